@@ -1,4 +1,5 @@
-"""A command puts the tool at its target, says so where it cannot, and keeps the limits."""
+"""A command puts the tool at its target, says so where it cannot, and keeps the limits; along a
+path neighbours have neighbouring joints; a correction table does the same on a grid."""
 
 from __future__ import annotations
 
@@ -17,22 +18,28 @@ from support.cells import (
     SLANTED,
     kr270_cell,
     kr270_chain,
-    random_poses,
 )
 from support.commands import calibrated, circumstances, erring, tool_errors
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.compensation.commands import targets_at
+from elastocal.compensation.commands import nominal_path, one_target, read_targets, targets_at
 from elastocal.compensation.compensate import compensate
-from elastocal.errors import InputError
+from elastocal.compensation.correction_table import (
+    EXACT,
+    CorrectionGrid,
+    correction_table,
+    joint_grid,
+)
+from elastocal.errors import ElastocalError, InputError
 from elastocal.model.calibrated import (
     Conditions,
     OpenParameters,
     ShownPoses,
     random_table,
+    share_of_levels,
     tool_point,
 )
-from elastocal.model.manipulator import Model
+from elastocal.model.chain import joint_limits
 from elastocal.model.rigid import nominal_flanges
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
@@ -49,13 +56,6 @@ POSTURES = np.radians(
 FARTHEST = 1e-7  # m and rad
 
 
-def near(chain, q, rng, size=2e-3):
-    """Targets a few mm and mrad from where the nominal flange is at q: (n, 3), (n, 3, 3)."""
-    T = nominal_flanges(chain, q)
-    turn = Rotation.from_rotvec(size * rng.normal(size=(len(q), 3))).as_matrix()
-    return T[:, :3, 3] + size * rng.normal(size=(len(q), 3)), T[:, :3, :3] @ turn
-
-
 @pytest.mark.parametrize(
     "effects",
     [
@@ -68,43 +68,33 @@ def near(chain, q, rng, size=2e-3):
     ],
 )
 def test_every_effect_is_undone(effects):
-    check_effects(effects, "equilibrium", FARTHEST)
-
-
-def check_effects(effects, model, farthest_turn):
-    settings_of = {
-        "joint3": {"jump_time_s": 3000.0},
-        "tracker": {"jump_time_s": 4000.0},
-        "marker:M1": {"slip_time_s": 2000.0},
-    }
     names = {e.partition(":")[0] for e in effects}
-    keep = {
-        "joint3": "encoder_jump" in names,
-        "tracker": "frame_jump" in names,
-        "marker:M1": "marker_slip" in names,
+    moments = {
+        "encoder_jump": ("joint3", {"jump_time_s": 3000.0}),
+        "frame_jump": ("tracker", {"jump_time_s": 4000.0}),
+        "marker_slip": ("marker:M1", {"slip_time_s": 2000.0}),
     }
     nominal = Nominal(
         joint_compliance=COMPLIANCE,
         gravity_compensator=COMPENSATOR if "gravity_compensator" in names else None,
-        settings={place: given for place, given in settings_of.items() if keep[place]},
+        settings=dict(found for name, found in moments.items() if name in names),
     )
     cell = kr270_cell(
-        (*EVERYWHERE, *effects), nominal=nominal, deflection_model=model, link_gravity=True,
-        gear_ripple_orders=(88.5,),
-    )  # fmt: skip
+        (*EVERYWHERE, *effects), nominal=nominal, link_gravity=True, gear_ripple_orders=(88.5,)
+    )
     chain, rng = kr270_chain(), np.random.default_rng(5)
     arm = calibrated(chain, cell)
     arm = replace(arm, x=erring(arm.model, rng))
-    position, rotation = near(chain, POSTURES, rng)
-    targets = targets_at("targets", position, rotation, "base", SLANTED, q=POSTURES)
-    n = len(POSTURES)
+    # Targets a few mm and mrad from where the nominal flange is.
+    T, n = nominal_flanges(chain, POSTURES), len(POSTURES)
+    turn = Rotation.from_rotvec(2e-3 * rng.normal(size=(n, 3))).as_matrix()
+    position = T[:, :3, 3] + 2e-3 * rng.normal(size=(n, 3))
+    targets = targets_at("targets", position, T[:, :3, :3] @ turn, "base", SLANTED, q=POSTURES)
     targets = replace(targets, table=replace(targets.table, **circumstances(n, 6, rng)))
-    # The flange's own place, so that nominal joints are near; M1 is some way off.
     found = compensate(arm, targets, tool_point(cell, "M1"))
-    missed = [s for s in found.status if s != "reached"]
-    assert not missed, missed
-    miss, turn = tool_errors(arm, found)
-    assert miss.max() < FARTHEST and turn.max() < farthest_turn
+    assert found.status == ("reached",) * n
+    miss, turned = tool_errors(arm, found)
+    assert miss.max() < FARTHEST and turned.max() < FARTHEST
     # The nominal command itself was far off: the test would see an effect left out.
     assert found.before.min() > 1e-4
 
@@ -118,10 +108,6 @@ def check_effects(effects, model, farthest_turn):
 )
 def test_random_arms_reach_what_they_can(seed, joints, oriented, load):
     """Targets of the nominal arm: reached within the limits, or said not to be."""
-    check_random_arm(seed, joints, oriented, load)
-
-
-def check_random_arm(seed, joints, oriented, load):
     rng = np.random.default_rng(seed)
     chain = random_chain(seed, joints)
     nominal = Nominal(joint_compliance=(1e-5,) * joints)
@@ -142,14 +128,10 @@ def check_random_arm(seed, joints, oriented, load):
     assert np.allclose(np.nan_to_num(found.after), np.nan_to_num(miss), atol=1e-12)
 
 
-def narrow(limit: dict[str, tuple[float, float]]):
-    return replace(kr270_cell(EVERYWHERE), limits=limit)
-
-
 def test_a_limit_is_kept_and_named():
     chain, rng = kr270_chain(), np.random.default_rng(1)
-    low, high = POSTURES[0, 2], POSTURES[0, 2]
-    cell = narrow({"joint3": (low - 0.5, high)})
+    high = POSTURES[0, 2]
+    cell = replace(kr270_cell(EVERYWHERE), limits={"joint3": (high - 0.5, high)})
     arm = calibrated(chain, cell)
     arm = replace(arm, x=erring(arm.model, rng))
     # A posture further out, which needs joint 3 beyond its limit.
@@ -185,59 +167,36 @@ def test_uncertainty_is_what_other_values_would_do():
     targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
     found = compensate(arm, targets, tool_point(cell, "M1"))
     std = np.sqrt(np.diag(arm.covariance))
+    rows = arm.model.table(found.q)
+    rows = replace(rows, force=found.force, marker=0 * rows.configuration)
     off = []
-    for k, s in enumerate(std):
-        ends = []
-        for sign in (1, -1):
-            x = arm.x.copy()
-            x[k] += sign * s
-            ends.append(_places(arm.model, found, x))
-        off.append((ends[0] - ends[1]) / 2)
+    for step in np.diag(std):
+        ends = (arm.model.target_poses(rows, arm.x + way * step)[1] for way in (1, -1))
+        off.append((next(ends) - next(ends)) / 2)
     expected = np.sqrt((np.array(off) ** 2).sum(axis=(0, 2)))
     assert np.allclose(found.uncertainty.std, expected, rtol=1e-3)
     assert not found.uncertainty.blamed
 
 
-def test_targets_far_from_what_was_measured_are_told():
+def test_targets_far_from_what_was_measured_are_told_and_a_point_known_worse_is_the_reason():
     cell = kr270_cell(("joint_offset",))
     arm = calibrated(kr270_chain(), cell, std=0.01)
     targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
 
-    def told(most, configurations=30):
+    def told(most, configurations=30, point="M1"):
         shown = replace(arm, shown=ShownPoses(most, configurations))
-        warned = compensate(shown, targets, tool_point(cell, "M1")).warnings
-        return [text for text in warned if "outside the measured" in text]
+        return " ".join(compensate(shown, targets, tool_point(cell, point)).warnings)
 
     std = compensate(arm, targets, tool_point(cell, "M1")).uncertainty.std
-    assert not told(std.max())
-    assert "line 1 and 3 more" in told(std.min() / 2)[0]
+    far = "outside the measured poses"
+    assert far not in told(std.max())
+    assert "line 1 and 3 more" in told(std.min() / 2) and far in told(std.min() / 2)
     # Of as few poses measured all may be surer than four others by chance.
-    assert not told(std.min() / 2, configurations=2)
-
-
-def test_a_point_that_is_known_worse_than_the_markers_is_the_reason():
-    """Where the markers are known as well as at measured poses, it is not the poses."""
-    cell = kr270_cell(("joint_offset",))
-    arm = calibrated(kr270_chain(), cell, std=0.01)
-    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
-    most = compensate(arm, targets, tool_point(cell, "M1")).uncertainty.std.max()
-    shown = replace(arm, shown=ShownPoses(most, 30))
-    text = " ".join(compensate(shown, targets, tool_point(cell, "6,0,0")).warnings)
+    assert far not in told(std.min() / 2, configurations=2)
+    # Where the markers are known as well as at measured poses, it is not the poses.
+    text = told(std.max(), point="6,0,0")
     assert "where the point 6,0,0 m in the flange frame lies on the tool is hardly known" in text
-    assert "outside the measured poses" not in text
-
-
-def _places(model: Model, found, x):
-    from elastocal.measurements import Measurements
-
-    n = len(found.q)
-    rows = Measurements(
-        source="t", row=np.arange(n), q=found.q, configuration=np.arange(n),
-        configuration_labels=tuple(map(str, range(n))), repeat=np.zeros(n, dtype=np.int64),
-        marker=np.zeros(n, dtype=np.int64), marker_names=tuple(model.cell.tool.markers),
-        force=found.force,
-    )  # fmt: skip
-    return model.target_poses(rows, x)[1]
+    assert far not in text
 
 
 def test_what_no_marker_showed_is_told():
@@ -268,23 +227,6 @@ def test_what_no_marker_showed_is_told():
     assert any("link6." in told and "`point`" in told for told in place.warnings)
 
 
-def test_random_poses_of_the_demo_arm_are_reached_without_joints_given():
-    chain = kr270_chain()
-    cell = kr270_cell(EVERYWHERE)
-    arm = calibrated(chain, cell)
-    arm = replace(arm, x=erring(arm.model, np.random.default_rng(6)))
-    q = 0.7 * random_poses(chain, 12, 7)
-    q = q[np.abs(q[:, 4]) > 0.3]
-    T = nominal_flanges(chain, q)
-    position = T[:, :3, 3] + T[:, :3, :3] @ cell.tool.markers["M1"]
-    found = compensate(
-        arm, targets_at("t", position, T[:, :3, :3], "base", DOWN), tool_point(cell, "M1")
-    )
-    assert found.reached.sum() >= len(q) - 1
-    miss, turn = tool_errors(arm, found)
-    assert miss[found.reached].max() < FARTHEST and turn[found.reached].max() < FARTHEST
-
-
 def test_too_soft_an_arm_has_no_equilibrium():
     nominal = Nominal(joint_compliance=(1e-3,) * 6)
     cell = kr270_cell(("joint_compliance",), nominal=nominal)
@@ -294,3 +236,164 @@ def test_too_soft_an_arm_has_no_equilibrium():
     )
     assert set(found.status) == {"no equilibrium"}
     assert np.isnan(found.after).all()
+
+
+# Paths
+
+HOME = np.radians([0, -90, 90, 0, 40, 0])
+PLACE = np.array([0.1, 0.0, 0.2])
+
+
+def circle(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """A circle of 0.3 m about where the tool is at home, with the tool's rotation kept."""
+    T = nominal_flanges(kr270_chain(), HOME[None])[0]
+    angle = np.linspace(0, 2 * np.pi, n)
+    ring = 0.3 * np.column_stack([0 * angle, np.cos(angle), np.sin(angle)])
+    return T[:3, 3] + T[:3, :3] @ PLACE + ring, np.tile(T[:3, :3], (n, 1, 1))
+
+
+def test_a_closed_path_is_followed_in_one_posture() -> None:
+    chain = kr270_chain()
+    cell = kr270_cell(("joint_compliance",))
+    position, rotation = circle(2000)
+    arm = calibrated(chain, cell)
+    targets = targets_at("path", position, rotation, "base", DOWN)
+    found = compensate(arm, targets, tool_point(cell, "0.1,0,0.2"), near=HOME)
+    assert found.reached.all()
+    assert np.abs(np.diff(found.q, axis=0)).max() < 0.01
+    assert np.abs(found.q[-1] - found.q[0]).max() < 1e-9
+    assert not found.warnings
+
+
+def test_given_joints_that_jump_are_told() -> None:
+    chain = kr270_chain()
+    cell = kr270_cell(("joint_compliance",))
+    position, rotation = circle(40)
+    arm = calibrated(chain, cell)
+    point = tool_point(cell, "0.1,0,0.2")
+    targets = targets_at("path", position, rotation, "base", DOWN)
+    smooth = compensate(arm, targets, point, near=HOME)
+    q = smooth.nominal.copy()
+    # The other posture of the wrist: q4 + 180°, −q5, q6 + 180° is the same pose.
+    q[20:] = q[20:] * [1, 1, 1, 1, -1, 1] + np.array([0, 0, 0, np.pi, 0, -np.pi])
+    found = compensate(arm, replace(targets, q=q), point)
+    assert found.reached.all()
+    told = [text for text in found.warnings if "solution branch changes" in text]
+    assert len(told) == 1 and told[0].startswith("path, line 21:")
+
+
+def test_scattered_places_are_reached_in_the_nearest_posture_and_one_out_of_reach_stops_none():
+    chain = kr270_chain()
+    limits = joint_limits(kr270_cell(), chain)
+    q = HOME + np.radians([[0, 0, 0, 0, 0, 0], [50, 20, -30, 10, 20, 60], [-60, -10, 20, 5, 10, 0]])
+    T = nominal_flanges(chain, q)
+    position = T[:, :3, 3] + T[:, :3, :3] @ PLACE
+    found, reached = nominal_path(chain, position, T[:, :3, :3], PLACE, limits, HOME)
+    assert reached.all() and np.allclose(found, q, atol=1e-5)
+    position, rotation = circle(30)
+    position[10] = [9.0, 0.0, 0.0]
+    q, reached = nominal_path(chain, position, rotation, PLACE, limits, HOME)
+    assert np.flatnonzero(~reached).tolist() == [10]
+    assert np.abs(q[11] - q[9]).max() < 0.2
+
+
+# Correction tables
+
+LOW = np.radians([-30, -110, 60, -20, 40, -20])
+HIGH = np.radians([30, -70, 100, 20, 80, 20])
+
+
+def arm_and_point():
+    cell = kr270_cell(("joint_offset", "link_geometry", "joint_compliance"))
+    arm = calibrated(kr270_chain(), cell)
+    arm = replace(arm, x=erring(arm.model, np.random.default_rng(8), 0.5))
+    return arm, tool_point(cell, "M1")
+
+
+def joint_box(counts) -> list[np.ndarray]:
+    ends = zip(LOW, HIGH, counts, strict=True)
+    return [np.linspace(a, b, n) if n > 1 else np.array([(a + b) / 2]) for a, b, n in ends]
+
+
+def test_corrected_targets_are_reached_by_the_nominal_arm() -> None:
+    arm, point = arm_and_point()
+    grid = CorrectionGrid(tuple(joint_box((2, 2, 1, 1, 2, 1))), True)
+    found = correction_table(arm, grid, point, DOWN)
+    assert set(found.status) == {EXACT}
+    T = nominal_flanges(arm.model.chain, found.points)
+    place = T[:, :3, 3] + T[:, :3, :3] @ arm.model.cell.tool.markers["M1"]
+    turned = Rotation.from_rotvec(found.correction[:, 3:]).as_matrix() @ T[:, :3, :3]
+    # A rigid, nominal arm stands for the controller.
+    rigid = kr270_cell(())
+    controller = compensate(
+        calibrated(arm.model.chain, rigid),
+        targets_at("t", place + found.correction[:, :3], turned, "base", q=found.points),
+        tool_point(rigid, "M1"),
+    )
+    assert controller.reached.all()
+    real = compensate(arm, targets_at("t", None, None, "base", DOWN, q=found.points), point)
+    miss, turn = tool_errors(arm, replace(real, q=controller.q))
+    assert miss.max() < 1e-7 and turn.max() < 1e-7
+
+
+@pytest.mark.parametrize(
+    ("counts", "told"),
+    [((5, 5), "one per joint"), ((0,), "1 or more"), ((30,), "points, and")],
+)
+def test_a_grid_that_cannot_be_is_refused(counts, told) -> None:
+    with pytest.raises(InputError, match=told):
+        joint_grid(arm_and_point()[0], counts)
+
+
+def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
+    arm, point = arm_and_point()
+    axes = joint_box((2, 2, 2, 1, 1, 1))
+    assert correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN).warnings == ()
+    axes[4] = np.zeros(1)
+    found = correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN)
+    (told,) = found.warnings
+    assert told.startswith("only 0 of 8 grid points are exact")
+    assert "singular by the levels of q5_deg = 0;" in told and "q4" not in told and "q6" not in told
+
+
+# Targets as texts and tables
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("x_mm,y_mm\n1,2\n", "without z_mm"),
+        ("rx_deg,ry_deg,rz_deg\n1,2,3\n", "x_mm,y_mm,z_mm are missing"),
+        ("x_mm,y_mm,z_mm,q1_deg\n1,2,3,4\n", "the robot has 6 joints"),
+        ("x_mm,y_mm,z_mm,marker\n1,2,3,A\n1,2,3,B\n", "`point`"),
+    ],
+)
+def test_tables_that_say_no_target_are_refused(tmp_path, text, told) -> None:
+    path = tmp_path / "targets.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=told):
+        read_targets(path, ("revolute",) * 6, "base")
+
+
+@settings(max_examples=60, deadline=None)
+@given(text=st.text("0123456789,.-+eE naif", max_size=30))
+def test_any_target_text_is_a_target_or_told(text) -> None:
+    try:
+        targets = one_target(text, "base")
+    except ElastocalError as error:
+        assert "`target` takes" in str(error)
+    else:
+        assert np.isfinite(targets.position).all()
+
+
+@given(
+    levels=st.lists(st.integers(-30, 30), min_size=1, max_size=6, unique=True),
+    angle=st.floats(-40, 40),
+)
+def test_shares_interpolate_between_levels(levels, angle):
+    values = np.array(levels, dtype=float)
+    share = share_of_levels(np.array([angle]), values)[0]
+    assert np.isclose(share.sum(), 1) and share.min() >= 0
+    # Shares of a linear function of the level give that function, clamped at the ends.
+    assert np.isclose(share @ values, np.clip(angle, values.min(), values.max()))
+    assert np.count_nonzero(share) <= 2

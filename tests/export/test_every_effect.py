@@ -3,42 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.cells import COMPENSATOR, SLANTED, kr270_cell
+from support.exports import write_result
+from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal
+from elastocal.export.export import Wish, export
 from elastocal.export.exportable import Conditions, cost_of, evaluate_pieces, keep
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
+from elastocal.model.urdf import read_urdf
 
+ROBOT = f'urdf = "{KR270}"'
 CONDITIONS = Conditions(SLANTED, time=1800.0, temperature=30.0)
 # Without parameters of their own they act through the others.
 ALWAYS = ("payload", "link_gravity")
 # Geometry, the last three of it constant once time and temperature are.
 RIGID = {
-    "base_frame",
-    "joint_offset",
-    "link_geometry",
-    "marker_position",
-    "marker_orientation",
-    "thermal_expansion",
-    "joint_drift",
-    "encoder_jump",
-}
+    "base_frame", "joint_offset", "link_geometry", "marker_position", "marker_orientation",
+    "thermal_expansion", "joint_drift", "encoder_jump",
+}  # fmt: skip
 SPRINGS = {
-    "joint_compliance",
-    "off_axis_compliance",
-    "link_bending",
-    "base_compliance",
-    "gravity_compensator",
-    "link_gravity",
-    "link_mass_error",
-    "payload",
-    "payload_error",
-}
+    "joint_compliance", "off_axis_compliance", "link_bending", "base_compliance",
+    "gravity_compensator", "link_gravity", "link_mass_error", "payload", "payload_error",
+}  # fmt: skip
 # What has no parameters unless a setting asks for some.
 SHOWN = {"gear_spectrum": {"order_1": 9.5}, "residual_field": {"field_joint1_size": 1e-4}}
 # What has no cost, for nobody states what it follows.
@@ -77,13 +70,9 @@ def calibrated(name: str) -> CalibratedArm:
 
 
 @pytest.mark.parametrize("name", [name for name in CATALOGUE if name not in ALWAYS])
-def test_it_is_accounted_for(name: str) -> None:
+@pytest.mark.parametrize("elastic", [False, True])
+def test_it_is_accounted_for(name: str, elastic: bool) -> None:
     arm = calibrated(name)
-    for elastic in (False, True):
-        check_kept(arm, name, elastic)
-
-
-def check_kept(arm: CalibratedArm, name: str, elastic: bool) -> None:
     kept = keep(arm, elastic, CONDITIONS)
     held = RIGID | (SPRINGS if elastic else set())
     left_out = {omission.effect for omission in kept.omissions}
@@ -114,3 +103,25 @@ def test_linear_deflections_are_held_at_the_deflected_pose_and_that_costs() -> N
     assert omission.effect == "linear deflections"
     # Second order: the deflection of some millimetres times that over the metres of the arm.
     assert 1e-8 < cost_of(kept, 8, seed=0).total.flange_max < 1e-4
+
+
+def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Path) -> None:
+    model = 'thermal_driver = "temperature"'
+    written = write_result(tmp_path, ROBOT, ["thermal_expansion:all"], model, value=lambda p: 12e-6)
+    arm = read_calibrated(*written)
+    (entry,) = export(arm, Wish("urdf", poses=20)).cost.effects
+    assert entry.difference is None and "`temperature_c`" in entry.note
+    warm = export(arm, Wish("urdf", conditions=Conditions(temperature=30.0), poses=20))
+    assert not warm.cost.effects and warm.cost.total.flange_max == 0.0
+    (tmp_path / "warm.urdf").write_text(warm.text)
+    forearm = read_urdf(tmp_path / "warm.urdf").joints[2].placement
+    assert forearm[0, 3] == pytest.approx(1.25 * (1 + 12e-6 * 10), rel=1e-15)
+    assert "at 30 °C" in warm.text
+
+
+def test_an_arm_with_torque_couplings_is_exported_without_them(tmp_path: Path) -> None:
+    effects = ["base_frame", "joint_offset:joint2", "torque_coupling:joint2", "move_lag:joint3"]
+    arm = read_calibrated(*write_result(tmp_path, ROBOT, effects))
+    omitted = {o.effect: o.note for o in keep(arm, False, Conditions()).omissions}
+    assert "recorded torques" in omitted["torque_coupling"]
+    arm.save(tmp_path / "arm.urdf")

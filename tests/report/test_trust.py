@@ -97,8 +97,10 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
         assert found.tone == "poor" and text in found.headline
 
 
-@pytest.mark.parametrize(("ratio", "n", "doubted"), [(1.4, 20, True), (1.4, 5, False),
-                                                     (1.3, 20, False), (1.3, 200, True)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("ratio", "n", "doubted"),
+    [(1.4, 20, True), (1.4, 5, False), (1.3, 20, False), (1.3, 200, True)],
+)
 def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doubted) -> None:
     """Twenty readings may be 1.38 times worse by chance (1 %), five 1.74 times."""
     known = replace(fine, dof=600, test=TestErrors(ratio * fine.heldout_rms, 0.0, 0.0, n))
