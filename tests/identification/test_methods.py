@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from support.calibration import (
     PLACED,
-    binomial_band,
     cell_of,
     measured,
     planar_chain,
@@ -101,18 +100,17 @@ def test_the_published_methods_are_those_of_the_paper():
 
 
 @pytest.mark.parametrize("method", [*ROBUST, "reml"])
-@pytest.mark.parametrize("share", [0.05, 0.3])
-def test_gross_errors_do_not_bend_a_robust_fit(method, share):
+def test_gross_errors_do_not_bend_a_robust_fit(method):
     """The prediction stays within a tenth of the errors' size, within the noise but for the
     losses without rejection at 30 %."""
     model, table, truth = campaign(1)
-    wrong = with_errors(table, share)
+    wrong = with_errors(table, 0.3)
     faulty = "drop" if method == "reml" else "auto"
     result = identify(model, wrong, Options(method=method, faulty=faulty))
     error = model.predict(table, result.x) - model.predict(table, truth)
     plain = identify(model, wrong, Options(method="ols"))
     bent = model.predict(table, plain.x) - model.predict(table, truth)
-    limit = SIGMA / 2 if method == "reml" or share < 0.1 else 4 * SIGMA
+    limit = SIGMA / 2 if method == "reml" else 4 * SIGMA
     assert np.sqrt(np.mean(error**2)) < limit
     assert np.sqrt(np.mean(bent**2)) > 2 * np.sqrt(np.mean(error**2))
 
@@ -120,34 +118,7 @@ def test_gross_errors_do_not_bend_a_robust_fit(method, share):
 # --- noise ----------------------------------------------------------------------------------
 
 
-def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
-    """4 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
-    hits = plain_hits = total = 0
-    for seed in range(4):
-        model, table, truth = campaign(seed, effect=1e-4)
-        both = identify(model, table), identify(model, table, Options(method="ols"))
-        for name, true in zip(model.names, truth, strict=True):
-            ends = [r[name].ci95 for r in both]
-            hits += ends[0][0] <= true <= ends[0][1]
-            plain_hits += ends[1][0] <= true <= ends[1][1]
-            total += 1
-    low, high = binomial_band(total, 0.95)
-    assert low <= hits <= high
-    assert plain_hits < low
-
-
 # --- intervals ------------------------------------------------------------------------------
-
-
-def test_clustered_intervals_hold_under_a_configuration_effect():
-    hits = total = 0
-    for seed in range(8):
-        model, table, truth = campaign(seed, effect=1e-4)
-        result = identify(model, table, Options(method="ols", intervals="cr2"))
-        for name, true in zip(model.names, truth, strict=True):
-            low, high = result[name].ci95
-            hits, total = hits + (low <= true <= high), total + 1
-    assert hits >= binomial_band(total, 0.95)[0]
 
 
 # --- what does not go together --------------------------------------------------------------

@@ -21,8 +21,6 @@ CERTIFIED = json.loads((FOLDER / "certified.json").read_text(encoding="utf-8"))
 DIGITS = {"Filip": 7, "Wampler4": 7, "Wampler5": 5}
 EXACT_FIT = {"Wampler1", "Wampler2"}
 
-every_set = pytest.mark.parametrize("name", sorted(CERTIFIED))
-
 
 def read(name):
     """B, y of the model, certified values."""
@@ -41,7 +39,7 @@ def digits(value, certified):
     return float(np.min(-np.log10(np.maximum(error, 1e-17))))
 
 
-@every_set
+@pytest.mark.parametrize("name", sorted(CERTIFIED))
 def test_certified_values(name):
     B, y, certified = read(name)
     found, x = ols(B, y), np.array(certified["x"])

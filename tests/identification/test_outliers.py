@@ -46,31 +46,22 @@ def rows_of(outliers):
     return np.sort(np.array([o.line - 2 for o in outliers], dtype=int))
 
 
-# --- false alarms ---------------------------------------------------------------------------
-
-
-def false_alarms(model, tables, poses):
-    return sum(
-        bool(identify(model, clean_table(model, seed, poses)[0]).faulty) for seed in range(tables)
-    )
-
-
 def test_clean_tables_hardly_ever_raise_an_alarm():
     """At a rate of 1 % more than 3 alarms in 20 tables have a probability below 1e-4."""
-    limit = stats.binom.isf(1e-4, 20, FALSE_ALARM)
     model = Model.assembled(planar_chain(), cell_of(("base_frame",)))
-    assert false_alarms(model, 20, 12) <= limit
+    tables = (clean_table(model, seed, 12)[0] for seed in range(20))
+    alarms = sum(bool(identify(model, table).faulty) for table in tables)
+    assert alarms <= stats.binom.isf(1e-4, 20, FALSE_ALARM)
 
 
 # --- gross errors ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1])
-def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
+def test_a_tenth_of_gross_errors_is_found_and_little_else():
     """20 σ and more are far beyond any limit.  A good reading is accused in one table of a
     hundred, so not one of 54 with a probability of 99 %; one per table is allowed."""
     model = Model.assembled(planar_chain(), cell_of(GEOMETRY))
-    table, _, rng = clean_table(model, seed, 60)
+    table, _, rng = clean_table(model, 1, 60)
     wrong, bad = with_gross_errors(table, rng, 0.1)
     found = rows_of(identify(model, wrong).faulty)
     assert set(bad) <= set(found)
@@ -98,7 +89,7 @@ def distance_block(seed, share, shift):
     ("seed", "shift"),
     [
         (0, 0.03),
-        *(pytest.param(s, d, marks=pytest.mark.long) for s in (1, 2) for d in (-0.1, 0.02)),
+        pytest.param(1, -0.1, marks=pytest.mark.long),
     ],
 )
 def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
@@ -115,10 +106,9 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
 # --- leaving them out -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [2])
-def test_dropping_equals_never_having_had_them(seed):
+def test_dropping_equals_never_having_had_them():
     model = Model.assembled(planar_chain(), cell_of(PLACED))
-    table, _, rng = clean_table(model, seed, 40)
+    table, _, rng = clean_table(model, 2, 40)
     wrong, bad = with_gross_errors(table, rng, 0.15, high=0.01)
     dropped = identify(model, wrong, Options(faulty="drop"))
     good = np.setdiff1d(np.arange(40), bad)

@@ -1,53 +1,29 @@
 """Which parameters the data determine, on arms whose redundancies are known by name."""
 
-from functools import lru_cache
-
 import numpy as np
 import pytest
 from scipy import linalg, stats
-from scipy.spatial.transform import Rotation
 from support.calibration import (
     GEOMETRY,
     binomial_band,
     cell_of,
-    combination_truth,
     covered,
     measured,
-    placement,
     planar_chain,
     random_chain,
     table_at,
     true_values,
     z_scores,
 )
-from support.cells import choices, kr270_chain, random_poses
+from support.cells import kr270_chain, random_poses
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.solve import reduce
-from elastocal.model.chain import Chain, Joint
 from elastocal.model.manipulator import Model
 
 DOWN = ((0.0, 0.0, -300.0),)
 SIDEWAYS = ((300.0, 0.0, 0.0),)
-
-
-def z_chain():
-    """Every joint turns about its own z: 1 vertical, 2 horizontal, 3 and 4 parallel to each
-    other and to nothing else, the flange turned away."""
-    flat = Rotation.from_euler("x", 90, degrees=True)
-    turned = Rotation.from_euler("y", 70, degrees=True)
-    placements = [
-        placement([0, 0, 0.3]),
-        placement([0.1, 0, 0.2], flat),
-        placement([0.3, 0.1, 0.2], turned),
-        placement([0.4, 0.05, 0.1]),
-    ]
-    joints = tuple(
-        Joint(f"q{i + 1}", "revolute", T, np.array([0.0, 0, 1]), -2.5, 2.5)
-        for i, T in enumerate(placements)
-    )
-    return Chain("z", joints, placement([0.3, 0.1, 0.2], Rotation.from_euler("xy", [1, 1])))
 
 
 def reduced(chain, effects, forces=((0, 0, 0),), seed=0, **cell):
@@ -67,19 +43,6 @@ def reduced(chain, effects, forces=((0, 0, 0),), seed=0, **cell):
 
 
 # --- cases whose algebra is known -----------------------------------------------------------
-
-
-def test_parallel_axes_leave_only_the_sum_of_shifts_along_them():
-    """Joints 3 and 4 turn about parallel z axes: a shift of joint 3's frame (link2.dz) and of
-    joint 4's (link3.dz) along them do the same."""
-    effects = ("link_geometry:link2", "link_geometry:link3")
-    _, share, invisible = reduced(z_chain(), effects)
-    assert not invisible
-    pair = {"link2.dz", "link3.dz"}
-    (dropped,) = pair & set(share)
-    assert share[dropped] == {(pair - {dropped}).pop(): 1.0}
-    # a tilt of the first about its axis moves the second as a turn and a shift of it, too
-    assert set(share) <= {"link2.dz", "link3.dz", "link2.rz", "link3.rz"}
 
 
 def test_a_vertical_joint_1_leaves_base_z_and_link1_dz_as_a_sum():
@@ -103,33 +66,14 @@ def test_a_vertical_load_does_not_show_a_vertical_joint(nominal):
 
 # --- properties -----------------------------------------------------------------------------
 
-CHOICES = [
-    ("base_frame", "marker_position"),
-    ("joint_offset", "link_geometry"),
-    GEOMETRY,
-    ("base_frame", "link_geometry"),
-    (*GEOMETRY, "encoder_scale"),
-    (*GEOMETRY, "joint_compliance", "off_axis_compliance", "base_compliance"),
-]
 
-
-@lru_cache
-def regression(chain_name, effects, seed=0):
-    chain = {"planar": planar_chain, "kr270": kr270_chain, "random": lambda: random_chain(2, 5)}[
-        chain_name
-    ]()
-    nominal = Nominal(joint_compliance=(1e-6,) * chain.n_joints)
-    model = Model.assembled(chain, cell_of(effects, nominal=nominal))
-    table = table_at(random_poses(chain, 25, seed), ((0, 0, 0), (100, 50, -200)))
-    B = model.regressor(table).B
-    return model, B, model.sizes(B)
-
-
-@pytest.mark.parametrize("effects", CHOICES[1:4], ids="+".join)
-@pytest.mark.parametrize("chain", ["kr270", "random"])
-def test_units_do_not_matter(chain, effects):
+@pytest.mark.parametrize("effects", [("base_frame", "link_geometry"), GEOMETRY], ids="+".join)
+def test_units_do_not_matter(effects):
     """Millimetres or microradians: B and sizes change together, nothing else does."""
-    model, B, sizes = regression(chain, effects)
+    chain = kr270_chain()
+    model = Model.assembled(chain, cell_of(effects))
+    B = model.regressor(table_at(random_poses(chain, 25, 0))).B
+    sizes = model.sizes(B)
     # Powers of two, so that exact ties between like columns are not broken by rounding.
     unit = 2.0 ** np.random.default_rng(1).integers(-20, 21, len(sizes))
     a = reduce(B, sizes, model.parameters, 1.0, 0.0)
@@ -143,9 +87,7 @@ def test_units_do_not_matter(chain, effects):
 # --- what a user gets -----------------------------------------------------------------------
 
 IDENTIFIED = [
-    ("base_frame", "marker_position"),
     GEOMETRY,
-    ("base_frame", "link_geometry"),
     ("base_frame", "joint_offset", "marker_position", "encoder_scale"),
 ]
 
@@ -159,23 +101,20 @@ def simulated(chain, effects, seed, poses=25, sigma=5e-5):
 
 
 @pytest.mark.parametrize("effects", IDENTIFIED, ids="+".join)
-@pytest.mark.parametrize("seed", range(1))
-@pytest.mark.parametrize("chain", ["planar", "random"])
-def test_no_interval_for_what_the_data_cannot_determine(chain, seed, effects):
+def test_no_interval_for_what_the_data_cannot_determine(effects):
     """Two arms with the same readings may not differ in any parameter that is given a value.
 
     Such arms are truth + v with B v = 0; with every |v_d| up to its typical size, a parameter
     with an interval may move by less than its standard deviation.
     """
-    arm = planar_chain() if chain == "planar" else random_chain(seed, 4)
-    result, _ = simulated(arm, effects, seed)
+    result, _ = simulated(random_chain(0, 4), effects, 0)
     model = result.model
     B = model.regressor(result.observations.table, result.x).B
     sizes = model.sizes(B)
     _, singular, Vt = linalg.svd(B * sizes)
     rank = int((singular > 1e-9 * singular[0]).sum())
     null = Vt[rank:]
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     for _ in range(20 if len(null) else 0):
         v = null.T @ rng.normal(size=len(null))
         v /= np.abs(v).max()
@@ -217,35 +156,3 @@ def test_combinations_cover_the_true_combination():
     for name, good in hits.items():
         low, _ = binomial_band(len(good), 0.95, 1 - 0.001 / len(hits))
         assert sum(good) >= low, name
-
-
-def test_what_another_effect_explains_completely_is_reported_with_it():
-    """An effect switched on twice in disguise: joint 1's offset and the base's turn about it."""
-    model = Model.assembled(planar_chain(), cell_of(("base_frame", "joint_offset:joint1")))
-    assert model.cell.model.effects == choices(("base_frame", "joint_offset:joint1"))
-    rng = np.random.default_rng(0)
-    truth = true_values(model, rng, anywhere=False)
-    table = measured(model, table_at(random_poses(model.chain, 15, 0)), truth, 1e-5, rng)
-    result = identify(model, table)
-    offset = result["joint1.offset"]
-    assert not offset.identifiable and offset.combined_with == ("base.rz",)
-    assert result.combination("base.rz").terms == pytest.approx(
-        {"base.rz": 1.0, "joint1.offset": 1.0}, abs=1e-2
-    )
-
-
-def test_combinations_hold_where_the_readings_are_too_good_for_a_linear_sum():
-    """At 1 µm what a millimetre and a milliradian do together is above the noise."""
-    model, held, plain = Model.assembled(random_chain(3), cell_of(GEOMETRY)), [], []
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        truth = true_values(model, rng, anywhere=False)
-        plan = table_at(random_poses(model.chain, 40, seed))
-        found = identify(model, measured(model, plan, truth, 1e-6, rng))
-        for name in found.determined:
-            single = found[name].identifiable
-            value = found[name] if single else found.combination(name)
-            low, high = value.ci95
-            held.append(low <= combination_truth(found, truth, name) <= high)
-        plain.append(covered(found, truth).mean())
-    assert np.mean(plain) < 0.85 < 0.9 < np.mean(held)

@@ -12,12 +12,8 @@ from elastocal.model.manipulator import Model
 SIGMA = 5e-5
 POSES = 60
 
-HALF_TURNS = {f"180° about {k}": Rotation.from_rotvec(np.pi * np.eye(3)[i]) for i, k in
-              enumerate("xyz")}  # fmt: skip
 ATTITUDES = {
-    "none": Rotation.identity(),
-    **HALF_TURNS,
-    "90° about z": Rotation.from_euler("z", 90, degrees=True),
+    "180° about x": Rotation.from_rotvec([np.pi, 0.0, 0.0]),
     "upside down, oblique": Rotation.from_euler("xyz", [175, 20, -130], degrees=True),
     "random": Rotation.random(random_state=0),
 }
@@ -78,9 +74,9 @@ def test_any_attitude_with_an_unknown_tool(name):
     np.testing.assert_allclose(found.markers, true, atol=2e-4)
 
 
-@pytest.mark.parametrize(("seed", "name"), list(enumerate(HALF_TURNS)))
-def test_half_turns_with_wrong_readings_and_several_markers(name, seed):
-    problem, _, exact, bad = case(random_chain(seed), HALF_TURNS[name], seed, markers=3, wrong=0.2)
+def test_half_a_turn_with_wrong_readings_and_several_markers():
+    turn = ATTITUDES["180° about x"]
+    problem, _, exact, bad = case(random_chain(1), turn, 1, markers=3, wrong=0.2)
     found = register(problem)
     assert_registered(problem, exact, found)
     miss = np.linalg.norm(predicted(problem, found) - problem.points, axis=1)
@@ -97,27 +93,3 @@ def test_a_known_base_is_kept_and_the_tool_found():
     assert_registered(problem, exact, found)
     # the base is exact, so each marker is a mean over 48 good turned readings
     np.testing.assert_allclose(found.markers, true, atol=5 * SIGMA)
-
-
-def test_known_markers_are_kept_and_the_base_found():
-    turn = HALF_TURNS["180° about x"]
-    problem, true, exact, _ = case(kr270_chain(), turn, seed=4, markers=2, wrong=0.2,
-                                   free_markers=[False, False])  # fmt: skip
-    found = register(problem)
-    assert np.array_equal(found.markers, true)
-    assert_registered(problem, exact, found)
-
-
-def test_the_result_moves_with_the_tracker():
-    problem, _, _, _ = case(kr270_chain(), Rotation.random(random_state=9), 9, wrong=0.1)
-    moved = Rotation.random(random_state=10)
-    shift = np.array([1.0, -2.0, 0.5])
-    other = RegistrationProblem(
-        problem.flange_rotation, problem.flange_position, moved.apply(problem.points) + shift,
-        problem.marker, problem.start_markers, problem.free_markers, True, np.eye(3), np.zeros(3),
-    )  # fmt: skip
-    a, b = register(problem), register(other)
-    # both stop when the median no longer changes by 1e-6 of itself
-    np.testing.assert_allclose(b.rotation, moved.as_matrix() @ a.rotation, atol=2e-5)
-    np.testing.assert_allclose(b.translation, moved.apply(a.translation) + shift, atol=5e-5)
-    np.testing.assert_allclose(b.markers, a.markers, atol=5e-5)

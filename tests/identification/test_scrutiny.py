@@ -109,11 +109,3 @@ def test_the_budget_adds_up_to_the_held_out_error(fitted):
     assert budget.lack_of_fit == pytest.approx(result.predicted.lacking)
     there = result.uncertainty(table.take(np.arange(6)))
     assert there.instrument == budget.instrument and there.parameters != budget.parameters
-
-
-def test_what_the_stated_noise_does_not_explain_is_lack_of_fit(fitted):
-    """As in the error expected at new poses, and no part of the instrument's."""
-    _, _, result = fitted
-    budget = replace(result, noise=replace(result.noise, ratio_to_stated=3.0)).uncertainty()
-    assert budget.lack_of_fit == pytest.approx(SIGMA * np.sqrt(3 * 8 / 9), rel=0.1)
-    assert budget.instrument == pytest.approx(SIGMA * np.sqrt(3 / 9), rel=0.3)

@@ -1,0 +1,262 @@
+"""Robust fits, the majority and the report of faulty readings, on a problem like the arm's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cvxpy as cp
+import numpy as np
+import pytest
+import statsmodels.api as sm
+from scipy import integrate, stats
+from scipy.spatial.transform import Rotation
+from support.calibration import binomial_band
+
+from elastocal.identification.faulty_readings import outlier_report
+from elastocal.identification.outliers import FALSE_ALARM, FitToGood, majority
+from elastocal.identification.robust import HUBER, covariance_of, huber, least_absolute
+
+
+@dataclass(frozen=True)
+class ArmLike:
+    """y = B x + noise of unit variance; the first five columns are seen at one level each."""
+
+    B: np.ndarray  # (810, 9)
+    x: np.ndarray
+    configuration: np.ndarray  # (270,)
+    marker: np.ndarray
+    size: int = 3
+
+    @property
+    def n(self) -> int:
+        return len(self.configuration)
+
+    def errors(self, rng, share=0.0, low=1.0, high=10.0):
+        """Unit noise (n, 3); a share of the readings off by `low` to `high` in each component,
+        in units where the noise is 1, and which ones."""
+        noise = rng.normal(size=(self.n, 3))
+        bad = rng.permutation(self.n)[: round(share * self.n)]
+        sign = rng.choice([-1.0, 1.0], (len(bad), 3))
+        noise[bad] += sign * rng.uniform(low, high, (len(bad), 3))
+        return noise, bad
+
+    def observed(self, noise):
+        return self.B @ self.x + noise.ravel()
+
+
+@pytest.fixture(scope="module")
+def arm() -> ArmLike:
+    """15 configurations at five levels, 3 markers, 6 repeats: 270 readings, 9 columns.
+
+    Lengths are in units of the noise: 10 µm, so that 1 to 10 mm are 100 to 1000.
+    """
+    rng = np.random.default_rng(2013)
+    configuration = np.repeat(np.arange(15), 18)
+    marker = np.tile(np.repeat(np.arange(3), 6), 15)
+    pose = rng.normal(size=(15, 1, 3, 9)) + 0.5 * rng.normal(size=(15, 3, 3, 9))
+    B = pose[configuration, marker]
+    level = configuration // 3
+    B[:, :, :5] *= (level[:, None] == np.arange(5))[:, None, :]
+    return ArmLike(B.reshape(-1, 9), rng.normal(size=9), configuration, marker)
+
+
+# Huber and the sum of lengths.
+
+
+@pytest.mark.parametrize("size", range(1, 7))
+def test_constants_are_95_percent_efficient(size):
+    """By quadrature over the density of χ(size): the efficiency a²/b, with a by Stein's identity
+    E div Ψ = E r·Ψ, which needs no derivative of ψ."""
+    c = HUBER[size - 1]
+
+    def mean(g):
+        parts = [(0, c), (c, 20)]
+        values = (integrate.quad(lambda d: g(d) * stats.chi.pdf(d, size), *part) for part in parts)
+        return sum(value for value, _ in values)
+
+    a = mean(lambda d: np.minimum(d, c) * d) / size
+    b = mean(lambda d: np.minimum(d, c) ** 2) / size
+    assert a**2 / b == pytest.approx(0.95, abs=1e-8)
+
+
+def regression(seed, n=120, p=4):
+    rng = np.random.default_rng(seed)
+    B = rng.normal(size=(n, p)) * 10.0 ** rng.uniform(-6, 3, p)
+    x = rng.normal(size=p) / np.linalg.norm(B, axis=0)
+    return B, B @ x + 0.1 * rng.standard_t(2.5, size=n)
+
+
+def test_estimate_scale_and_covariance_are_those_of_statsmodels():
+    """Columns scaled to unit length for statsmodels, whose pseudo-inverse needs that."""
+    B, y = regression(1)
+    unit = np.linalg.norm(B, axis=0)
+    theirs = sm.RLM(y, B / unit, M=sm.robust.norms.HuberT(1.345))
+    reference = theirs.fit(cov="H1", tol=1e-13, maxiter=2000)
+    found = huber(B, y, 1, c=1.345)
+    np.testing.assert_allclose(found.x * unit, reference.params, rtol=1e-8)
+    assert found.scale == pytest.approx(reference.scale, rel=1e-8)
+    scaled = covariance_of(found, B).matrix * np.outer(unit, unit)
+    np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
+
+
+@pytest.mark.parametrize("fit", [huber, least_absolute], ids=["huber", "l1"])
+def test_the_axes_of_a_reading_do_not_matter(arm, fit):
+    """Each reading turned by its own rotation, as another tracker frame would: same x, weights."""
+    rng = np.random.default_rng(9)
+    y = arm.observed(arm.errors(rng, 0.1)[0])
+    turn = Rotation.random(270, random_state=1).as_matrix()
+    B2 = (turn @ arm.B.reshape(270, 3, 9)).reshape(-1, 9)
+    y2 = (turn @ y.reshape(270, 3, 1)).ravel()
+    one, two = fit(arm.B, y, 3), fit(B2, y2, 3)
+    np.testing.assert_allclose(one.x, two.x, atol=1e-7)
+    np.testing.assert_allclose(one.weights, two.weights, rtol=1e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("size", [2, 3])
+def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
+    rng = np.random.default_rng(size)
+    B = rng.normal(size=(40 * size, 5))
+    y = B @ np.ones(5) + rng.standard_t(2, size=40 * size)
+    x = cp.Variable(5)
+    lengths = [cp.norm(y[k : k + size] - B[k : k + size] @ x) for k in range(0, len(y), size)]
+    problem = cp.Problem(cp.Minimize(cp.sum(cp.hstack(lengths))))
+    problem.solve(solver=cp.CLARABEL)
+    found = least_absolute(B, y, size)
+    total = np.linalg.norm(found.residual.reshape(-1, size), axis=1).sum()
+    assert total <= problem.value * (1 + 1e-6)
+    np.testing.assert_allclose(found.x, x.value, atol=1e-4)
+    assert found.converged
+
+
+def covers(found, arm, cluster=None):
+    """How many of the intervals hold the truth."""
+    low, high = covariance_of(found, arm.B, cluster).interval(found.x).T
+    return int(((low < arm.x) & (arm.x < high)).sum())
+
+
+def test_intervals_hold_the_truth(arm):
+    """Of the sum of lengths, whose ψ jumps, beside blunders: 95 % of 20 tables × 9 parameters.
+
+    Parameters of a table are nearly independent, and the band of 99.9 % is that of a third as many.
+    """
+    rng = np.random.default_rng(0)
+    tables = (arm.observed(arm.errors(rng, 0.05, 100, 1000)[0]) for _ in range(20))
+    held = sum(covers(least_absolute(arm.B, y, 3), arm) for y in tables)
+    low, high = binomial_band(20 * 9 // 3, 0.95)
+    assert low <= held / 3 <= high
+
+
+def test_intervals_hold_the_truth_where_readings_of_a_configuration_err_alike(arm):
+    """A deviation as large as the noise, in 15 clusters; intervals of independent readings do
+    not."""
+    rng, alike, alone = np.random.default_rng(4), 0, 0
+    for _ in range(20):
+        common = np.repeat(rng.normal(size=(15, 3)), 18, axis=0)
+        found = huber(arm.B, arm.observed(arm.errors(rng)[0] + common), 3)
+        alike += covers(found, arm, arm.configuration)
+        alone += covers(found, arm)
+    low, _ = binomial_band(20 * 9 // 3, 0.95)
+    assert alone / 3 < low <= alike / 3
+
+
+# The majority and the report.
+
+
+def kept(arm, B, y):
+    good, variance = majority(B.reshape(270, 3, -1), y.reshape(270, 3))
+    rows = np.repeat(good, 3)
+    x = np.linalg.lstsq(B[rows], y[rows])[0]
+    std = np.sqrt(np.diag(np.linalg.inv(arm.B.T @ arm.B)))
+    return good, variance, np.abs((x - arm.x) / std).max()
+
+
+def test_thirty_per_cent_of_blunders_do_not_carry_it_away(arm):
+    """1 to 10 mm at a noise of 10 µm on 81 of 270 readings.  The other 70 % alone have √(1/0.7)
+    times the standard deviations, and 9 parameters stay below 4.5 of those with a
+    probability above 0.999; least squares is off by tens."""
+    noise, bad = arm.errors(np.random.default_rng(0), 0.3, 100, 1000)
+    y = arm.observed(noise)
+    good, variance, off = kept(arm, arm.B, y)
+    assert not good[bad].any() and good.mean() > 0.65
+    assert off < 4.5 * np.sqrt(1 / 0.7)
+    assert variance == pytest.approx(1.0, abs=0.2)
+
+
+def test_blunders_that_agree_on_another_answer_at_leverage_points(arm):
+    """30 % of the readings lie ten times as far out and fit another x exactly."""
+    rng = np.random.default_rng(0)
+    y = arm.observed(arm.errors(rng)[0])
+    bad = rng.permutation(270) < 81
+    rows = np.repeat(bad, 3)
+    B = np.where(rows[:, None], 10 * arm.B, arm.B)
+    y[rows] = (B @ (arm.x + 100))[rows]
+    good, _, off = kept(arm, B, y)
+    assert not good[bad].any() and off < 4.5 * np.sqrt(1 / 0.7)
+
+
+WIDE = 1e3  # deviation that the weak prior gives each parameter
+
+
+def agreeing(B, y, tests, seed=0):
+    """Readings that the fit to the others does not contradict: the majority, and from there until
+    the set stands.  `tests` is what their p-values share."""
+    good = majority(B, y, seed)[0]
+    for _ in range(30):
+        fit = FitToGood(B * WIDE, y, good, 1.0)
+        better = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / tests
+        if 2 * better.sum() <= len(better) or np.array_equal(better, good):
+            break
+        good = better
+    return good
+
+
+def report(arm, noise, seed=0):
+    """Lines 2 to 271, in the order of configuration, marker, repeat."""
+    B, y = arm.B.reshape(270, 3, -1), arm.observed(noise).reshape(270, 3)
+    good = agreeing(B, y, 4 * 270, seed)
+    residual = y - B @ np.linalg.lstsq(B[good].reshape(-1, 9), y[good].ravel())[0]
+    marker = np.array(["M1", "M2", "M3"])[arm.marker]
+    lines = np.arange(270) + 2
+    return outlier_report(B * WIDE, residual, residual, good, lines, marker, arm.configuration)
+
+
+def clean(arm, seed=0):
+    return arm.errors(np.random.default_rng(seed))[0]
+
+
+def alarms(arm, tables):
+    return sum(bool(report(arm, clean(arm, 1000 + k), seed=k).findings) for k in range(tables))
+
+
+def test_clean_tables_hardly_ever_raise_an_alarm(arm):
+    """At 1 % per table more than 4 alarms in 30 tables have a probability below 1e-4."""
+    assert alarms(arm, 30) <= stats.binom.isf(1e-4, 30, FALSE_ALARM)
+
+
+def test_a_displaced_marker_is_one_finding_though_none_of_its_readings_is_beyond_the_noise(arm):
+    """Its 90 readings are not listed one by one, nor the configurations that it was seen in."""
+    noise = clean(arm)
+    noise[arm.marker == 1] += [0.0, 0.8, 0.0]
+    (finding,) = report(arm, noise).findings
+    assert (finding.level, finding.name, finding.pattern) == ("marker", "M2", "common")
+    assert len(finding.readings) == 90
+    assert finding.error == pytest.approx(0.8, abs=0.7) and finding.beyond < 9
+
+
+def test_several_faults_are_told_apart(arm):
+    noise = clean(arm)
+    noise[arm.marker == 1] += [0.0, 2.0, 0.0]
+    noise[arm.configuration == 3] += [0.0, 0.0, 15.0]
+    noise[250] += 30.0
+    found = {(f.level, f.name) for f in report(arm, noise).findings}
+    assert found == {("marker", "M2"), ("configuration", "3"), ("reading", "252")}
+
+
+def test_scattered_blunders_make_no_bad_marker_configuration_or_block(arm):
+    """30 % at random: all of them found, one by one, and at most one good reading accused."""
+    noise, bad = arm.errors(np.random.default_rng(0), 0.3, 100, 1000)
+    result = report(arm, noise)
+    assert {f.level for f in result.findings} == {"reading"}
+    accused = {f.readings[0] for f in result.findings}
+    assert set(bad) <= accused and len(accused) <= len(bad) + 1
+    assert not result.good[bad].any()
