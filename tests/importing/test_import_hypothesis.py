@@ -1,23 +1,20 @@
 """Whatever stands in files and mappings: a table that reads back, or an InputError."""
 
 import tempfile
-from datetime import datetime
 from pathlib import Path
 
 import numpy as np
+import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from support.tracker_exports import imported, krl, rapid
+from support.tracker_exports import imported
 
 from elastocal.errors import InputError
-from elastocal.importing.foreign_text import ForeignText, program_rows, seconds_of
-from elastocal.importing.mapping_file import read_mapping
+from elastocal.importing.joining import dwells
 
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 MAPPING = """
 [[source]]
-[source.text]
-{text}
 [source.columns]
 name = 1
 q1_deg = 2
@@ -40,8 +37,7 @@ def test_what_was_written_is_read(rows, delimiter, decimal, encoding):
         for c, m, *numbers in rows
     ]
     with tempfile.TemporaryDirectory() as folder:
-        text = "\n".join(lines).encode(encoding)
-        found = imported(Path(folder), {"a.csv": text}, MAPPING.format(text=""))
+        found = imported(Path(folder), {"a.csv": "\n".join(lines).encode(encoding)}, MAPPING)
     table = found.table
     expected = np.array([row[2:] for row in rows])
     np.testing.assert_allclose(np.degrees(table.q[:, 0]), expected[:, 0], atol=1e-9)
@@ -50,14 +46,20 @@ def test_what_was_written_is_read(rows, delimiter, decimal, encoding):
     assert labels == [row[0] for row in rows]
 
 
+PROGRAM = '[[source]]\nrole = "both"\npreset = "{}"\ncolumns = {{ x_mm = 2, y_mm = 3, z_mm = 4 }}\n'
+
+
 @QUIET
 @given(
-    st.binary(max_size=200) | st.text(";,\t\n\"'. 0123456789ab_µ-", max_size=120).map(str.encode)
+    st.binary(max_size=200)
+    | st.text(";,\t\n\"'. 0123456789ab_µ-", max_size=120).map(str.encode)
+    | st.text('{}[](),;:=!."A1E6XYZ \n-+0189ax', max_size=80).map(str.encode),
+    st.sampled_from([MAPPING, PROGRAM.format("kuka"), PROGRAM.format("abb")]),
 )
-def test_any_bytes_are_a_table_or_refused(data):
+def test_any_bytes_are_a_table_or_refused(data, mapping):
     with tempfile.TemporaryDirectory() as folder:
         try:
-            found = imported(Path(folder), {"a.csv": data}, MAPPING.format(text=""))
+            found = imported(Path(folder), {"a.csv": data}, mapping)
         except InputError as error:
             assert "a.csv" in str(error) or "the table" in str(error) or "data.csv" in str(error)
         else:
@@ -75,8 +77,6 @@ KEYS = st.sampled_from(
     ["source", "columns", "preset", "text", "names", "join", "joints", "loads", "x_mm", "sign",
      "coupling", "by", "pattern", "files", "units", "full", "decimal"]
 )  # fmt: skip
-
-
 TABLES = (
     VALUE
     | st.dictionaries(KEYS, VALUE, max_size=3)
@@ -87,48 +87,39 @@ TABLES = (
 @QUIET
 @given(st.dictionaries(KEYS, TABLES, max_size=4))
 def test_any_mapping_is_read_or_refused_by_name(data):
-    import tomli_w
-
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "mapping.toml"
-        path.write_text(tomli_w.dumps(data), encoding="utf-8")
         try:
-            read_mapping(path)
+            imported(Path(folder), {}, tomli_w.dumps(data))
         except InputError as error:
-            assert "mapping.toml" in str(error)
+            assert "mapping.toml" in str(error) or "no files" in str(error)
 
 
-@QUIET
-@given(st.text('{}[](),;:=!."A1E6XYZ \n-+0189ax', max_size=80))
-def test_any_program_text_is_read_or_refused(text):
-    for kind in ("krl", "rapid"):
-        try:
-            found = program_rows(ForeignText("f", "ASCII", text.split("\n")), kind)
-        except InputError as error:
-            assert str(error).startswith("f")
-        else:
-            assert found.rows and all(len(c) == len(found.header) for _, c in found.rows)
+STEPS = st.lists(st.tuples(st.sampled_from([0.1, 0.5, 2.0]), st.integers(-2, 2),
+                           st.integers(-1, 1)), min_size=1, max_size=40)  # fmt: skip
 
 
-@QUIET
-@given(st.lists(st.tuples(*[st.floats(-360, 360).map(lambda v: round(v, 3))] * 6),
-                min_size=1, max_size=5))  # fmt: skip
-def test_programs_hold_what_was_written(poses):
-    q = np.array(poses)
-    for text, kind in ((krl(q), "krl"), (rapid(q), "rapid")):
-        found = program_rows(ForeignText("f", "ASCII", text.split("\n")), kind)
-        values = [[float(cell) for cell in cells[1:7]] for _, cells in found.rows]
-        np.testing.assert_array_equal(values, q)
+def plainly(time, q, still, shortest):
+    """The longest runs from the start on, row by row, as the definition says."""
+    found, start = [], 0
+    while start < len(q):
+        end = start
+        while end + 1 < len(q) and (np.ptp(q[start : end + 2], axis=0) <= still).all():
+            end += 1
+        if end > start and time[end] >= time[start] + shortest:
+            found.append((start, end))
+            start = end
+        start += 1
+    return found
 
 
-@QUIET
-@given(st.datetimes(min_value=datetime(1990, 1, 1)))
-def test_times_are_seconds(moment):
-    whole = moment.replace(microsecond=0)
-    form = "%d.%m.%Y %H:%M:%S"
-    later = whole.replace(second=(whole.second + 30) % 60)
-    texts = [whole.strftime(form), later.strftime(form)]
-    before, after = seconds_of("f", [1, 2], texts, [form])
-    assert after - before == later.second - whole.second
-    without, utc = seconds_of("f", [1, 2], [whole.isoformat(), whole.isoformat() + "Z"], [])
-    assert without == utc
+@settings(max_examples=300, deadline=None)
+@given(STEPS, st.sampled_from([0.0, 1.0, 2.5]))
+def test_dwells_are_as_the_definition_says_whatever_the_sampling(steps, shortest):
+    time = np.cumsum([dt for dt, _, _ in steps])
+    q = np.cumsum([(a, b) for _, a, b in steps], axis=0).astype(float)
+    still = np.array([1.0, 0.0])
+    first, last, standing = dwells(time, q, still, shortest)
+    ends = list(zip(first, last, strict=True))
+    assert ends == plainly(time, q, still, shortest)
+    for (a, b), there in zip(ends, standing, strict=True):
+        np.testing.assert_array_equal(there, np.median(q[a : b + 1], axis=0))

@@ -1,5 +1,7 @@
 """Wrong mappings and data are told by file, key, line and remedy; likely mistakes of units too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.tracker_exports import (
@@ -11,6 +13,7 @@ from support.tracker_exports import (
     spatialanalyzer,
 )
 
+from elastocal.cell.work_cell import read_cell
 from elastocal.errors import InputError
 
 DATA = "name,x,y,z,a\n" + "".join(f"{i}_M1,{100 * i},{i},{i},{7 * i}\n" for i in range(1, 7))
@@ -28,10 +31,6 @@ q1_deg = "a"
 def refused(tmp_path, match, mapping=GOOD, **files):
     with pytest.raises(InputError, match=match):
         imported(tmp_path, files or {"data.csv": DATA}, mapping)
-
-
-def test_the_mapping_itself_is_right(tmp_path):
-    assert len(imported(tmp_path, {"data.csv": DATA}, GOOD).table) == 6
 
 
 @pytest.mark.parametrize(
@@ -82,40 +81,30 @@ def test_mistakes_in_the_mapping(tmp_path, old, new, match):
     refused(tmp_path, match, GOOD.replace(old, new), **{"data.csv": data})
 
 
-def test_a_header_that_contradicts_the_mapping(tmp_path):
-    data = DATA.replace("name,x,", "name,x [m],")
-    refused(
-        tmp_path, r"'x \[m\]' says m, but the mapping has x_mm; write x_m", **{"data.csv": data}
-    )
+REPEATED = GOOD.replace('x_mm = "x"', 'x_mm = 3\nrepeat = "x"')
+T = '[source.optional]\ntemperature_C = "T"\n'
 
 
 @pytest.mark.parametrize(
-    ("cell", "match"),
+    ("old", "new", "match", "mapping"),
     [
-        ("abc", r"data.csv, line 3, column x: 'abc' is not a number"),
+        ("name,x,", "name,x [m],", r"'x \[m\]' says m, but the mapping has x_mm; write x_m", GOOD),
+        ("200,", "abc,", r"data.csv, line 3, column x: 'abc' is not a number", GOOD),
+        ("3_M1,300,3,3,21", "3_M1,300", r"line 4: 2 columns, but q1_deg is column 5", GOOD),
+        ("name,x,y", "name,x,x", r"x_mm = 'x' could be column 2 \(x\) or 3 \(x\)",
+         GOOD.replace('y_mm = "y"', "y_mm = 3")),
+        *(("1_M1,100", f"1_M1,{text}", r"line 2: repeat '.*' is no whole number", REPEATED)
+          for text in ("²", "1.5", "9" * 40)),
     ],
-)
-def test_cells_that_are_no_numbers(tmp_path, cell, match):
-    refused(tmp_path, match, **{"data.csv": DATA.replace("200,", f"{cell},")})
-
-
-def test_too_few_columns_in_a_line(tmp_path):
-    refused(tmp_path, r"data.csv, line 4: 2 columns, but q1_deg is column 5",
-            **{"data.csv": DATA.replace("3_M1,300,3,3,21", "3_M1,300")})  # fmt: skip
-
-
-def test_an_ambiguous_column_is_to_be_numbered(tmp_path):
-    data = DATA.replace("name,x,y,z,a", "name,x,x,z,a").replace("y", "y")
-    refused(tmp_path, r"x_mm = 'x' could be column 2 \(x\) or 3 \(x\)",
-            GOOD.replace('y_mm = "y"', "y_mm = 3"), **{"data.csv": data})  # fmt: skip
+)  # fmt: skip
+def test_mistakes_in_the_file(tmp_path, old, new, match, mapping):
+    assert old in DATA and len(imported(tmp_path, {"data.csv": DATA}, GOOD).table) == 6
+    refused(tmp_path, match, mapping, **{"data.csv": DATA.replace(old, new)})
 
 
 def test_files_of_one_kind_need_the_same_columns(tmp_path):
-    mapping = GOOD + '[source.optional]\ntemperature_C = "T"\n'
-    other = DATA.replace("a\n", "a,T\n", 1).replace("7\n", "7,20\n")
-    other = "\n".join([other.split("\n")[0], "1_M1,1,2,3,4,20"])
-    refused(tmp_path, r"one.csv: has no temperature, but .*two.csv has", mapping,
-            **{"one.csv": DATA, "two.csv": other})  # fmt: skip
+    files = {"one.csv": DATA, "two.csv": "name,x,y,z,a,T\n1_M1,1,2,3,4,20"}
+    refused(tmp_path, r"one.csv: has no temperature, but .*two.csv has", GOOD + T, **files)
 
 
 @pytest.fixture(scope="module")
@@ -143,29 +132,19 @@ def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
         ("sign = [1, 1, -1, 1, 1, 1]", "sign of joint 3"),
         ("offset_deg = [0, 90, 0, 0, 0, 0]", "offset_deg -90 at joint 2"),
         ("coupling = [{ joint = 3, of = 2, factor = 1.0 }]", "factor = -1 }"),
+        ([1, 0, 2], "two columns of the positions swapped"),
+        (None, "one pose later"),
     ],
 )
 def test_what_would_make_the_readings_fit_is_named(tmp_path, readings, change, words):
-    from dataclasses import replace
-
-    from elastocal.cell.work_cell import read_cell
-
-    cell = replace(read_cell(readings[0].path), limits={})
-    found = with_cell(tmp_path, (cell, *readings[1:]), f"[joints]\n{change}\n")
+    cell, degrees, points = readings
+    cell = replace(read_cell(cell.path), limits={})
+    mapping = f"[joints]\n{change}\n" if isinstance(change, str) else ""
+    points = points[..., change] if isinstance(change, list) else points
+    log = None if change else krl(np.roll(degrees, 1, axis=0))
+    found = with_cell(tmp_path, (cell, degrees, points), mapping, log=log)
     (warning,) = [w for w in found.warnings if "nominal arm" in w]
     assert words in warning
-
-
-def test_poses_shifted_by_one_are_recognised(tmp_path, readings):
-    log = krl(np.roll(readings[1], 1, axis=0))
-    (warning,) = with_cell(tmp_path, readings, log=log).warnings
-    assert "one pose later" in warning
-
-
-@pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0], [0, 2, 1]])
-def test_swapped_columns_of_positions_are_recognised(tmp_path, readings, order):
-    (warning,) = with_cell(tmp_path, readings, points=readings[2][..., order]).warnings
-    assert "two columns of the positions swapped" in warning
 
 
 def test_joints_beyond_the_limits_are_refused_with_their_line(tmp_path, readings):
@@ -215,8 +194,6 @@ def test_units_mistaken_for_others(tmp_path, readings, length, angle, scale, tur
 
 
 def test_deflections_need_both_states(tmp_path, readings):
-    from dataclasses import replace
-
     cell, degrees, points = readings
     cell = replace(cell, model=replace(cell.model, observe="deflection"))
     name = 'load = "full"\nfiles = ["b*"]\n'
@@ -242,11 +219,3 @@ def test_numbers_of_any_size_are_told_as_implausible(tmp_path, readings):
     found = with_cell(tmp_path, readings, points=points)
     assert found.fit is None
     assert any("from the tracker" in w for w in found.warnings)
-
-
-@pytest.mark.parametrize("text", ["²", "1.5", "x", "9" * 40])
-def test_repeats_are_whole_numbers(tmp_path, text):
-    mapping = GOOD.replace('name = "name"', 'name = "name"\nrepeat = "r"')
-    data = DATA.replace("name,x,y,z,a", "name,x,y,z,a,r").replace("\n", f",{text}\n")
-    refused(tmp_path, r"line 2: repeat '.*' is no whole number", mapping,
-            **{"data.csv": data.replace(f"r,{text}", "r", 1)})  # fmt: skip

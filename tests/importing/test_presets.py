@@ -1,4 +1,7 @@
-"""Every preset reads its style, and what it reads is what was measured."""
+"""Every preset reads its style, and what it reads is what was measured, as docs show it."""
+
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +14,12 @@ from support.tracker_exports import (
     rapid,
     spatialanalyzer,
 )
+from typer.testing import CliRunner
 
+from elastocal.cli.main import app
 from elastocal.errors import InputError
-from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping
+
+PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
 
 
 @pytest.fixture(scope="module")
@@ -21,30 +27,29 @@ def readings(tmp_path_factory):
     return kr270_readings(tmp_path_factory.mktemp("cell"))
 
 
-def holds(found, degrees, points, shots=1):
+def holds(found, degrees, points):
     """The table has these joint values and points, in the order of the points."""
-    q = np.repeat(degrees, points.shape[1] * shots, axis=0)
-    xyz = np.repeat(points[:, None], shots, axis=1).reshape(-1, 3)
+    q = np.repeat(degrees, points.shape[1], axis=0)
     np.testing.assert_allclose(np.degrees(found.table.q), q, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.table.position * 1e3, xyz, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.table.position * 1e3, points.reshape(-1, 3), atol=1e-9)
     names = [found.table.marker_names[m] for m in found.table.marker]
     assert names == list(MARKERS) * (len(names) // len(MARKERS))
 
 
-TRACKERS = {
-    "spatialanalyzer": spatialanalyzer,
-    "polyworks": lambda p: delimited(p, "Name\tMeas X (mm)\tMeas Y (mm)\tMeas Z (mm)", "\t"),
-    "leica": lambda p: delimited(p, "Point ID;X [mm];Y [mm];Z [mm]", ";", ","),
-    "faro": lambda p: delimited(p, "Feature,X (mm),Y (mm),Z (mm)"),
-}
-
-
-@pytest.mark.parametrize("tracker", TRACKERS)
-@pytest.mark.parametrize("log", ["kuka", "abb"])
-def test_tracker_and_controller(tmp_path, readings, tracker, log):
+@pytest.mark.parametrize(
+    ("tracker", "export", "log"),
+    [
+        ("spatialanalyzer", spatialanalyzer, "abb"),
+        ("polyworks", lambda p: delimited(p, "Name\tMeas X (mm)\tMeas Y (mm)\tMeas Z (mm)", "\t"),
+         "kuka"),
+        ("leica", lambda p: delimited(p, "Point ID;X [mm];Y [mm];Z [mm]", ";", ","), "abb"),
+        ("faro", lambda p: delimited(p, "Feature,X (mm),Y (mm),Z (mm)"), "kuka"),
+    ],
+)  # fmt: skip
+def test_tracker_and_controller(tmp_path, readings, tracker, export, log):
     cell, degrees, points = readings
-    files = {"points.txt": TRACKERS[tracker](points), "poses.txt": (
-        krl(degrees) if log == "kuka" else rapid(degrees))}  # fmt: skip
+    poses = krl(degrees) if log == "kuka" else rapid(degrees)
+    files = {"points.txt": export(points), "poses.txt": poses}
     found = imported(tmp_path, files, presets=(tracker, log), cell=cell)
     holds(found, degrees, points)
     assert found.joined.how == "name"
@@ -62,7 +67,6 @@ def test_joint_states_are_ordered_by_their_names(tmp_path, readings):
         ",".join(["1", str(10**18 + i), *names, *(f"{v:.12f}" for v in np.radians(q[order]))])
         for i, q in enumerate(degrees)
     ]
-    log = "\n".join([",".join(head), *rows])
     mapping = """
 [[source]]
 preset = "spatialanalyzer"
@@ -74,32 +78,39 @@ names = ["joint_a1", "joint_a2", "joint_a3", "joint_a4", "joint_a5", "joint_a6"]
 [join]
 by = "order"
 """
+    log = "\n".join([",".join(head), *rows])
     files = {"points.txt": spatialanalyzer(points), "joints.csv": log}
     holds(imported(tmp_path, files, mapping, cell=cell), degrees, points)
 
 
-def test_units_of_the_axes_comment_decide(tmp_path, readings):
+def test_the_unit_is_that_of_the_axes_comment_or_asked_for(tmp_path, readings):
     _, degrees, points = readings
+    both = "spatialanalyzer", "kuka"
     files = {"p.txt": spatialanalyzer(points / 25.4, unit="in"), "j.dat": krl(degrees)}
-    found = imported(tmp_path, files, presets=("spatialanalyzer", "kuka"))
+    found = imported(tmp_path, files, presets=both)
     np.testing.assert_allclose(found.table.position * 1e3, points.reshape(-1, 3), atol=0.01)
-
-
-def test_no_unit_is_guessed(tmp_path, readings):
-    _, degrees, points = readings
-    text = spatialanalyzer(points).replace("// AXES", "// axes unknown")
-    files = {"p.txt": text.replace("(mm)", ""), "j.dat": krl(degrees)}
+    files["p.txt"] = files["p.txt"].replace("(in)", "")
     with pytest.raises(InputError, match=r"column 3.*no unit.*length_unit='mm'"):
-        imported(tmp_path, files, presets=("spatialanalyzer", "kuka"))
+        imported(tmp_path, files, presets=both)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_mappings_with_a_comment_on_what_they_read(name):
-    assert preset_text(name).startswith("# ")
-    (source,) = read_mapping(None, (name,)).sources
-    assert source.columns and source.role in ("points", "joints", "both")
+def test_the_preview_shown_is_what_is_printed(tmp_path, monkeypatch):
+    (block,) = re.findall(r"```console\n\$ (elastocal import points.*?)```", PAGE, re.S)
+    command, _, shown = block.replace("\\\n", " ").partition("\n")
+    _, degrees, points = kr270_readings(tmp_path)
+    (tmp_path / "points.txt").write_text(spatialanalyzer(points), encoding="utf-8")
+    (tmp_path / "poses.dat").write_text(krl(degrees), encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "100")
+    result = CliRunner().invoke(app, command.split()[1:], catch_exceptions=False)
+    assert result.exit_code == 0
+    printed = [" ".join(line.split()) for line in result.stdout.splitlines()]
+    for line in (" ".join(line.split()) for line in shown.splitlines()):
+        if line and line != "..." and not line.startswith("Nominal arm"):
+            assert line in printed
 
 
-def test_unknown_preset_names_the_nearest():
-    with pytest.raises(InputError, match=r"'kuca'.*'kuka'"):
-        preset_text("kuca")
+def test_the_mapping_shown_is_one_and_takes_the_files_it_names(tmp_path):
+    (text,) = re.findall(r"```toml mapping\n(.*?)```", PAGE, re.S)
+    with pytest.raises(InputError, match=r"mapping.toml: no file fits files = 'loaded\*.csv'"):
+        imported(tmp_path, {"unloaded.txt": "", "poses.dat": ""}, text)

@@ -32,52 +32,47 @@ def readings(tmp_path_factory):
     return kr270_readings(tmp_path_factory.mktemp("cell"))
 
 
-def read_by_a_tracker(points, angle="deg", height="zenith", clockwise=False, second_face=False):
+def read_by_a_tracker(points, angle="deg", height="zenith", clockwise=False):
     """(n, 3): distance, azimuth and height angle of points (n, 3), by atan2 and nothing of ours."""
     x, y, z = points.T
     az = np.arctan2(-y if clockwise else y, x)
     zen = np.arctan2(np.hypot(x, y), z)
-    if second_face:
-        az, zen = az + np.pi, 2 * np.pi - zen
     up = zen if height == "zenith" else np.pi / 2 - zen
     to = TURN[angle] / (2 * np.pi)
     return np.column_stack([np.linalg.norm(points, axis=1), az % (2 * np.pi) * to, up * to])
 
 
-def written(polar, head="P;D;Hz;V", poses=10):
-    names = [f"P{i}_{m}" for i in range(1, poses + 1) for m in MARKERS]
+PLAIN = MAPPING.format(length="mm", angle="deg", height="zenith", extra="")
+
+
+def brought_in(tmp_path, readings, polar, mapping=PLAIN):
+    names = [f"P{i}_{m}" for i in range(1, 11) for m in MARKERS]
     rows = [";".join([n, *(f"{v:.12f}" for v in p)]) for n, p in zip(names, polar, strict=True)]
-    return "\n".join([head, *rows, ""])
-
-
-def brought_in(tmp_path, readings, polar, length="mm", angle="deg", height="zenith", extra=""):
-    mapping = MAPPING.format(length=length, angle=angle, height=height, extra=extra)
-    files = {"points.csv": written(polar), "poses.dat": krl(readings[1])}
+    files = {"points.csv": "\n".join(["P;D;Hz;V", *rows, ""]), "poses.dat": krl(readings[1])}
     return imported(tmp_path, files, mapping, cell=readings[0])
 
 
-@pytest.mark.parametrize("length", ["mm", "m"])
-@pytest.mark.parametrize("angle", list(TURN))
-@pytest.mark.parametrize("height", ["zenith", "elevation"])
-@pytest.mark.parametrize("clockwise", [False, True])
+@pytest.mark.parametrize(
+    ("length", "angle", "height", "clockwise"),
+    [
+        ("mm", "deg", "zenith", False),
+        ("m", "gon", "elevation", True),
+        ("mm", "rad", "zenith", True),
+    ],
+)
 def test_every_unit_and_sense_gives_the_positions_back(
     tmp_path, readings, length, angle, height, clockwise
 ):
     points = readings[2].reshape(-1, 3)
     polar = read_by_a_tracker(points, angle, height, clockwise)
+    if height == "zenith":  # the second face
+        polar[::2, 1:] = np.array([0.5, 1.0]) * TURN[angle] + np.array([1, -1]) * polar[::2, 1:]
     polar[:, 0] /= FACTORS["length"][length]
     extra = 'azimuth = "clockwise"' if clockwise else ""
-    found = brought_in(tmp_path, readings, polar, length, angle, height, extra)
+    mapping = MAPPING.format(length=length, angle=angle, height=height, extra=extra)
+    found = brought_in(tmp_path, readings, polar, mapping)
     np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
     assert found.warnings == ()
-
-
-def test_no_unit_of_an_angle_is_guessed(tmp_path, readings):
-    polar = read_by_a_tracker(readings[2].reshape(-1, 3))
-    files = {"points.csv": written(polar, "Point;Range mm;Azimuth;Zenith"),
-             "poses.dat": krl(readings[1])}  # fmt: skip
-    with pytest.raises(InputError, match=r"'Zenith' state no unit; give angle_unit='deg'"):
-        imported(tmp_path, files, presets=("spherical", "kuka"))
 
 
 def test_azimuths_counted_the_other_way_are_told_with_a_cell(tmp_path, readings):
@@ -100,10 +95,8 @@ def test_azimuths_counted_the_other_way_are_told_with_a_cell(tmp_path, readings)
 )  # fmt: skip
 def test_mistakes_in_the_mapping_are_told(tmp_path, readings, change, told):
     polar = read_by_a_tracker(readings[2].reshape(-1, 3))
-    mapping = change(MAPPING.format(length="mm", angle="deg", height="zenith", extra=""))
-    files = {"points.csv": written(polar), "poses.dat": krl(readings[1])}
     with pytest.raises(InputError, match=told):
-        imported(tmp_path, files, mapping)
+        brought_in(tmp_path, readings, polar, change(PLAIN))
 
 
 @pytest.mark.parametrize(

@@ -1,29 +1,28 @@
-"""Encodings, delimiters, decimal marks, preambles, and robot programs as text."""
+"""Encodings, delimiters, marks of numbers, preambles, robot programs, and units in headers."""
 
 import numpy as np
 import pytest
 from support.tracker_exports import imported
 
 from elastocal.errors import InputError
-from elastocal.importing.foreign_text import ForeignText, program_rows, read_lines
 from elastocal.units import convert, split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]
-NAMED = """
+HEADER = [*(f"Gelenkstück {i}" for i in (1, 2, 3)), "X [mm]", "Y [mm]", "Z [mm]"]
+MAPPING = """
 [[source]]
+[source.text]
+{text}
 [source.columns]
-q1_deg = "Achse 1"
-q2_deg = "Achse 2"
-q3_deg = "Achse 3"
+"q#_deg" = "Gelenkstück #"
 x_mm = "X"
 y_mm = "Y"
 z_mm = "Z"
 """
-HEADER = ["Achse 1", "Achse 2", "Achse 3", "X [mm]", "Y [mm]", "Z [mm]"]
 
 
-def text_of(delimiter, decimal, header=HEADER, thousands=""):
-    lines = [delimiter.join(header)]
+def text_of(delimiter, decimal, thousands=""):
+    lines = [delimiter.join(HEADER)]
     for row in ROWS:
         cells = [f"{v:,}".replace(",", thousands and "T").replace(".", decimal) for v in row]
         lines.append(delimiter.join(cells).replace("T", thousands))
@@ -37,92 +36,75 @@ def check(found):
 
 
 @pytest.mark.parametrize(
-    ("delimiter", "decimal"),
-    [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ",")],
+    ("delimiter", "decimal", "encoding", "thousands"),
+    [
+        (",", ".", "utf-8-sig", ""),
+        ("\t", ",", "cp1252", "."),
+        (";", ".", "utf-16", "'"),
+        (";", ",", "utf-8", " "),
+    ],
 )
-def test_delimiters_and_decimal_marks(tmp_path, delimiter, decimal):
-    check(imported(tmp_path, {"a.csv": text_of(delimiter, decimal)}, NAMED))
+def test_styles_of_tables(tmp_path, delimiter, decimal, encoding, thousands):
+    text = text_of(delimiter, decimal, thousands).encode(encoding)
+    if thousands:
+        with pytest.raises(InputError, match=r"a.csv, line 2, column X \[mm\].*1.{1,2}234.5"):
+            imported(tmp_path, {"a.csv": text}, MAPPING.format(text=""))
+    told = f'thousands = "{thousands}"' if thousands else ""
+    check(imported(tmp_path, {"a.csv": text}, MAPPING.format(text=told)))
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252"])
-def test_encodings(tmp_path, encoding):
-    header = [f"{h.replace('Achse', 'Gelenkstück')}" for h in HEADER]
-    mapping = NAMED.replace("Achse", "Gelenkstück")
-    check(imported(tmp_path, {"a.csv": text_of(";", ",", header).encode(encoding)}, mapping))
-
-
-@pytest.mark.parametrize(("thousands", "decimal"), [(".", ","), ("'", "."), (" ", ",")])
-def test_thousands_separators(tmp_path, thousands, decimal):
-    mapping = NAMED.replace("[source.columns]", f'[source.text]\nthousands = "{thousands}"\n'
-                            "[source.columns]")  # fmt: skip
-    check(imported(tmp_path, {"a.csv": text_of(";", decimal, thousands=thousands)}, mapping))
-
-
-def test_preamble_repeated_headers_and_footers(tmp_path):
+def test_preamble_repeated_headers_footers_and_rows_without_a_value(tmp_path):
     lines = text_of(";", ".").splitlines()
-    text = "\n".join(["Report; of today", "", *lines[:2], lines[0], lines[2], "2 points exported"])
+    lines = ["Report; of today", "", *lines[:2], lines[0], lines[2], "2 points exported"]
+    files = {"a.csv": "\n".join([*lines, "12;;13;1;2;3"])}
     with pytest.raises(InputError, match=r"line 7: 1 columns.*ignore"):
-        imported(tmp_path, {"a.csv": text}, NAMED)
-    mapping = NAMED.replace("[source.columns]", "[source.text]\nignore = 'exported$'\n"
-                            "[source.columns]")  # fmt: skip
-    found = imported(tmp_path, {"a.csv": text}, mapping)
+        imported(tmp_path, files, MAPPING.format(text=""))
+    found = imported(tmp_path, files, MAPPING.format(text="ignore = 'exported$'"))
     check(found)
-    assert [line for line, _ in found.understood[0].ignored] == [1, 5, 7]
+    ignored = found.understood[0].ignored
+    assert [line for line, _ in ignored] == [1, 5, 7, 8]
+    assert ignored[-1][1] == "no value in column Gelenkstück 2"
 
 
-def test_rows_without_a_value_are_left_out_by_name(tmp_path):
-    text = text_of(";", ".") + "12;;13;1;2;3\n"
-    found = imported(tmp_path, {"a.csv": text}, NAMED)
-    check(found)
-    assert found.understood[0].ignored == ((4, "no value in column Achse 2"),)
+POINT = '[[source]]\nrole = "points"\ncolumns = {x_mm = "x", y_mm = "y", z_mm = "z"}\n'
+KRL = "$AXIS_ACT={E6AXIS: A1 1.5, A2 -2E1,\n A3 3, A4 4, A5 5, A6 6}\nPOS Q={X 1,Y 2,Z 3}\n"
+KRL += "DECL AXIS P[2]={A1 7,A2 8,A3 9,A4 1,A5 2,A6 3} ; {A1 9}"
+RAPID = """\
+PERS jointtarget j{2}:=[[[1.5,-20,3,4,5,6],[1.5,9E9,9E9,9E9,9E9,9E9]],
+[[7,8,9,1,2,3],[2.5,9E9,9E9,9E9,9E9,9E9]]];
+CONST robtarget r:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
+CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];"""
 
 
-def program(text, kind):
-    return program_rows(ForeignText("f", "ASCII", text.split("\n")), kind)
+def program(tmp_path, text, preset):
+    files = {"p.csv": "x,y,z\n1,2,3\n4,5,6\n", "f": text}
+    return imported(
+        tmp_path, files, f'{POINT}[[source]]\npreset = "{preset}"\n[join]\nby = "order"\n'
+    )
 
 
-def test_krl_over_several_lines_in_logs_and_arrays():
-    found = program("$AXIS_ACT={E6AXIS: A1 1.5, A2 -2E1,\n A3 3, A4 4, A5 5, A6 6}\n"
-              "DECL AXIS P[2]={A1 7,A2 8,A3 9,A4 1,A5 2,A6 3} ; {A1 9}\nPOS Q={X 1,Y 2,Z 3}",
-              "krl")  # fmt: skip
-    assert found.header == ("name", "A1", "A2", "A3", "A4", "A5", "A6")
-    assert [cells[:4] for _, cells in found.rows] == [
-        ["$AXIS_ACT", "1.5", "-2E1", "3"], ["P[2]", "7", "8", "9"]
-    ]  # fmt: skip
-    assert found.rows[1][0] == 3
-    assert found.ignored == [(4, "Q is a Cartesian position, not joint values")]
-
-
-def test_rapid_arrays_robtargets_and_original_positions():
-    found = program("PERS jointtarget j{2}:=[[[1,2,3,4,5,6],[1.5,9E9,9E9,9E9,9E9,9E9]],\n"
-              "[[7,8,9,1,2,3],[2.5,9E9,9E9,9E9,9E9,9E9]]];\n"
-              "CONST robtarget r:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
-              "CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];",
-              "rapid")  # fmt: skip
-    assert [cells[0] for _, cells in found.rows] == ["j{1}", "j{2}"]
-    assert found.header == ("name", *(f"rax_{i}" for i in range(1, 7)), "eax_a")
-    assert [line for line, _ in found.ignored] == [3, 4]
-
-
-@pytest.mark.parametrize("kind", ["krl", "rapid"])
-def test_programs_without_joint_values(kind):
-    with pytest.raises(InputError, match=r"^f: no "):
-        program("MODULE x\nENDMODULE", kind)
+@pytest.mark.parametrize(("text", "preset", "lines"), [(KRL, "kuka", [3]), (RAPID, "abb", [3, 4])])
+def test_robot_programs_over_several_lines_in_logs_and_arrays(tmp_path, text, preset, lines):
+    found = program(tmp_path, text, preset)
+    joints = [[1.5, -20, 3, 4, 5, 6], [7, 8, 9, 1, 2, 3]]
+    np.testing.assert_allclose(np.degrees(found.table.q), joints)
+    assert [line for line, _ in found.understood[1].ignored] == lines
 
 
 @pytest.mark.parametrize(
-    ("data", "message"),
+    ("text", "preset", "message"),
     [
-        (b"", "empty file"),
-        (b"PK\x03\x04abc", "workbook"),
-        (b"#ROSBAG V2.0\n", "bag"),
-        (b"a\0\0\0\0b,c\0d", "NUL characters"),
+        ("MODULE x\nENDMODULE", "kuka", "f: no "),
+        ("MODULE x\nENDMODULE", "abb", "f: no "),
+        ("XP1={A1 1,A2 B-1,A3 2}", "kuka", r"f, line 1: A2 is 'B-1', not a number"),
+        (b"", "kuka", "empty file"),
+        (b"PK\x03\x04abc", "kuka", "workbook"),
+        (b"a\0\0\0\0b,c\0d", "kuka", "NUL characters"),
     ],
 )
-def test_files_that_are_no_text(tmp_path, data, message):
-    (tmp_path / "f").write_bytes(data)
+def test_files_without_joint_values(tmp_path, text, preset, message):
     with pytest.raises(InputError, match=message):
-        read_lines(tmp_path / "f")
+        program(tmp_path, text, preset)
 
 
 @pytest.mark.parametrize(
@@ -130,10 +112,8 @@ def test_files_that_are_no_text(tmp_path, data, message):
     [
         ("X [mm]", ("X", "mm")),
         ("Z (Millimeters)", ("Z", "mm")),
-        ("A1 deg", ("A1", "deg")),
         ("x_m", ("x", "m")),
         ("Y, in", ("Y", "in")),
-        ("Force N", ("Force", "N")),
         ("field.position0", ("field.position0", None)),
         ("[mm]", ("[mm]", None)),
         ("Point ID", ("Point ID", None)),
@@ -155,16 +135,5 @@ def test_units_in_headers(header, expected):
     ],
 )
 def test_the_same_in_every_unit(values, units):
-    for value, unit in zip(values, units, strict=True):
-        found = convert(np.array([value]), unit, units[0])
-        np.testing.assert_allclose(found, values[0], rtol=1e-14)
-
-
-def test_thousands_separators_that_nobody_told_of_are_refused(tmp_path):
-    with pytest.raises(InputError, match=r"a.csv, line 2, column X \[mm\].*'1.234,5'"):
-        imported(tmp_path, {"a.csv": text_of(";", ",", thousands=".")}, NAMED)
-
-
-def test_krl_expressions_are_no_values():
-    with pytest.raises(InputError, match=r"f, line 1: A2 is 'B-1', not a number"):
-        program("XP1={A1 1,A2 B-1,A3 2}", "krl")
+    found = [convert(np.array([v]), u, units[0])[0] for v, u in zip(values, units, strict=True)]
+    np.testing.assert_allclose(found, values[0], rtol=1e-14)

@@ -34,7 +34,7 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("head", ["{marker}_{axis}", "{marker}.{axis}", "{marker} {axis}"])
+@pytest.mark.parametrize("head", ["{marker}_{axis}", "{marker} {axis}"])
 def test_every_marker_of_a_row_becomes_a_reading(tmp_path, head):
     _, degrees, points = kr270_readings(tmp_path)
     file = wide(tmp_path / "log.csv", degrees, points, head)
@@ -76,7 +76,7 @@ def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path):
 @pytest.mark.parametrize(
     ("name", "force"),
     [("log_2600N", 2600.0), ("payload_2p5kg", 2.5 * 9.80665), ("load2.6kN", 2600.0),
-     ("run3_12 kg", 12 * 9.80665), ("arm7_unloaded", 0.0), ("P12N3", 0.0), ("n100", 0.0)],
+     ("arm7_unloaded", 0.0), ("P12N3", 0.0)],
 )  # fmt: skip
 def test_a_load_in_a_files_name_is_taken_and_told(tmp_path, name, force):
     _, degrees, points = kr270_readings(tmp_path)
@@ -117,18 +117,19 @@ def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_pat
     assert done.exit_code == 0 and "column payload_kg of" in done.output
 
 
-def test_a_marker_that_lacks_a_column_is_named(tmp_path):
-    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M1_z_mm,M2_x_mm\n1,2,3,4,5\n")
-    done = run(tmp_path / "log.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
-    assert done.exit_code == 2 and "'M2' has no column for y_auto, z_auto" in done.output
+@pytest.mark.parametrize(
+    ("columns", "told"),
+    [
+        ('x_mm = "*_x"\ny_mm = "*_y"', "'M2' has no column for y_mm, as 'M2_y'"),
+        ('name = "*_name"', "* stands for the markers of a row"),
+    ],
+)
+def test_places_of_markers_that_are_not_there_are_told(tmp_path, columns, told):
+    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M2_x_mm\n1,2,3,4\n")
+    (tmp_path / "map.toml").write_text(f"[[source]]\n[source.columns]\n{columns}\n")
+    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 2 and told in done.output
     assert not (tmp_path / "data.csv").exists()
-
-
-def test_a_star_where_no_marker_stands_is_refused(tmp_path):
-    (tmp_path / "log.csv").write_text("q1_deg,M1_x\n1,2\n")
-    (tmp_path / "map.toml").write_text('[[source]]\n[source.columns]\nname = "*_name"\n')
-    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "--preview")
-    assert done.exit_code == 2 and "* stands for the markers of a row" in done.output
 
 
 def test_one_message_names_the_units_of_all_columns_that_state_none(tmp_path):
@@ -159,7 +160,7 @@ def test_a_lone_force_column_is_the_load_and_no_marker(tmp_path):
     assert {first[f"force_{a}_N"] for a in "xy"} == {"0.0"} and first["force_z_N"] == "-100.0"
 
 
-@pytest.mark.parametrize("width", [40, 60, 77])
+@pytest.mark.parametrize("width", [40, 77])
 def test_the_preview_shows_as_many_whole_columns_as_there_is_room_for(tmp_path, width):
     _, degrees, points = kr270_readings(tmp_path)
     file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
