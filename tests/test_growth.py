@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.cli.main import app
-from elastocal.compensation.commands import read_targets
+from elastocal.compensation.compensate import read_targets
 from elastocal.errors import ElastocalError
 from elastocal.files import read_json
 from elastocal.importing.assemble import import_files

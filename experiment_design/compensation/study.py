@@ -22,8 +22,7 @@ from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from elastocal.compensation.commands import read_targets
-from elastocal.compensation.compensate import compensate
+from elastocal.compensation.compensate import compensate, read_targets
 from elastocal.model.calibrated import read_calibrated, tool_point
 
 HERE = Path(__file__).resolve().parent

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
     from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
     from elastocal.cell.work_cell import Cell
-    from elastocal.compensation.commands import Targets
-    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation.compensate import Compensation, Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, IntervalKind, Method
@@ -45,8 +44,7 @@ else:
         "pandas DataFrame",
         "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
         "elastocal.cell.work_cell Cell",
-        "elastocal.compensation.commands Targets",
-        "elastocal.compensation.compensate Compensation",
+        "elastocal.compensation.compensate Compensation Targets",
         "elastocal.diagnosis.diagnosis Diagnosis",
         "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
         "elastocal.identification.options FaultyReadings IntervalKind Method",
@@ -679,7 +677,7 @@ def compensate(
 
 def check_frame(frame: str) -> None:
     """Raise InputError for a frame that targets cannot stand in."""
-    from elastocal.compensation.commands import FRAMES
+    from elastocal.compensation.compensate import FRAMES
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
     require(frame in FRAMES, told)
@@ -705,7 +703,7 @@ def _targets(
 ) -> Targets:
     import numpy as np
 
-    from elastocal.compensation.commands import Targets, read_targets, targets_at
+    from elastocal.compensation.compensate import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
         return targets

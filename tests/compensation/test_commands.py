@@ -22,8 +22,13 @@ from support.cells import (
 from support.commands import calibrated, circumstances, erring, tool_errors
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.compensation.commands import nominal_path, one_target, read_targets, targets_at
-from elastocal.compensation.compensate import compensate
+from elastocal.compensation.compensate import (
+    compensate,
+    nominal_path,
+    one_target,
+    read_targets,
+    targets_at,
+)
 from elastocal.compensation.correction_table import (
     EXACT,
     CorrectionGrid,

@@ -413,7 +413,7 @@ def compensate(
         box (X0,Y0,Z0,X1,Y1,Z1): Grid over this box in mm in the base frame, not over the joints.
         rotation (RX,RY,RZ): Rotation vector of the tool in --box, in degrees.
     """
-    from elastocal.compensation.commands import one_target
+    from elastocal.compensation.compensate import one_target
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated

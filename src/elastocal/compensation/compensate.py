@@ -1,36 +1,282 @@
-"""From targets to commands: nominal joints, their error, the command that undoes it; as files."""
+"""Commanded joints that put the real tool at its targets: targets, the nominal command of each, its
+error, the command near it that undoes it; with uncertainty and notices, as files."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from elastocal.above import Result
-from elastocal.compensation import commands
-from elastocal.compensation.commands import Commanding, Goals, Solved, Targets
-from elastocal.errors import InputError, InsufficientDataError, option
+from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
-from elastocal.measurements import families
+from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
     ToolPoint,
     lasting,
+    numbers,
     tool_point,
 )
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
+from elastocal.model.inverse_kinematics import (
+    ARM_LENGTH,
+    BoundedSearch,
+    Postures,
+    Reaching,
+    inverse_kinematics,
+    unwound,
+)
+from elastocal.model.inverse_kinematics import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import nominal_flanges, reach_of
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
+
+# Targets: where the tool is to be, and in which frame that is stated.
+
+Frame = Literal["base", "tracker"]
+FRAMES: tuple[Frame, ...] = ("base", "tracker")
+
+
+@dataclass(frozen=True)
+class Targets:
+    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.
+
+    `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
+    rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
+    without a position the tool is to be where the nominal arm has it at q.
+    """
+
+    table: Measurements
+    frame: Frame
+    position: Array | None
+    rotation: Array | None
+    q: Array | None
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def place(self, i: int) -> str:
+        return f"{self.table.source}, line {self.table.row[i]}"
+
+
+def read_targets(
+    path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
+) -> Targets:
+    """Targets of a CSV or Parquet file whose columns are those of the measurement table.
+
+    x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone,
+    or both: joints are then the nominal command to start from.  force_x_N … and circumstances
+    (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
+    (3,) N acts where the table states none.
+    """
+    table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
+    q = table.q if table.q.shape[1] else None
+    if table.position is None:
+        extra = (
+            "; a rotation alone is no target" if table.rotation is not None and q is None else ""
+        )
+        require(
+            q is not None and table.rotation is None,
+            f"{path}: the columns x_mm,y_mm,z_mm are missing; a target needs its position, or the "
+            f"nominal command q1_deg … alone{extra}",
+        )
+        require(
+            frame == "base",
+            f"{path}: targets by q1_deg … alone are where the nominal arm has the tool, which "
+            f"stands in the base frame; leave {option('frame', 'tracker')} away, or give "
+            "x_mm,y_mm,z_mm",
+        )
+    require(
+        len(table.marker_names) == 1,
+        f"{path}: targets of the markers {', '.join(table.marker_names[:4])} … in one table; the "
+        f"point of the tool is chosen by {option('point')}: split the table by marker",
+    )
+    if force is not None:
+        require(
+            not table.force.any(),
+            f"{path}: the table has forces of its own; leave {option('load')} away or drop them",
+        )
+        table = replace(table, force=np.tile(force, (len(table), 1)))
+    rotation = table.rotation
+    matrices = None if rotation is None else Rotation.from_rotvec(rotation).as_matrix()
+    return Targets(table, frame, table.position, matrices, q)
+
+
+def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
+    """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
+    what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
+    values = numbers(option("target"), text, (3, 6), what)
+    position = values[None, :3] / 1e3
+    rotation = None
+    if len(values) == 6:
+        rotation = Rotation.from_rotvec(np.radians(values[None, 3:])).as_matrix()
+    return targets_at(option("target"), position, rotation, frame, force)
+
+
+def targets_at(
+    source: str, position: Array | None, rotation: Array | None, frame: Frame,
+    force: Array | None = None, q: Array | None = None,
+) -> Targets:  # fmt: skip
+    """Targets that no table states, all under one `force` (3,) N; errors name `source`."""
+    known = position if position is not None else q
+    if known is None:
+        raise InputError(f"{source}: neither positions nor joints")
+    pull = np.zeros(3) if force is None else force
+    table = Measurements.of_poses(source, np.zeros((len(known), 0)), pull)
+    return Targets(table, frame, position, rotation, q)
+
+
+# The nominal command: what the robot would be commanded without calibration, along a path.
+
+STEP = 0.1  # rad or m between neighbours that count as one smooth piece
+LARGE = np.radians(20.0)  # a step beyond which another posture may be nearer
+LONGEST_PIECE = 256  # rows solved at once
+
+
+def nominal_path(
+    chain: Chain,
+    position: Array,
+    rotation: Array | None,
+    point: Array,
+    limits: tuple[Array, Array],
+    near: Array | None,
+    seed: int = 0,
+) -> tuple[Array, BoolArray]:
+    """Nominal joints (n, joints) that bring `point` (3,) of the flange to places along a path, and
+    whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
+
+    `position` (n, 3) m and `rotation` (n, 3, 3) of the flange, or None for any, in the base
+    frame.  The first place is reached in the posture nearest to `near` (default: the middle of
+    the joint ranges), every other from the one before it, so that neighbouring places have
+    neighbouring joints.  Where that fails, or takes a large step, the nearest of many postures
+    is taken.
+    """
+    n = len(position)
+    q, reached = np.zeros((n, chain.n_joints)), np.zeros(n, dtype=bool)
+    task = Reaching(chain, position, rotation, point, None, *limits)
+    first, length, last, begun = 0, 1, near, 0
+    ahead, leaps = None, 1  # postures of the places from `begun` on: leaps mostly come together
+    while first < n:
+        good = 0
+        if first and last is not None:  # the next places, smoothly from the last posture
+            rows = np.arange(first, min(first + length, n))
+            found = task.solve(np.tile(last, (len(rows), 1)), rows)[0]
+            errors = np.column_stack(task.errors(found, rows))
+            steps = np.abs(np.diff(np.vstack([last, found]), axis=0)).max(axis=1)
+            fits = (errors <= NOMINAL_TOLERANCE).all(axis=1)
+            fits &= steps <= np.where(rows == first, LARGE, STEP)
+            good = len(rows) if fits.all() else int(np.argmin(fits))
+            q[first : first + good], reached[first : first + good] = found[:good], True
+            length = min(2 * length, LONGEST_PIECE) if good == len(rows) else max(good, 1)
+        if not good:  # the place from anywhere
+            if ahead is None or first >= begun + len(ahead.q):
+                leaps = leaps if ahead is None else min(2 * leaps, LONGEST_PIECE)
+                begun, some = first, slice(first, first + leaps)
+                turned = None if rotation is None else rotation[some]
+                ahead = inverse_kinematics(
+                    chain, position[some], limits, rotation=turned, point=point, near=last,
+                    seed=seed,
+                )  # fmt: skip
+            q[first], reached[first] = _nearest(task, chain, ahead, first - begun, first, last)
+            good = 1
+        first += good
+        last = q[first - 1] if reached[first - 1] else last
+    return q, reached
+
+
+def _nearest(
+    task: Reaching, chain: Chain, found: Postures, k: int, place: int, near: Array | None
+) -> tuple[Array, bool]:
+    """Of row k of the postures found the nearest to `near`, or what comes nearest to the place."""
+    q, good = found.q[k], found.reached[k]
+    if near is None or not good.any():
+        return q[0], bool(good[0])
+    q = unwound(chain, q[good], near, task.lower, task.upper)
+    q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
+    if chain.n_joints > task.equations:
+        q = task.nearest(q, np.array([place]), near)
+    return q[0], True
+
+
+def jumps(task: Reaching, q: Array, usable: BoolArray) -> IntArray:
+    """Rows i whose joints leave those of row i − 1 by much more than the tool's motion asks for.
+
+    q (n, joints); rows that are not `usable` are passed over.  The measure is the step of least
+    norm that the tool's motion asks for, J⁺r, at either end; steps below 20° never count.
+    """
+    rows = np.flatnonzero(usable)
+    if len(rows) < 2:
+        return np.zeros(0, dtype=np.int64)
+    before, after = rows[:-1], rows[1:]
+    step = q[after] - q[before]
+    asked = np.zeros(len(step))
+    for ends, target in ((before, after), (after, before)):
+        r, J = task.residual(q[ends], target)
+        least = (np.linalg.pinv(J, rcond=1e-6) @ r[..., None])[..., 0]
+        asked = np.maximum(asked, np.linalg.norm(least, axis=1))
+    large = np.abs(step).max(axis=1) > LARGE
+    return np.asarray(after[large & (np.linalg.norm(step, axis=1) > 3 * asked)])
+
+
+# Commanded joints that put the calibrated tool at its targets, near nominal commands.
+
+TOLERANCE = 1e-8  # m and rad within which a target counts as reached
+
+
+@dataclass(frozen=True)
+class Goals:
+    """`position` (n, 3) m and `rotation` (n, 3, 3), or None for any, in the data's frame."""
+
+    position: Array
+    rotation: Array | None
+
+    def in_base(self, T: Array) -> Goals:
+        back = T[:, :3, :3].transpose(0, 2, 1)
+        position = np.einsum("nij,nj->ni", back, self.position - T[:, :3, 3])
+        return Goals(position, None if self.rotation is None else back @ self.rotation)
+
+
+class Commanding(BoundedSearch):
+    """r(q) of the calibrated tool against its goals, searched within the joint limits.
+
+    Levenberg–Marquardt of `BoundedSearch` with the derivative through the equilibrium.  Its steps
+    have the least norm, so that from nominal commands, from which those wanted are a few
+    milliradians away, an arm with more joints than the task has equations stays next to them.
+    """
+
+    def __init__(
+        self, tool: CalibratedTool, rows: list[NDArray], goals: Goals, lower: Array, upper: Array
+    ) -> None:
+        super().__init__(lower, upper)
+        self.tool, self.rows, self.goals = tool, rows, goals
+
+    def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
+        rotation = None if self.goals.rotation is None else self.goals.rotation[target]
+        rows = [values[target] for values in self.rows]
+        return self.tool.errors(rows, q, self.goals.position[target], rotation)
+
+    def misses(self, q: Array, target: IntArray) -> Array:
+        """Distance in m and angle in rad (R, 2) from the goals; NaN without an equilibrium."""
+        r = self.residual(q, target)[0]
+        turn = np.linalg.norm(r[:, 3:], axis=1) / ARM_LENGTH
+        return np.column_stack([np.linalg.norm(r[:, :3], axis=1), turn])
+
+    def commands(self, nominal: Array, target: IntArray) -> tuple[Array, Array]:
+        """Commands (R, joints) for the targets near nominal ones, and what they miss (R, 2)."""
+        q = self.solve(nominal, target)[0]
+        return q, self.misses(q, target)
+
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 
@@ -93,7 +339,7 @@ class Compensation(Result):
         return len(self.q)
 
     @property
-    def reached(self) -> NDArray[np.bool_]:
+    def reached(self) -> BoolArray:
         return np.array([status == REACHED for status in self.status])
 
 
@@ -130,33 +376,31 @@ def compensate(
     flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
     if targets.q is None:
         progress("nominal commands")
-        nominal = commands.nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
+        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
     else:
         check_limits(arm.model, replace(targets.table, q=targets.q))
         nominal = np.clip(targets.q, *limits)
     progress("commands")
-    search = Commanding(tool, rows, goals, *limits)
-    every = np.arange(len(targets))
-    found = search.commands(nominal, every)
-    lost = np.flatnonzero(~found.reached)
+    search, every = Commanding(tool, rows, goals, *limits), np.arange(len(targets))
+    q, after = search.commands(nominal, every)
+    lost = np.flatnonzero(~_is_reached(after))
     if targets.q is None and len(lost):
         progress(f"other postures for {len(lost)} points")
-        nominal = _other_postures(
-            search, chain, in_base, flange, place[0], limits, lost, nominal, seed
-        )
-        found = found.replaced(lost, search.commands(nominal[lost], lost))
-    before = search.misses(nominal, every)
-    status = _status(search, found, nominal)
-    reached = found.reached
+        nominal[lost] = _other_postures(
+            search, chain, in_base[lost], None if flange is None else flange[lost], place[0],
+            lost, nominal[lost], seed,
+        )  # fmt: skip
+        q[lost], after[lost] = search.commands(nominal[lost], lost)
+    before, reached = search.misses(nominal, every), _is_reached(after)
     progress("uncertainty")
-    uncertainty = _uncertainty(tool, rows, found.q, reached)
     task = Reaching(chain, in_base, flange, place[0], None, *limits)
-    path = commands.jumps(task, found.q, reached)
     result = Compensation(
-        chain, targets, point, found.q, nominal, before[0], found.miss,
-        np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
-        task.errors(nominal, every)[0], uncertainty, (),
+        chain, targets, point, q, nominal, before[:, 0], after[:, 0],
+        np.column_stack([before[:, 1], after[:, 1]]), _status(search, after, nominal), goals,
+        force, T, place, turn, task.errors(nominal, every)[0], _uncertainty(tool, rows, q, reached),
+        (),
     )  # fmt: skip
+    path = jumps(task, q, reached)
     told = [*_of_joints(result, limits, path), *_of_loads(arm, result), *_of_places(arm, result)]
     if of_one_campaign:
         told.append(
@@ -202,43 +446,40 @@ def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) 
     return Goals(position, rotation)
 
 
+def _is_reached(missed: Array) -> BoolArray:
+    return np.asarray((missed <= TOLERANCE).all(axis=1))
+
+
 def _other_postures(
     search: Commanding, chain: Chain, position: Array, flange: Array | None, place: Array,
-    limits: tuple[Array, Array], lost: NDArray[np.int64], nominal: Array, seed: int,
+    lost: IntArray, nominal: Array, seed: int,
 ) -> Array:  # fmt: skip
-    """Nominal commands (n, joints), those of the targets `lost` in another posture where the
+    """Nominal commands (lost, joints) of the targets `lost`, in another posture where the
     calibrated arm reaches them from one: the nearest to the old command."""
-    found = inverse_kinematics(
-        chain, position[lost], limits, rotation=None if flange is None else flange[lost],
-        point=place, seed=seed,
-    )  # fmt: skip
-    count = found.q.shape[1]
-    starts = found.q.reshape(len(lost) * count, -1)
+    limits = search.lower, search.upper
+    found = inverse_kinematics(chain, position, limits, rotation=flange, point=place, seed=seed)
+    n, count, joints = found.q.shape
     target = np.repeat(lost, count)
-    q, _ = search.solve(starts, target)
-    good = search.judged(q, target).reached.reshape(len(lost), count)
-    far = np.linalg.norm(found.q - nominal[lost][:, None], axis=2)
-    best = np.where(good, far, np.inf).argmin(axis=1)
-    chosen = found.q[np.arange(len(lost)), best]
-    nominal = nominal.copy()
-    nominal[lost] = np.where(good.any(axis=1, keepdims=True), chosen, nominal[lost])
-    return nominal
+    missed = search.commands(found.q.reshape(n * count, joints), target)[1]
+    good = _is_reached(missed).reshape(n, count)
+    far = np.linalg.norm(found.q - nominal[:, None], axis=2)
+    chosen = found.q[np.arange(n), np.where(good, far, np.inf).argmin(axis=1)]
+    return np.where(good.any(axis=1, keepdims=True), chosen, nominal)
 
 
-def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...]:
-    reached, lost = found.reached, ~np.isfinite(found.miss)
+def _status(search: Commanding, missed: Array, nominal: Array) -> tuple[str, ...]:
+    reached, lost = _is_reached(missed), ~np.isfinite(missed[:, 0])
     status = np.where(reached, REACHED, np.where(lost, NO_EQUILIBRIUM, NOT_REACHED)).astype(object)
     left = np.flatnonzero(~reached & ~lost)
     if len(left):
         wide = np.full(nominal.shape[1], np.inf)
         free = Commanding(search.tool, search.rows, search.goals, -wide, wide)
-        q, _ = free.solve(nominal[left], left)
-        status[left[free.judged(q, left).reached]] = LIMIT
+        status[left[_is_reached(free.commands(nominal[left], left)[1])]] = LIMIT
     return tuple(status)
 
 
 def _uncertainty(
-    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: NDArray[np.bool_]
+    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: BoolArray
 ) -> Uncertainty:
     n = len(q)
     covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
@@ -369,7 +610,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
 MARKERS_ASKED = 3  # of those on one tool one is as good as another
 
 
-def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: NDArray[np.bool_]) -> Array:
+def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: BoolArray) -> Array:
     """Standard deviation (k,) in m at the given rows of the marker that is known best there: what
     the arm's pose alone leaves unknown."""
     found = np.full(int(rows.sum()), np.inf)

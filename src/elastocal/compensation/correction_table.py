@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.compensation import commands
-from elastocal.compensation.commands import Goals, Targets
 from elastocal.compensation.compensate import (
     LARGE_CORRECTION,
     Compensation,
+    Goals,
+    Targets,
     compensate,
     in_file_units,
     joint_columns,
+    targets_at,
 )
 from elastocal.errors import InputError, option
 from elastocal.model.calibrated import (
@@ -214,10 +215,10 @@ def _mostly_inexact(
 
 def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Targets:
     if grid.joints:
-        return commands.targets_at(option("table"), None, None, "base", force, q=points)
+        return targets_at(option("table"), None, None, "base", force, q=points)
     rotation = grid.rotation
     turned = None if rotation is None else np.broadcast_to(rotation, (len(points), 3, 3))
-    return commands.targets_at(option("table"), points, turned, "base", force)
+    return targets_at(option("table"), points, turned, "base", force)
 
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
