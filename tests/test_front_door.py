@@ -24,7 +24,7 @@ from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.errors import option, options_as_flags
 from elastocal.identification.options import Options
 from elastocal.planning.design import DesignOptions
-from elastocal.report.page import FRAMES
+from elastocal.report.renderers import FRAMES
 from elastocal.saving import WRITERS
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")

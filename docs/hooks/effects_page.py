@@ -14,7 +14,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import load_chain
-from elastocal.report.formatting import display
+from elastocal.report.blocks import display
 
 STAGES = {
     "transmission": "Transmission: what the gears make of the commanded joints",

@@ -33,11 +33,10 @@ def later(*rooms: str) -> dict[str, Any]:
 
 globals().update(later("pandas DataFrame"))
 
-VIEWS = "elastocal.report.page"
-TEXTS = "elastocal.report.terminal"
+VIEWS = "elastocal.report.renderers"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
-NAMES = "elastocal.report.formatting"
+NAMES = "elastocal.report.blocks"
 
 
 class ByValue:
@@ -117,7 +116,7 @@ class Result(Saved):
 
     def __str__(self) -> str:
         """The result as the command line prints it: tables and sentences."""
-        return str(import_module(TEXTS).printed_text(self))
+        return str(import_module(VIEWS).printed_text(self))
 
     def summary(self) -> str:
         """The same text."""

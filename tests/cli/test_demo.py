@@ -15,7 +15,7 @@ def demo(folder: Path):
 
 def test_the_demo_may_be_made_again_and_says_the_same(tmp_path: Path, monkeypatch) -> None:
     # A report takes as long as all else.
-    monkeypatch.setattr("elastocal.report.page.write_page", lambda *found, **more: None)
+    monkeypatch.setattr("elastocal.report.renderers.write_page", lambda *found, **more: None)
     first = demo(tmp_path / "new" / "demo")
     assert first.exit_code == 0, first.stderr
     written = (tmp_path / "new" / "demo" / "result.json").read_text()

@@ -29,7 +29,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATH", os.environ["PATH"])  # put back what shim changes
         console_blocks.shim(made)
-        patch.setattr("elastocal.report.page.write_page", lambda *found, **more: None)
+        patch.setattr("elastocal.report.renderers.write_page", lambda *found, **more: None)
         ran("elastocal demo -q", work)
         yield work
 

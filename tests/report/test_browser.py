@@ -20,7 +20,7 @@ from support.diagnoses import EXPLAINED, HOSTILE
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.model.manipulator import Model
-from elastocal.report.page import page_of
+from elastocal.report.renderers import page_of
 
 playwright = pytest.importorskip("playwright.sync_api")
 

@@ -15,13 +15,13 @@ from support.pages import Page
 from elastocal.cell.work_cell import CertificateEntries
 from elastocal.errors import InputError
 from elastocal.identification.error_budget import gap_budget, pose_accuracy
-from elastocal.report.certificate_view import (
+from elastocal.report.blocks import length
+from elastocal.report.judgement_view import judgement
+from elastocal.report.smaller_views import (
     Certified,
     certified_values,
     pose_repeatability,
 )
-from elastocal.report.formatting import length
-from elastocal.report.judgement_view import judgement
 
 ENTRIES = CertificateEntries(
     number="<b>17</b>", laboratory="Laboratory", country="DE", customer="Customer",

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.report.formatting import (
+from elastocal.report.blocks import (
     estimate,
     length,
     plain,

@@ -33,9 +33,8 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.plan import PlanSize
 from elastocal.report import figures
-from elastocal.report.blocks import TONES
-from elastocal.report.formatting import resource
-from elastocal.report.page import page_of, write_page
+from elastocal.report.blocks import TONES, resource
+from elastocal.report.renderers import page_of, write_page
 from elastocal.simulation import simulate
 
 SCRIPT = "<script>alert(1)</script>"

@@ -17,11 +17,10 @@ from rich.cells import cell_len
 from rich.console import Console
 from support.diagnoses import EXPLAINED, MANY, MANY_UNKNOWN, NOTHING, VERDICTS
 
-from elastocal.report.blocks import ShownTable
+from elastocal.report.blocks import ShownTable, probability, settings_text
 from elastocal.report.diagnosis_view import gap_table, place_table, sensitivity
-from elastocal.report.formatting import probability, settings_text
 from elastocal.report.identification_view import parameter_table, texts, undetermined_table
-from elastocal.report.terminal import print_report
+from elastocal.report.renderers import print_report
 
 
 def printed(width: int, *arguments: Any, **how: Any) -> str:

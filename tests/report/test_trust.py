@@ -21,8 +21,8 @@ from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.result import Finding, TestErrors
 from elastocal.identification.sentences import Told
 from elastocal.report import judgement_view
-from elastocal.report.formatting import length
-from elastocal.report.page import page_of
+from elastocal.report.blocks import length
+from elastocal.report.renderers import page_of
 
 MISFIT = LackOfFit(9.0, 1e-5, 30, 20)
 

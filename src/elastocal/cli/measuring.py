@@ -109,7 +109,7 @@ def effects(
     """
     from elastocal.demo import example
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.formatting import effect_entries
+    from elastocal.report.blocks import effect_entries
 
     known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
     entries = effect_entries(known)
@@ -124,7 +124,7 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
 
     from elastocal.model.chain import names_told
     from elastocal.model.manipulator import load_chain
-    from elastocal.report.formatting import STAGES, effect_head
+    from elastocal.report.blocks import STAGES, effect_head
 
     for stage, several in groupby(entries, lambda entry: entry["stage"]):
         screen.print(f"\n{STAGES[stage].capitalize()}", style="bold")
@@ -205,7 +205,7 @@ def design(
     from elastocal.files import atomic_write_text, together
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.candidates import plan_and_names
-    from elastocal.report.terminal import print_report
+    from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
@@ -422,7 +422,7 @@ def demo(
     """
     from elastocal.cli.using import write_results
     from elastocal.demo.example import run_demo
-    from elastocal.report.terminal import print_report
+    from elastocal.report.renderers import print_report
 
     with run.progress() as progress:
         done = run_demo(folder, seed, progress)
@@ -486,8 +486,8 @@ def import_(
     from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
     from elastocal.importing.records import likely_presets
+    from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
-    from elastocal.report.terminal import print_blocks
 
     if show_preset is not None:
         say(preset_text(show_preset), end="")

@@ -76,7 +76,7 @@ def identify(
         details: Also method, noise, residuals, intervals, all lists.
     """
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.terminal import print_report
+    from elastocal.report.renderers import print_report
 
     run.writes(
         (output, ".json"), (report, PAGES), (residuals, ".csv"), (certificate, f"{PAGES} .xml")
@@ -127,7 +127,7 @@ def write_results(
     beside the estimates.
     """
     from elastocal.files import together
-    from elastocal.report.page import write_page
+    from elastocal.report.renderers import write_page
     from elastocal.saving import save_residuals, write_json
 
     with together(p for p in (output, residuals, report, certificate) if p is not None):
@@ -174,8 +174,7 @@ def diagnose(
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.page import write_page
-    from elastocal.report.terminal import print_report
+    from elastocal.report.renderers import print_report, write_page
     from elastocal.saving import save_diagnosis
 
     require(
@@ -281,7 +280,7 @@ def next_command(
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.terminal import print_report
+    from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
@@ -337,7 +336,7 @@ def compare(
     from elastocal.diagnosis.changes import compare as compared
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.terminal import print_report
+    from elastocal.report.renderers import print_report
     from elastocal.saving import write_json
 
     if old_order := new is None:
@@ -417,8 +416,8 @@ def compensate(
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import compensation_blocks
-    from elastocal.report.terminal import print_blocks
 
     # What can be wrong with the options is told before any file is read.
     verbs.check_frame(asked["frame"])
@@ -635,8 +634,8 @@ def export(
     from elastocal.export.export import export as exported
     from elastocal.export.export import write
     from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import export_blocks
-    from elastocal.report.terminal import print_blocks
     from elastocal.saving import wish_of
 
     run.writes((output, ""), (joint_correction, ".csv"))

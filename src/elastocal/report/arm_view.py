@@ -24,8 +24,7 @@ from elastocal.planning.bodies import cell_bodies, hull, mesh_hull, outward, ske
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks
-from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
-from elastocal.report.formatting import (
+from elastocal.report.blocks import (
     first_stops,
     joint_heads,
     joint_texts,
@@ -33,6 +32,7 @@ from elastocal.report.formatting import (
     load_text,
     short_name,
 )
+from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 

@@ -1,15 +1,35 @@
-"""What a result says as a list of blocks, made once; shown by terminal, page and notebook.
+"""What a result says as a list of blocks, made once and shown by terminal, page and notebook;
+numbers, names and effects as text.
 
 Each kind of result has a function that gives its `Report`.  Texts are plain: a renderer escapes
 them, typesets minus signs and decides on the layout.  A terminal shows what stands open, and with
-details the folds that are `printed`; it leaves out figures.
+details the folds that are `printed`; it leaves out figures.  Numbers have the units people think in
+and the digits that are known.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import inspect
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from elastocal.errors import InputError
+from elastocal.model.chain import numbered
+from elastocal.model.effects.catalogue import CATALOGUE, cell_of
+from elastocal.model.manipulator import load_chain
+from elastocal.text import printable
+from elastocal.units import Array
+
+if TYPE_CHECKING:
+    from elastocal.cell.work_cell import Cell
+    from elastocal.diagnosis.diagnosis import Candidate, EffectAt, FoundEffect
+    from elastocal.model.effects.base import Effect
+    from elastocal.planning.plan import Plan
 
 # good: use it; warn: use it knowing what is wrong, or look what changed; poor: do not use it.
 Tone = Literal["good", "warn", "poor"]
@@ -140,3 +160,468 @@ def unfolded(blocks: Iterable[Block], which: Callable[[Fold], bool]) -> Iterator
         elif which(block):
             yield Heading(block.summary)
             yield from unfolded(block.blocks(), which)
+
+
+# Numbers
+
+# SI unit → (factor, unit shown).
+SHOWN = {
+    "m": (1e3, "mm"),
+    "rad": (1e3, "mrad"),
+    "1": (1e6, "ppm"),
+    "rad/(N*m)": (1e6, "µrad/(N·m)"),
+    "m/N": (1e6, "µm/N"),
+    "N/m": (1e-3, "N/mm"),
+    "N*m/rad": (1e-3, "kN·m/rad"),
+    "N": (1.0, "N"),
+    "kg": (1.0, "kg"),
+    "m/s": (3.6e9, "µm/h"),
+    "rad/s": (3.6e9, "µrad/h"),
+    "1/K": (1e6, "ppm/K"),
+}
+MOST_DECIMALS = 9
+
+
+def display(value: float, unit: str) -> tuple[float, str]:
+    """`value` in SI `unit` as people read it: 2.87e-7, "rad/(N*m)" → 0.287, "µrad/(N·m)".
+
+    A unit that is not listed keeps its value, written with proper symbols.
+    """
+    if unit in SHOWN:
+        factor, text = SHOWN[unit]
+        return value * factor, text
+    return value, unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
+
+
+def with_uncertainty(value: float, half: float) -> tuple[str, str]:
+    """Value and ± half width with the digits the half width allows: "0.287", "0.003".
+
+    The half width gets two digits where it begins with 1 or 2, else one; hundreds and more
+    are rounded off as well.
+    """
+    if not (math.isfinite(value) and math.isfinite(half)) or half <= 0:
+        return plain(value), plain(half)
+    exponent = math.floor(math.log10(half))
+    digits = 2 if half / 10.0**exponent < 2.95 else 1
+    decimals = digits - 1 - exponent
+    if decimals > MOST_DECIMALS:
+        size = math.floor(math.log10(abs(value))) if value else exponent
+        return f"{value:.{min(max(size + decimals, 0), 15)}e}", f"{half:.{digits - 1}e}"
+    return _fixed(value, decimals), _fixed(half, decimals)
+
+
+def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
+    """SI value and half width as text: value, ± half width, unit."""
+    shown, text = display(value, unit)
+    return *with_uncertainty(shown, display(half, unit)[0]), text
+
+
+def with_ends(value: float, low: float, high: float) -> tuple[str, str]:
+    """Value and interval with the digits that `resolution` allows: "0.000", "[0.000, 0.013]"."""
+    size = resolution(value, low, high)
+    ends = ("∞" if v == math.inf else "-∞" if v == -math.inf else rounded_alike(v, size)
+            for v in (low, high))  # fmt: skip
+    return rounded_alike(value, size), f"[{', '.join(ends)}]"
+
+
+def resolution(value: float, low: float, high: float) -> float:
+    """The half width whose digits a lopsided interval is shown with, 0 where both ends are open.
+
+    Its shorter side gets two digits, unless that is empty, without an end, or below a tenth of
+    the longer.
+    """
+    sides = [side for side in (value - low, high - value) if 0 < side < math.inf]
+    if not sides:
+        return 0.0
+    return 1.5 * 10.0 ** math.floor(math.log10(max(min(sides), max(sides) / 10)))
+
+
+def rounded_alike(value: float, half: float) -> str:
+    """`value` with the digits that `half` allows: a true value beside its estimate."""
+    return with_uncertainty(value, half)[0]
+
+
+def plain(value: float) -> str:
+    """A number without known uncertainty, such as a nominal value: at most six digits."""
+    if not math.isfinite(value):
+        return "–"
+    return f"{value + 0.0:.6g}"
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A finite number rounded to `digits` digits, without an exponent where it is readable."""
+    if value == 0 or not 1e-5 < abs(value) < 1e7:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
+    return _fixed(value, decimals)
+
+
+def length(metres: float) -> str:
+    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
+    if not math.isfinite(metres):
+        return "not available"
+    if abs(metres) < 0.9995e-3:
+        return f"{significant(metres * 1e6)} µm"
+    if abs(metres) < 0.9995:
+        return f"{significant(metres * 1e3)} mm"
+    return f"{significant(metres)} m"
+
+
+def newtons(force: Iterable[float]) -> str:
+    """ "(0, 0, -2600) N"."""
+    return f"({', '.join(f'{v + 0.0:g}' for v in force)}) N"
+
+
+def load_text(force: Iterable[float]) -> str:
+    return newtons(force) if any(force) else "unloaded"
+
+
+def loads_text(forces: Array, one: str, several: str) -> str:
+    """Forces in the words for `one` of them, or for their number and how large they are."""
+    if len(forces) == 1:
+        return one.format(newtons(forces[0]))
+    sizes = [math.hypot(*force) for force in forces]
+    return f"{several.format(len(sizes))}, {min(sizes):.4g} to {max(sizes):.4g} N"
+
+
+def _fixed(value: float, decimals: int) -> str:
+    """Rounded, also to tens, and never -0."""
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}"
+
+
+def short_name(name: str, most: int = 12) -> str:
+    """A printable name that fits a figure's axis."""
+    text = printable(name)
+    return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def counted(n: int, one: str, many: str | None = None) -> str:
+    """ "1 pose", "2 poses"."""
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
+def signed(value: float, told: Callable[[float], str] = significant) -> str:
+    return f"{'-' if value < 0 else '+'}{told(abs(value))}"
+
+
+MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
+
+
+def typeset(text: str) -> str:
+    """With proper minus signs before numbers and between terms, not in names."""
+    return MINUS.sub("−", text)
+
+
+def together(parts: Sequence[str], last: str = "and") -> str:
+    """ "a, b and c"."""
+    return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
+
+
+def capital(text: str) -> str:
+    """As a sentence begins; a symbol such as p or ρ₀ stays as it is."""
+    return text if text[1:2] in (" ", "₀") else f"{text[:1].upper()}{text[1:]}"
+
+
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    return f"{capital(text.rstrip('.'))}."
+
+
+def title_of(*names: str) -> str:
+    """Robot and cell, once where they have the same name."""
+    return printable(" – ".join(name for name in dict.fromkeys(names) if name))
+
+
+MOST_FAULTY = 100  # rows of the table of outliers
+
+
+def outlier_blocks(
+    title: str, found: Sequence[tuple[Any, float, float]]
+) -> list[ShownTable | Sentence]:
+    """Readings beyond the noise: each with its line and names, its error in m, and that over the
+    noise."""
+    rows = [
+        (str(o.line), printable(o.configuration), printable(o.marker), length(error),
+         significant(ratio))
+        for o, error, ratio in found[:MOST_FAULTY]
+    ]  # fmt: skip
+    heads = ("line", "configuration", "marker", "error", "error / noise")
+    more = len(found) - len(rows)
+    blocks: list[ShownTable | Sentence] = [ShownTable(heads, rows, (1, 2), title=title)]
+    return [*blocks, Sentence(f"and {more} more", soft=True)] if more else blocks
+
+
+def budget_table(
+    steps: Sequence[tuple[str, float, tuple[float, float]]], floor: tuple[str, float] | None
+) -> ShownTable:
+    """Steps (name, held-out rms in m, its 95 % interval) and what each changes; `floor` last."""
+    rows: list[tuple[str, ...]] = []
+    for k, (name, rms, ci95) in enumerate(steps):
+        change = signed(rms - steps[k - 1][1], length) if k else ""
+        rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
+    if floor is not None:
+        rows.append((floor[0], length(floor[1]), "", ""))
+    heads = ("model", "held-out rms", "95 %", "change")
+    return ShownTable(heads, rows, title="Error budget (3-D rms error at held-out poses)")
+
+
+def joint_heads(kinds: Sequence[str]) -> list[str]:
+    return [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
+
+
+def joint_texts(q: Iterable[float], kinds: Sequence[str], decimals: int = 2) -> list[str]:
+    """Joints q (n,) in rad or m as texts in ° or mm."""
+    return [
+        f"{math.degrees(v) if kind == 'revolute' else v * 1e3:.{decimals}f}"
+        for v, kind in zip(q, kinds, strict=True)
+    ]
+
+
+def first_stops(plan: Plan) -> dict[int, int]:
+    """Pose → its first place in the order of execution, from 1."""
+    stops = reversed(list(enumerate(plan.execution.stops)))
+    return {stop.pose: k + 1 for k, stop in stops if not stop.again}
+
+
+def resource(name: str) -> str:
+    """The text of a file beside this module."""
+    return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
+
+
+# Effects in words
+
+# Places that are the only one their effects have: "base drift", not "base drift at base".
+SINGLE = ("base", "wrist", "load", "tracker", "arm")
+STAGES = {
+    "transmission": "transmission",
+    "geometry": "links",
+    "load": "loads",
+    "compliance": "compliance",
+    "tool": "tool and markers",
+    "tracker": "tracker",
+}
+LONG_TIME = 120.0  # s, from which on times are told in minutes
+
+
+def plain_name(name: str) -> str:
+    """ "gear_eccentricity" → "gear eccentricity"."""
+    return printable(name).replace("_", " ")
+
+
+def place(where: str) -> str:
+    """ "joint2" → "joint 2", "marker:M_1" → "marker M_1", "all" → "all links"."""
+    if where.startswith("marker:"):
+        return f"marker {printable(where.removeprefix('marker:'))}"
+    if where == "all":
+        return "all links"
+    return re.sub(r"^([a-z]+)([0-9]+)$", r"\1 \2", printable(where))
+
+
+def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
+    """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
+    return effect_at_places(e.effect, [e.where])
+
+
+KINDS_OF_PLACE = re.compile(r"(joint|link)([0-9]+)")
+# Steps of a budget that are no effects.
+STEPS = {"unknown": "what has no name", "rest": "the smaller causes"}
+
+
+def places(where: Iterable[str], runs: bool = False) -> str:
+    """ "joints 1, 2 and 5", "link 3 and base"; with `runs` "joints 1 to 4 and 6"."""
+    numbers: dict[str, list[int]] = {}
+    told, others = [], []
+    for one in where:
+        if match := KINDS_OF_PLACE.fullmatch(one):
+            numbers.setdefault(match[1], []).append(int(match[2]))
+        else:
+            others.append(place(one))
+    for kind, found in numbers.items():
+        each: list[list[int]] = []  # numbers that follow each other
+        for n in sorted(found):
+            if runs and each and n == each[-1][-1] + 1:
+                each[-1].append(n)
+            else:
+                each.append([n])
+        texts = ([f"{r[0]} to {r[-1]}"] if len(r) > 2 else map(str, r) for r in each)
+        several = together([text for run in texts for text in run])
+        told.append(f"{kind}{'s' * (len(found) > 1)} {several}")
+    return together([*told, *others])
+
+
+def effect_at_places(effect: str, where: Sequence[str]) -> str:
+    """ "gear errors at joints 1, 2 and 5", "thermal expansion of links 2 and 3"."""
+    name = STEPS.get(effect, plain_name(effect))
+    if effect not in STEPS and len(where) == 1 and where[0] in SINGLE:
+        return name
+    of_what = all(w == "all" or w.startswith(("marker:", "link")) for w in where)
+    return f"{name} {'of' if of_what and effect not in STEPS else 'at'} {places(where)}"
+
+
+def name_of(text: str) -> str:
+    """A step of the budget or a rival: "base_frame", "link_bending at link2", "backlash:joint3",
+    "gear_errors:joint1+joint2"."""
+    effect, colon, where = text.replace(" at ", ":", 1).partition(":")
+    if not colon:
+        return STEPS.get(text) or driver_name(plain_name(text))
+    several = where.split("+")
+    # A marker may be called "M+1".
+    known = all(
+        KINDS_OF_PLACE.fullmatch(w) or w in ("all", *SINGLE) or w.startswith("marker:")
+        for w in several
+    )
+    return effect_at_places(effect, several if known else [where])
+
+
+def driver_name(driver: str) -> str:
+    """ "joint2 angle" → "joint 2 angle"."""
+    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
+
+
+def probability(p: float) -> str:
+    """Two decimals, and never a certainty."""
+    if not math.isfinite(p):
+        return "–"
+    if p > 0.995:
+        return "> 0.99"
+    return "< 0.01" if p < 0.005 else f"{p:.2f}"
+
+
+def p_value(p: float) -> str:
+    """Two digits, or that it is below the smallest that is told."""
+    from elastocal.diagnosis.diagnosis import SMALLEST_P
+
+    if not math.isfinite(p):
+        return "–"
+    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
+
+
+def size_of(p: float) -> str:
+    """ "p = 0.02", "p < 0.0001"."""
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def percent(fraction: float) -> str:
+    return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
+
+
+def reduction(f: FoundEffect) -> str:
+    """ "75 % (63 to 84 %)"."""
+    low, high = f.gap_reduction_ci95
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return percent(f.gap_reduction)
+    return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
+
+
+def settings_text(settings: Mapping[str, float], lines: Sequence[float] = ()) -> str:
+    """Searched constants with their units: "jump time 12.0 min, ripple order 101"; for want of
+    times a moment is one between the `lines` of the table at which visits begin."""
+    ends = {key: key.replace("_low_", "_high_") for key in settings if "_low_" in key}
+    pairs = {low: high for low, high in ends.items() if high in settings}
+    # What all names begin with says nothing.
+    first = {key.partition("_")[0] + "_" for key in settings}
+    begin = first.pop() if len(first) == 1 < len(settings) else ""
+    texts = []
+    for key, value in settings.items():
+        if LINE.fullmatch(key) or key.endswith(REFERENCE):
+            continue
+        if lines and key.endswith("_time_s"):
+            later = min((line for line in lines if line > value), default=value)
+            texts.append(f"before line {later:.0f} of the table, by the order of its rows")
+        elif key in pairs:
+            high = setting_value(pairs[key], settings[pairs[key]])
+            texts.append(f"from {setting_value(key, value)} to {high}")
+        elif key not in pairs.values():
+            name = plain_name(_name_and_unit(key)[0].removeprefix(begin))
+            texts.append(f"{name} {setting_value(key, value)}")
+    return ", ".join([*texts, *_orders(settings)])
+
+
+LINE = re.compile(r"order_(sd_)?[0-9]+")  # of a spectrum: an order and how uncertain it is
+REFERENCE = "_centre_rad"  # where phases count from says nothing
+MOST_ORDERS = 6
+
+
+def _orders(settings: Mapping[str, float]) -> list[str]:
+    """ "orders 1.000 ± 0.002, 18.52 ± 0.03 and 4 more", with 95 % half widths."""
+    told = []
+    orders = [key for key in settings if (line := LINE.fullmatch(key)) and not line[1]]
+    for key in orders[:MOST_ORDERS]:
+        sd = settings.get(key.replace("_", "_sd_"), 0.0)
+        value, half = with_uncertainty(settings[key], 1.96 * sd)
+        told.append(f"{value} ± {half}" if sd > 0 else significant(settings[key], 4))
+    if more := len(orders) - len(told):
+        told.append(f"{more} more")
+    return [f"order{'s' * (len(orders) > 1)} {together(told)}"] if told else []
+
+
+def _name_and_unit(key: str) -> tuple[str, str]:
+    name, _, unit = key.rpartition("_")
+    return (name, unit) if unit in ("s", "rad") and name else (key, "")
+
+
+def setting_value(key: str, value: float) -> str:
+    """A searched constant in the unit of its key, "12.0 min" or "5.7°"; a size in mrad."""
+    unit = _name_and_unit(key)[1]
+    if unit == "rad":
+        if "size" in key:
+            return f"{significant(value * 1e3)} mrad"
+        return f"{significant(math.degrees(value))}°"
+    if unit != "s":
+        return significant(value, 4)
+    if abs(value) < LONG_TIME:
+        return f"{significant(value)} s"
+    return f"{significant(value / 60)} min"
+
+
+# What can be fitted, as rows: each effect of the catalogue with its unit, size, places, words.
+
+
+def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
+    """Per effect, in the catalogue's order: name, stage, what it is, places, parameters.
+
+    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
+    parameter's typical size is null where only the readings say it.
+    """
+    given = cell_of(cell)
+    chain = load_chain(given)
+    given = numbered(given, chain)
+    on, entries = {choice.name for choice in given.model.effects}, []
+    for effect in CATALOGUE.values():
+        where = effect.places(chain, given)
+        try:
+            parameters = effect.parameters(where[0], chain, given) if where else ()
+        except InputError:  # of link weights without masses: settings of the cell make them
+            parameters = ()
+        entries.append({
+            "name": effect.name, "stage": effect.stage,
+            "on": effect.name in on or effect.acts_unasked(given), "what": what_it_is(effect),
+            "places": list(where), "needs": list(effect.needed(given)),
+            "parameters": [
+                {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
+                for p in parameters
+            ],
+        })  # fmt: skip
+    return entries
+
+
+def what_it_is(effect: Effect) -> str:
+    """The first paragraph of the effect's own text, on one line."""
+    first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
+    return " ".join(first.split())
+
+
+def effect_head(entry: dict[str, Any]) -> str:
+    """Name (* where it is on), places and typical sizes by unit of an effect, for people."""
+    sizes: dict[str, list[float]] = {}
+    for p in entry["parameters"]:
+        value, unit = display(p["typical"] or 0.0, p["unit"])
+        sizes.setdefault(unit, []).append(float(f"{value:.2g}"))
+    told = []
+    for unit, found in sizes.items():
+        ends = dict.fromkeys(f"{v:g}" for v in (min(found), max(found)))
+        told.append(f"{' to '.join(ends)} {unit}" if max(found) else f"{unit}, as the readings say")
+    where = places(entry["places"], runs=True) or "nowhere here"
+    what = ", ".join(told) or "no size of its own"
+    return f"{entry['name']}{' *' * entry['on']}: {where}; {what}"

@@ -21,6 +21,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.measurements import by_rows
 from elastocal.report.blocks import (
+    STAGES,
     TONES,
     WARNING,
     Block,
@@ -32,9 +33,6 @@ from elastocal.report.blocks import (
     Sentence,
     ShownTable,
     ShownVerdict,
-)
-from elastocal.report.formatting import (
-    STAGES,
     budget_table,
     capital,
     counted,

@@ -28,8 +28,9 @@ from elastocal.identification.weighted_problem import least_norm
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.report.blocks import Figure, ShownTable
-from elastocal.report.formatting import (
+from elastocal.report.blocks import (
+    Figure,
+    ShownTable,
     driver_name,
     effect_at,
     length,

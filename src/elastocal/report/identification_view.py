@@ -45,8 +45,6 @@ from elastocal.report.blocks import (
     Sentence,
     ShownTable,
     ShownVerdict,
-)
-from elastocal.report.formatting import (
     budget_table,
     counted,
     display,

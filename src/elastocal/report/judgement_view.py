@@ -19,8 +19,17 @@ from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
-from elastocal.report.blocks import WARNING, ShownTable, Tone
-from elastocal.report.formatting import counted, display, estimate, length, plain, significant
+from elastocal.report.blocks import (
+    WARNING,
+    ShownTable,
+    Tone,
+    counted,
+    display,
+    estimate,
+    length,
+    plain,
+    significant,
+)
 from elastocal.text import gathered, listed, printable
 
 

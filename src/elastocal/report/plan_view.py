@@ -22,8 +22,6 @@ from elastocal.report.blocks import (
     Report,
     ShownTable,
     ShownVerdict,
-)
-from elastocal.report.formatting import (
     counted,
     display,
     first_stops,
