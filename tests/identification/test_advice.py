@@ -125,17 +125,27 @@ def test_a_parameter_beyond_its_bound():
     assert "fit with bounds" in text_of(result, "beyond bound")
 
 
-def spoil(rows):
+def spoil(rows, by=0.01):
     def change(table):
         position = table.position.copy()
-        position[rows] += 0.01
+        position[rows] += by
         return replace(table, position=position)
 
     return change
 
 
 def test_too_many_outliers_are_no_reading_errors():
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    result = identified(model, poses=50, change=spoil(np.arange(10, 16)))
+    model, rows = Model.assembled(planar_chain(), cell_of(PLACED)), np.arange(10, 16)
+    apart = 0.01 * np.random.default_rng(0).normal(size=(6, 3))
+    result = identified(model, poses=50, change=spoil(rows, apart))
     assert kinds(result) == {"outliers", "share"}
     assert "(lines 12–17)" in text_of(result, "outliers")
+
+
+def test_as_many_that_one_shift_explains_are_set_apart_and_the_shift_is_told():
+    model = Model.assembled(planar_chain(), cell_of(PLACED))
+    result = identified(model, poses=50, change=spoil(np.arange(10, 16)))
+    assert [o.line for o in result.excluded] == list(range(12, 18)) and not result.outliers
+    found = result.finding("faulty_readings")
+    assert found.numbers["shifted"] == 6
+    assert "One common shift each explains lines 12 to 17 by 17.4 mm" in found.remedy

@@ -57,9 +57,10 @@ class FaultyGroup:
     these lie beyond the noise on their own.  `pattern` says whether a group errs in common, a
     displacement, or by scatter; `error` is the length in m of the median error or the rms length,
     of poses the position's, `sigmas` that of the whitened errors over the noise of a row.
-    `p_value` is adjusted for all tests of the report.  `influence` is the largest change of a
-    parameter, in its standard deviations, if the readings were fitted along, and `column` that
-    parameter.
+    `p_value` is adjusted for all tests of the report; `p_left` is that of what one common shift
+    leaves of the errors, by the noise of the others: 0 of a single reading.  `influence` is the
+    largest change of a parameter, in its standard deviations, if the readings were fitted along,
+    and `column` that parameter.
     """
 
     level: Level
@@ -73,6 +74,16 @@ class FaultyGroup:
     p_value: float
     influence: float
     column: int
+    p_left: float = 0.0
+
+    @property
+    def explained(self) -> bool:
+        """Whether one common shift accounts for all of its errors."""
+        return self.pattern == "common" and self.p_left >= FALSE_ALARM
+
+    def __str__(self) -> str:
+        name = {"block": f"lines {self.name}"}.get(self.level, f"{self.level} {self.name}")
+        return f"{name} by {self.error * 1e3:.3g} mm"
 
 
 @dataclass(frozen=True)
@@ -90,6 +101,11 @@ class OutlierReport:
     tests: dict[Level, int]
     false_alarm: float = FALSE_ALARM
     names: tuple[str, ...] = ()
+
+    @property
+    def shifted(self) -> list[FaultyGroup]:
+        """Groups, most of them beyond the noise, whose errors one common shift accounts for."""
+        return [f for f in self.findings if f.explained and 2 * f.beyond >= len(f.readings)]
 
     def to_json(self) -> dict[str, Any]:
         """Plain numbers, strings and lists; an unbounded influence is None."""
@@ -123,11 +139,11 @@ class Group(NamedTuple):
 
 def group_test(
     fit: FitToGood, used: BoolArray, may_shift: bool
-) -> tuple[float, float, Array | None]:
+) -> tuple[float, float, Array | None, float]:
     """The smaller p-value of two F-tests of the `used` (n,) members of a group, of one common
     error, where there may be one, and of any, 1 where neither can be made; what telling the group
     apart takes off the sum of squares beyond what noise would; and the error (size,) common to its
-    readings, None where they err in different directions.
+    readings, None where they err in different directions; and the p-value of what that leaves.
 
     With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with
     them (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
@@ -142,13 +158,17 @@ def group_test(
     S, e = fit.T[used].sum(axis=0), fit.e[used].sum(axis=0)
     solved = np.linalg.solve(G, np.column_stack([S.T, c]))
     M = n * np.eye(size) - S @ solved[:, :size]
-    shift, gain, p_common = np.zeros(size), 0.0, 1.0
+    shift, gain, p_common, p_left = np.zeros(size), 0.0, 1.0, 0.0
     if may_shift and dof_with > size and np.linalg.eigvalsh(M)[0] > ABSORBED * n:
         b = e - S @ solved[:, size]
         shift = np.linalg.solve(M, b)
         gain = float(b @ shift)
         rest = max(rss_with - gain, TINY)
         p_common = float(f_test(gain, size, rest, dof_with - size)[1])
+        added = int((used & ~fit.good).sum()) - 1
+        if added > 0 and fit.dof > 0:
+            left = max(rss_with - gain - fit.rss, 0.0)
+            p_left = float(f_test(left, size * added, max(fit.rss, TINY), fit.dof)[1])
     excess, p_any = 0.0, 1.0
     rss_without, dof_without, G, _ = _changed(fit, used & fit.good, -1)
     if dof_without > 0 and np.linalg.eigvalsh(G)[0] > ABSORBED:
@@ -157,7 +177,7 @@ def group_test(
         excess = drop - n * size * rest / dof_without
     common = may_shift and gain >= excess / 2
     p = min(1.0, 2 * min(p_common, p_any))
-    return p, max(gain, excess), shift if common else None
+    return p, max(gain, excess), shift if common else None, p_left
 
 
 def _changed(fit: FitToGood, members: BoolArray, sign: int) -> tuple[float, float, Array, Array]:
@@ -182,18 +202,26 @@ def groups_of(
     return [Group(level, str(names[k]), code == k, names[k] not in without_shift) for k in testable]
 
 
-def _runs(beyond: BoolArray, active: BoolArray, lines: IntArray) -> Iterator[Group]:
-    """Runs of active lines at least half of whose readings lie `beyond` the noise, and three or
-    more."""
-    for first, last in blocks([int(k) for k in lines[beyond]]):
-        run = active & (lines >= first) & (lines <= last)
-        if (beyond & run).sum() >= max(SMALLEST_BLOCK, run.sum() / 2):
-            yield Group("block", f"{first} to {last}", run)
+def _runs(
+    beyond: BoolArray, active: BoolArray, lines: IntArray, marker: NDArray[Any] | None
+) -> Iterator[Group]:
+    """Runs of active lines, of all markers and of each, at least half of whose readings lie
+    `beyond` the noise, and three or more."""
+    every = np.ones(len(lines), dtype=bool)
+    own = [] if marker is None else [(f" of {m}", marker == m) for m in np.unique(marker[beyond])]
+    for of, members in (("", every), *own):
+        order = np.flatnonzero(members)[np.argsort(lines[members], kind="stable")]
+        for first, last in blocks(np.flatnonzero(beyond[order]).tolist()):
+            run = np.zeros_like(every)
+            run[order[first : last + 1]] = True
+            run &= active
+            if (beyond & run).sum() >= max(SMALLEST_BLOCK, run.sum() / 2):
+                yield Group("block", f"{lines[order[first]]} to {lines[order[last]]}{of}", run)
 
 
 def _blamed(
     fit: FitToGood, active: BoolArray, groups: list[Group], lines: IntArray,
-    adjust: dict[Level, int],
+    marker: NDArray[Any] | None, adjust: dict[Level, int],
 ) -> tuple[Group, float] | None:  # fmt: skip
     """The group that explains most, with its adjusted p-value; None where none is beyond noise.
 
@@ -201,7 +229,7 @@ def _blamed(
     chance, else what is not.
     """
     beyond, found = active & ~fit.good, []
-    for group in (*groups, *_runs(beyond, active, lines)):
+    for group in (*groups, *_runs(beyond, active, lines, marker)):
         present = active & group.members
         inside, outside = int((beyond & present).sum()), int((beyond & ~present).sum())
         count, others = int(present.sum()), int((active & ~present).sum())
@@ -211,7 +239,7 @@ def _blamed(
         used = present if whole else present & fit.good
         if used.sum() < 2 or (group.level == "block" and not whole):
             continue
-        p, gain, _ = group_test(fit, used, group.may_shift)
+        p, gain, *_ = group_test(fit, used, group.may_shift)
         if p * adjust[group.level] < FALSE_ALARM:
             gain /= WORTH_A_BLOCK if group.level == "block" else 1.0
             own = group._replace(members=present)
@@ -247,12 +275,13 @@ def outlier_report(
     tests: dict[Level, int] = {"reading": n}
     for group in groups:
         tests[group.level] = tests.get(group.level, 0) + 1
-    tests["block"] = n * (n + 1) // 2
+    several = [] if marker is None else np.unique(marker, return_counts=True)[1].tolist()
+    tests["block"] = sum(k * (k + 1) // 2 for k in (n, *several))
     adjust = {level: count * len(tests) for level, count in tests.items()}
     active, accepted = np.ones(n, dtype=bool), []
     while True:
         fit = FitToGood(B, y, good & active, variance)
-        blamed = _blamed(fit, active, groups, lines, adjust)
+        blamed = _blamed(fit, active, groups, lines, marker, adjust)
         if blamed is None or 2 * (active & ~blamed[0].members).sum() <= n:
             break
         group, p = blamed
@@ -275,9 +304,9 @@ def _finding(
     move = np.abs(_move(fit, group.members))
     column = int(np.argmax(move))
     chosen = np.flatnonzero(group.members)
-    shift = None
+    shift, p_left = None, 0.0
     if group.level != "reading":
-        shift = group_test(fit, group.members, group.may_shift)[2]
+        *_, shift, p_left = group_test(fit, group.members, group.may_shift)
     pattern: Pattern = "single" if group.level == "reading" else "scatter"
     own, error = (float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, off))
     if shift is not None:
@@ -286,6 +315,7 @@ def _finding(
     return FaultyGroup(
         group.level, group.name, pattern, tuple(chosen.tolist()), tuple(lines[chosen].tolist()),
         beyond, error, own / float(np.sqrt(fit.variance)), p, float(move[column]), column,
+        p_left,
     )  # fmt: skip
 
 

@@ -582,7 +582,14 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
     n, fitted, kept = len(result.faulty), len(result.observations.lead), len(result.outliers)
     if n:
         remedy = f"Check the {n} reading{'s' * (n > 1)} beyond the noise."
+        shifted = result.faulty_report.shifted if result.faulty_report else []
+        if shifted:
+            remedy += (
+                f" One common shift each explains {listed(map(str, shifted), 4)}: look for what "
+                "moved there, a marker or the tracker."
+            )
         numbers = {"left_out": len(result.excluded), "heldout_all_rms_um": result.heldout_all_rms}
+        numbers["shifted"] = sum(len(f.readings) for f in shifted)
         yield _note("faulty_readings", remedy, fitted=kept, **numbers)
     if kept > MANY * fitted:
         yield _care("many_faulty_readings", faulty=kept, fitted=fitted)

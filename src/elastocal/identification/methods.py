@@ -10,6 +10,7 @@ from scipy import sparse
 
 from elastocal.identification import published
 from elastocal.identification.covariance import Covariance
+from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.knowledge_fit import fit_with_knowledge
 from elastocal.identification.least_squares import Problem
 from elastocal.identification.noise_choice import (
@@ -278,7 +279,13 @@ def _reml(
         start: Solution, good: BoolArray, kind: str, known: NoiseAndOutliers | None = None
     ) -> Adapted:
         solution, noise, good = _adapted(every, start, good, kind, progress, refit, known)
-        if not good.all() and not options.sets_aside(~good):
+
+        def explained() -> BoolArray:
+            report = report_faulty(every, solution, noise, good)
+            known = [] if report is None else [f.readings for f in report.shifted]
+            return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
+
+        if not good.all() and not options.sets_aside(~good, explained):
             # So many faulty readings look like anything that scatters or drifts.
             plainly, everything = OF_READINGS if kind == "auto" else kind, np.ones_like(good)
             solution, noise, _ = _adapted(every, every, everything, plainly, progress, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
@@ -243,10 +244,16 @@ class Options:
                 f"with these there are {', '.join(WITH_KNOWLEDGE)}"
             )
 
-    def sets_aside(self, faulty: NDArray[np.bool_]) -> bool:
-        """Whether the `faulty` readings (N,) are left out of the fit."""
+    def sets_aside(
+        self, faulty: NDArray[np.bool_], explained: Callable[[], NDArray[np.bool_]] | None = None
+    ) -> bool:
+        """Whether the `faulty` readings (N,) are left out of the fit: in auto, where but for those
+        `explained` by one common shift each, whose cause is known, they are few."""
         if self.faulty == "auto":
-            return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
+            share = faulty.mean()
+            if share > MOST_SET_ASIDE and explained is not None:
+                return bool((faulty & ~explained()).mean() <= MOST_SET_ASIDE)
+            return bool(0 < share <= MOST_SET_ASIDE)
         return self.faulty == "drop" and bool(faulty.any())
 
     @property
