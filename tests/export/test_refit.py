@@ -18,9 +18,8 @@ import elastocal as ec
 from elastocal.cli.main import app
 from elastocal.export.export import Wish
 from elastocal.export.export import export as to_text
-from elastocal.export.exportable import Conditions, random_table
+from elastocal.export.exportable import Conditions, random_table, read_joint_correction
 from elastocal.export.mjcf_file import MujocoRest
-from elastocal.export.refit import read_joint_correction
 
 HELD = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 LACKED = (

@@ -17,9 +17,15 @@ import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
 from elastocal.export import exportable, mjcf_file, rigid_files
-from elastocal.export.exportable import Cost, ExportNumbers, Kept
+from elastocal.export.exportable import (
+    Cost,
+    ExportNumbers,
+    JointCorrection,
+    Kept,
+    Refit,
+    refitted,
+)
 from elastocal.export.mjcf_file import HeldArm, MujocoRest, NotInPlace
-from elastocal.export.refit import JointCorrection, Refit, refitted
 from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
