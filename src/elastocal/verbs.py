@@ -394,7 +394,7 @@ def simulated(
     """What `simulate` gives, and the true values (parameters,) behind it."""
     import numpy as np
 
-    from elastocal.identification.checks import check_limits
+    from elastocal.identification.start import check_limits
     from elastocal.model.arm import given_force
     from elastocal.simulation import draw_errors, expand_plan, values_from
     from elastocal.simulation import simulate as run

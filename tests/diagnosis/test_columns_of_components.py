@@ -11,7 +11,7 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 from elastocal.cell.arm_description import EffectChoice, Nominal
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, compute_columns
-from elastocal.identification.checks import as_placed
+from elastocal.identification.start import as_placed
 from elastocal.measurements import with_moves
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model

@@ -10,9 +10,9 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification.checks import copied
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
+from elastocal.identification.start import copied
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import undetermined_lines

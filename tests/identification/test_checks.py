@@ -16,9 +16,9 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.checks import check_limits, check_table, fixed_and_free
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
+from elastocal.identification.start import check_limits, check_table, fixed_and_free
 from elastocal.model.chain import Chain, Joint, joint_limits
 from elastocal.model.manipulator import Model
 

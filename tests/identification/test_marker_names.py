@@ -10,7 +10,7 @@ import pytest
 
 import elastocal as ec
 from elastocal.cell.arm_description import CartesianNoise, ModelSpec
-from elastocal.identification.marker_names import exchanged
+from elastocal.identification.mistakes import exchanged
 
 DEMO = Path(ec.__file__).parent / "demo"
 MARKERS = {"M1": [0.25, 0.0, 0.05], "M2": [-0.12, 0.22, 0.10], "M3": [0.0, -0.2, 0.08]}

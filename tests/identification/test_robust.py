@@ -13,8 +13,15 @@ from scipy.spatial.transform import Rotation
 from support.calibration import binomial_band
 
 from elastocal.identification.faulty_readings import outlier_report
-from elastocal.identification.outliers import FALSE_ALARM, FitToGood, majority
-from elastocal.identification.robust import HUBER, covariance_of, huber, least_absolute
+from elastocal.identification.outliers import (
+    FALSE_ALARM,
+    HUBER,
+    FitToGood,
+    covariance_of,
+    huber,
+    least_absolute,
+    majority,
+)
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
-from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.least_squares import Problem
 from elastocal.identification.outliers import find_faulty
 from elastocal.identification.solve import Solution, solve
-from elastocal.identification.start import start_values
+from elastocal.identification.start import fixed_and_free, start_values
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model

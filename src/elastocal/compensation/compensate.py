@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.above import Result
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
+from elastocal.identification.start import check_limits
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.calibrated import (
     CalibratedArm,

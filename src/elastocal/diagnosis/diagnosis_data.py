@@ -30,8 +30,8 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.checks import as_placed
 from elastocal.identification.noise_structure import TIME, stated_deviations
+from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE

@@ -11,8 +11,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import option
-from elastocal.identification.marker_names import exchanged
-from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
+from elastocal.identification.mistakes import CELL, KILOGRAMS, exchanged, load_ratio
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.outliers import kept_of

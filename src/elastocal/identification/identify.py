@@ -9,16 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.checks import (
-    check_rows,
-    check_table,
-    copied,
-    fallen,
-    fixed_and_free,
-    ordinary,
-    solved_body,
-    without_copies,
-)
 from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
@@ -43,7 +33,17 @@ from elastocal.identification.result import Calibration, Combination, Estimate, 
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.solve import Solution, bent, residual_sigma, solve
-from elastocal.identification.start import start_values
+from elastocal.identification.start import (
+    check_rows,
+    check_table,
+    copied,
+    fallen,
+    fixed_and_free,
+    ordinary,
+    solved_body,
+    start_values,
+    without_copies,
+)
 from elastocal.identification.weighted_problem import (
     Weights,
     partition,

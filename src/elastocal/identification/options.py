@@ -149,6 +149,18 @@ class MethodResult:
     limits: dict[int, tuple[float, float]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class FunctionPrior:
+    """What smooth functions bring into a fit: the `prior` of their parameters, the noise `sigma`
+    of a whitened row beside them and its degrees of freedom `dof`, and where the prior's part of
+    the objective `stands` in the fit without further knowledge."""
+
+    prior: GaussianPrior
+    sigma: float
+    dof: float
+    stands: float
+
+
 # How to identify: method, noise, what is held, what becomes of faulty readings.
 
 Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "l1"]

@@ -1,18 +1,22 @@
-"""Readings that the others contradict: each judged as if left out of the fit to the majority."""
+"""Readings that the others contradict: each judged as if left out of the fit to the majority.
+
+And fits that they bend little, by Huber's loss.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import linalg, special
+from scipy import linalg, sparse, special
 
-from elastocal.errors import ElastocalError
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
 from elastocal.identification.least_squares import Problem
 from elastocal.identification.noise_choice import (
     NoiseFit,
@@ -21,7 +25,8 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.residuals import f_test
+from elastocal.identification.options import LEVEL, Intervals, MethodResult
+from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import (
     Part,
@@ -31,7 +36,7 @@ from elastocal.identification.weighted_problem import (
     sample,
 )
 from elastocal.model.manipulator import Model
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
 TINY = np.finfo(float).tiny
@@ -544,3 +549,216 @@ def settle(
     except ElastocalError:  # the good ones alone do not show all parameters
         found, good, _ = until_it_stands(every, fitted, judged)
     return NoiseAndOutliers(found, good)
+
+
+# Robust fits by name, by reweighting.
+#
+# An observation of `size` whitened rows (x, y, z of a tracker reading) is right or wrong as a
+# whole: Huber's loss sees the length d = |e_i|/σ of its scaled residual, its rows share a weight,
+#
+#     ρ(d) = d²/2 up to c, c d − c²/2 beyond,    ψ = ρ′ = min(d, c)        (Huber 1964)
+#
+#     huber   c of 95 % efficiency
+#     l1      c near 0, the least sum of Euclidean lengths
+#
+# The weights solve Σ B_iᵀ Ψ(e_i/σ) = 0, Ψ(r) = ψ(|r|) r/|r|; they are no inverse variances.
+
+# c of Huber's loss by the rows of an observation, 1 to 6: 95 % efficient.  Under normal noise d
+# follows χ(size), and with J = ∂Ψ/∂r symmetry gives E J = a·I and E ΨΨᵀ = b·I,
+#
+#     a = E[ψ′/size + (1 − 1/size) ψ(d)/d],    b = E ψ²/size,    efficiency a²/b
+#
+# (Huber 1981, section 7.6, for size 1; Maronna 1976 for vectors), found by quadrature.
+
+HUBER = (1.344997509, 1.501141084, 1.627987920, 1.731072513, 1.812018420, 1.869337729)
+L1 = 1e-4  # far below any standard deviation
+TOLERANCE = 1e-11  # of the step |B δx| in units of the scale
+MAX_ITER = 5000
+
+
+@dataclass(frozen=True)
+class RobustEstimate:
+    """x = V z (p,) of y (rows,) ≈ B x, B x = Q z with orthonormal Q, so that the parameters' units
+    do not matter; residual (rows,), scale σ, and c of the loss."""
+
+    Q: Array
+    V: Array
+    residual: Array
+    size: int
+    c: float
+    z: Array
+    scale: float
+    converged: bool
+
+    @property
+    def x(self) -> Array:
+        return self.V @ self.z
+
+    @property
+    def distance(self) -> Array:
+        """|e_i|/σ (n,)."""
+        return lengths(self.residual, self.size) / self.scale
+
+    @property
+    def weights(self) -> Array:
+        """ψ(d)/d (n,)."""
+        return loss_weights(self.distance, self.c)
+
+    @property
+    def smooth_c(self) -> float:
+        """c of a loss that is as good and has a curvature to be estimated.
+
+        ψ of l1 jumps at zero: a share of the residuals there tells its slope, that of Hall and
+        Sheather's bandwidth, without the p residuals that the fit makes zero (Koenker 2005, section
+        3.4).
+        """
+        kept = np.sort(self.distance)[len(self.z) // self.size :]
+        h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3) * (1.5 / (2 * np.pi)) ** (1 / 3)
+        return max(self.c, float(np.quantile(kept, min(2 * h, 0.98)))) if self.c == L1 else self.c
+
+
+def lengths(residual: Array, size: int) -> Array:
+    """|e_i| (n,) of each observation."""
+    return np.linalg.norm(residual.reshape(-1, size), axis=1)
+
+
+def loss_weights(d: Array, c: float) -> Array:
+    return c / np.maximum(d, c)
+
+
+def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstimate:
+    """M-estimate of y (n·size,) ≈ B x, from least squares on, σ the MAD about zero of every
+    residual anew (Huber 1981, section 7.8), no less than rounding of y lets it be; by default of
+    95 % efficiency.
+
+    It has one solution, and resists errors in y but not at leverage points.
+    """
+    factors, c = orthogonal(B), HUBER[size - 1] if c is None else c
+    Q, z, converged = factors.Q, factors.Q.T @ y, False
+    floor = float(np.finfo(float).eps * np.sqrt(np.mean(y**2)) + np.finfo(float).tiny)
+    r = y - Q @ z
+    scale = max(median_scale(lengths(r, size), size), floor)
+    for _ in range(MAX_ITER):
+        weighted = Q.T * np.repeat(loss_weights(lengths(r, size) / scale, c), size)
+        step = linalg.solve(weighted @ Q, weighted @ r, assume_a="pos")
+        z, before = z + step, scale
+        r = y - Q @ z
+        scale = max(median_scale(lengths(r, size), size), floor)
+        moved = float(np.linalg.norm(step))
+        still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
+        same = abs(scale - before) <= TOLERANCE * scale
+        if converged := bool((moved <= TOLERANCE * scale or still) and same):
+            break
+    return RobustEstimate(Q, factors.V, r, size, c, z, scale, converged)
+
+
+def least_absolute(B: Array, y: Array, size: int) -> RobustEstimate:
+    return huber(B, y, size, L1)
+
+
+# Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
+#
+# With r_i = e_i/σ and u = r/|r| the derivative of an observation's score is
+#
+#     J_i = ∂Ψ/∂r = ψ′(d_i) u uᵀ + (ψ(d_i)/d_i)(I − u uᵀ),      d_i = |r_i|,
+#
+# eigenvalue ψ′ along the error and ψ/d across it (size − 1 times; for size 1 only ψ′).  For errors
+# that are symmetric in direction E J = a I, E ΨΨᵀ = b I, and expanding Σ B_iᵀ Ψ(e_i/σ) = 0 gives
+#
+#     x̂ − x ≈ (BᵀB)⁻¹ Bᵀ (σ/a) Ψ,    cov x̂ = σ² (b/a²) (BᵀB)⁻¹
+#
+# (Huber 1981, sections 7.6 and 7.10, per row; Maronna 1976): that of least squares whose residuals
+# are (σ/a) Ψ.  The weights ψ/d as inverse variances would be wrong: a weight is small because that
+# residual came out large, not because its variance was known to be.
+
+
+def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = None) -> Covariance:
+    """Covariance (p, p) of x̂ of y ≈ B x.
+
+    Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less p as
+    dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of (σ/a) Ψ.
+
+    Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster alone
+    determines a combination of the parameters.
+    """
+    rows, p, size, d = len(found.residual), len(found.z), found.size, found.distance
+    c = found.smooth_c
+    along, across, psi = (d <= c).astype(float), loss_weights(d, c), np.minimum(d, c)
+    a = float(np.mean(along + (size - 1) * across)) / size
+    if not a > 0:
+        raise InsufficientDataError(
+            "so many readings lie far from the fit that its covariance cannot be determined; use "
+            "the default method, or look for the cause of the outliers"
+        )
+    if cluster is not None:
+        pseudo = np.repeat(across, size) * found.residual / a
+        return cluster_robust(B, pseudo, np.repeat(cluster, size), "CR3")
+    square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
+    k = 1 + p / rows * (square - a**2) / a**2
+    variance = (k * found.scale / a) ** 2 * float(psi @ psi) / (rows - p)
+    name = "l1" if found.c == L1 else "huber"
+    text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
+    return Covariance("H1", variance * found.V @ found.V.T, np.full(p, float(rows - p)), text)
+
+
+# Robust fit of the nonlinear model: linear robust steps on the exact B.
+
+STILL = 1e-5  # |B δx| in units of the scale at which the steps have converged
+MOST_MOVES = 40
+
+
+def robust_result(
+    method: str, every: Solution, sound: Solution, good: BoolArray, intervals: str
+) -> MethodResult:
+    """The robust fit of all readings in the parameters that the `good` ones (N,) determine.
+
+    Minimises Σ ρ(|W (y − h(X))_i|/σ) over X[kept] by Gauss–Newton steps from the fit to the good
+    ones: each is the robust linear fit of the whitened residual to the whitened B at X.
+
+    Whitening by a covariance that couples observations (deflections that share an unloaded
+    reading) mixes them: a bad reading then also shows in those whitened after it.
+
+    Raises InputError for a large table, other intervals and dependent columns, ElastocalError where
+    the start has poses without equilibrium.
+    """
+    problem, kept, x, steps = every.problem, sound.reduction.kept, sound.fit.x.copy(), 0
+    if problem.large:
+        raise InputError(
+            f"the method {method} takes no table of this size; use the default "
+            "method, which excludes outliers"
+        )
+    if intervals not in ("auto", "cr3"):
+        raise InputError(
+            f"the method {method} has intervals of its own: 'auto' for independent readings, "
+            "'cr3' where readings of a configuration depend on each other"
+        )
+    observed, weights = problem.observations, problem.weights
+    while True:
+        at = problem.model.regressor(observed.table, x, kept, observed)
+        B, e = weights.apply(at.B), weights.apply(at.residual)
+        found = huber(B, e, observed.size, None if method == "huber" else L1)
+        converged = bool(np.linalg.norm(found.z) <= STILL * found.scale * np.sqrt(len(kept)))
+        if converged or steps == MOST_MOVES:
+            break
+        x[kept] += found.x
+        steps += 1
+    fit = replace(
+        sound.fit, x=x, residual=at.residual, whitened=e, converged=converged, steps=steps,
+        problem=problem, columns=kept, sizes=sound.sizes,
+        reason=sound.fit.reason if converged else "the robust steps did not settle",
+    )  # fmt: skip
+    # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
+    root = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
+    whiten = sparse.csr_array(sparse.diags_array(root))
+    if weights.whiten is not None:
+        whiten = sparse.csr_array(whiten @ weights.whiten)
+    heldout = held_out_residual(
+        fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
+    )
+    problem = replace(problem, x0=sound.problem.x0)
+    solution = replace(sound, problem=problem, fit=fit, held=heldout)
+    cluster = None if intervals == "auto" else observed.configuration
+    covariance = covariance_of(found, B, cluster)
+    ends = covariance.interval(x[kept], LEVEL)
+    return MethodResult(method, solution, Intervals(covariance, ends), None, good)

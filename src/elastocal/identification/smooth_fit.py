@@ -20,7 +20,6 @@ from scipy import linalg, sparse, special
 
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import (
     EXHAUSTED,
     Fit,
@@ -35,6 +34,7 @@ from elastocal.identification.noise_choice import NoiseFit, linearised, weights_
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
     LEVEL,
+    FunctionPrior,
     Intervals,
     MethodResult,
     Options,

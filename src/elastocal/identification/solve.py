@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.checks import check_enough
 from elastocal.identification.covariance import root_of
 from elastocal.identification.least_squares import Fit, PriorRows, Problem, fit, moved
 from elastocal.identification.residuals import (
@@ -23,6 +22,7 @@ from elastocal.identification.residuals import (
     predicts_better,
     rms_3d,
 )
+from elastocal.identification.start import check_enough
 from elastocal.identification.weighted_problem import (
     Part,
     RFactor,

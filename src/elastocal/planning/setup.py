@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from elastocal.errors import InsufficientDataError, option
-from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
