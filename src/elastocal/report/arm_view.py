@@ -23,15 +23,7 @@ from elastocal.model.observations import Observations
 from elastocal.planning.bodies import cell_bodies, hull, mesh_hull, outward, skeleton, urdf_bodies
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
-from elastocal.report import blocks
-from elastocal.report.blocks import (
-    first_stops,
-    joint_heads,
-    joint_texts,
-    length,
-    load_text,
-    short_name,
-)
+from elastocal.report import blocks as say
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
@@ -286,7 +278,7 @@ MOST_POSES = 80  # in the page; of more, those with the largest residuals and a 
 WORST = 30
 
 
-def residual_arm(model: Model, observed: Observations, x: Array, residual: Array) -> blocks.Figure:
+def residual_arm(model: Model, observed: Observations, x: Array, residual: Array) -> say.Figure:
     """The arm with its residuals as arrows: one pose per configuration and load, each arrow the
     mean residual of a marker; `residual` (rows,) at parameter values x (parameters,)."""
     table, marker = observed.table, observed.table.marker[observed.lead]
@@ -323,8 +315,9 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
         groups = [own[marker[own] == m] for m in markers]
         name = table.configuration_labels[table.configuration[rows[k]]]
         poses.append(Posed(
-            f"{name}, {load_text(table.force[rows[k]])}" if several else name,
-            f"rms residual {length(float(rms[code]))} of {len(own)} readings", frames[k], flange[k],
+            f"{name}, {say.load_text(table.force[rows[k]])}" if several else name,
+            f"rms residual {say.length(float(rms[code]))} of {len(own)} readings",
+            frames[k], flange[k],
             np.array([at[g].mean(axis=0) for g in groups]),
             tuple(table.marker_names[m] for m in markers),
             np.array([vectors[g].mean(axis=0) for g in groups]),
@@ -345,14 +338,14 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
     return posed("space", "Residuals as arrows on the posed arm", text, space)
 
 
-def plan_arm(plan: Plan) -> blocks.Figure:
+def plan_arm(plan: Plan) -> say.Figure:
     cell, chain = plan.model.cell, plan.model.chain
     frames, flange = frames_at(cell, chain, plan.q)
     local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
-    order, heads = first_stops(plan), joint_heads(chain.kinds)
+    order, heads = say.first_stops(plan), say.joint_heads(chain.kinds)
     poses = []
     for k, T in enumerate(flange):
-        joints = zip(map(str.split, heads), joint_texts(plan.q[k], chain.kinds), strict=True)
+        joints = zip(map(str.split, heads), say.joint_texts(plan.q[k], chain.kinds), strict=True)
         told = ", ".join(f"{name} {text} {unit}" for (name, unit), text in joints)
         group = plan.group_names[plan.group[k]]
         about = [f"stop {order[k]}", *([group] if plan.level_joint else []), told]
@@ -387,7 +380,7 @@ TOP = np.eye(3)
 SIDE = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
-def posed(name: str, title: str, caption: str, space: Space) -> blocks.Figure:
+def posed(name: str, title: str, caption: str, space: Space) -> say.Figure:
     """The first pose seen obliquely, and all poses from above and from the side."""
 
     def draw(figure: Figure) -> None:
@@ -405,7 +398,7 @@ def posed(name: str, title: str, caption: str, space: Space) -> blocks.Figure:
             handles = axes.get_legend_handles_labels()
             figure.legend(*handles, loc="outside lower center", ncols=4)
 
-    return blocks.Figure(name, title, draw, 7.0, caption, space=space)
+    return say.Figure(name, title, draw, 7.0, caption, space=space)
 
 
 def write_plan_picture(path: str | Path, plan: Plan) -> None:
@@ -449,7 +442,7 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
                       markeredgewidth=0.5)  # fmt: skip
         for pose, (x, y, _) in zip(space.poses[:MOST_NUMBERED], tips, strict=False):
             if len(space.poses) <= MOST_NUMBERED:
-                axes.annotate(short_name(pose.name, 6), (x, y), (3, 2),
+                axes.annotate(say.short_name(pose.name, 6), (x, y), (3, 2),
                               textcoords="offset points", fontsize=7)  # fmt: skip
     for pose in poses if whole else (space.poses[space.first],):
         at, tip = pose.markers @ view.T, pose.line[-1] @ view.T
@@ -484,7 +477,7 @@ def _draw_around(axes: Axes, space: Space, view: Array, whole: bool) -> None:
         _fill(axes, points, FAINT, 0.25)
         if whole:
             top = (float(points[:, 0].mean()), float(points[:, 1].max()))
-            axes.annotate(short_name(shell.name, LONGEST_NAME), top, (0, 2), ha="center",
+            axes.annotate(say.short_name(shell.name, LONGEST_NAME), top, (0, 2), ha="center",
                           textcoords="offset points", fontsize=7, clip_on=True)  # fmt: skip
     for wall in space.shells.walls if whole else ():
         normal, at = (view @ wall.normal)[:2], (view @ wall.point)[:2]
@@ -508,7 +501,7 @@ def turned(space: Space) -> Any:
     import plotly.graph_objects as go
 
     def name(text: str) -> str:  # plotly reads some HTML in its texts
-        return escape(short_name(text, LONGEST_NAME), quote=False)
+        return escape(say.short_name(text, LONGEST_NAME), quote=False)
 
     figure = go.Figure()
 

@@ -20,43 +20,7 @@ from elastocal.diagnosis.diagnosis import (
     NoiseFloor,
 )
 from elastocal.measurements import by_rows
-from elastocal.report.blocks import (
-    STAGES,
-    TONES,
-    WARNING,
-    Block,
-    Figure,
-    Fold,
-    KeyFigures,
-    Lines,
-    Report,
-    Sentence,
-    ShownTable,
-    ShownVerdict,
-    budget_table,
-    capital,
-    counted,
-    display,
-    driver_name,
-    effect_at,
-    effect_at_places,
-    estimate,
-    length,
-    name_of,
-    outlier_blocks,
-    p_value,
-    place,
-    places,
-    plain_name,
-    probability,
-    reduction,
-    setting_value,
-    settings_text,
-    significant,
-    size_of,
-    title_of,
-    together,
-)
+from elastocal.report import blocks as say
 from elastocal.text import printable
 
 MOST_CANDIDATES = 8
@@ -84,57 +48,56 @@ FAMILIES = {
 }
 
 
-def diagnosis_report(d: Diagnosis) -> Report:
+def diagnosis_report(d: Diagnosis) -> say.Report:
     """Why the arm still differs from the model, and what follows."""
     title, backend = printable(d.data), ""
     if d.model is not None:
-        title = title_of(d.model.chain.name, d.model.cell.name)
+        title = say.title_of(d.model.chain.name, d.model.cell.name)
         backend = d.model.backend_report()
-    return Report("Diagnosis", title, _blocks(d), backend)
+    return say.Report("Diagnosis", title, _blocks(d), backend)
 
 
-def _blocks(d: Diagnosis) -> Iterator[Block]:
-    headline, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
+def _blocks(d: Diagnosis) -> Iterator[say.Block]:
+    headline, floor = say.length(d.gap.calibrated), say.length(d.gap.noise_floor)
     figures = [("calibrated arm, held out", headline)]
     if d.effects:
-        headline += f" → {length(d.gap.explained)}"
-        figures.append(("with the effects found", length(d.gap.explained)))
+        headline += f" → {say.length(d.gap.explained)}"
+        figures.append(("with the effects found", say.length(d.gap.explained)))
     figures += [("noise alone", floor), ("readings", str(d.n_readings))]
-    yield Fold("", lambda: [KeyFigures(f"{headline} (noise {floor})", figures)])
-    tone = TONES[d.findings[0].severity] if d.findings else "good"
-    yield ShownVerdict(tone, diagnosis_headline(d))
-    lines = [(label, capital(text)) for label, text in diagnosis_lines(d)]
-    lines += [("Not separable", capital(f"{text}.")) for text in alike(d)]
+    yield say.Fold("", lambda: [say.KeyFigures(f"{headline} (noise {floor})", figures)])
+    tone = say.TONES[d.findings[0].severity] if d.findings else "good"
+    yield say.ShownVerdict(tone, diagnosis_headline(d))
+    lines = [(label, say.capital(text)) for label, text in diagnosis_lines(d)]
+    lines += [("Not separable", say.capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
-    yield Lines([*lines, *((WARNING, capital(printable(text))) for text in d.warnings)])
-    yield Fold("", lambda: _figures(d), figures=("budget", "curves"))
+    yield say.Lines([*lines, *((say.WARNING, say.capital(printable(text))) for text in d.warnings)])
+    yield say.Fold("", lambda: _figures(d), figures=("budget", "curves"))
     shapes = "" if len(d.effects) <= FEW else "Found effects over the joints they act at"
-    yield Fold(shapes, lambda: _shapes(d), figures=("effects",))
+    yield say.Fold(shapes, lambda: _shapes(d), figures=("effects",))
     yield cause_table(d)
     yield added_parameter_table(d)
-    places = place_table(d)
-    yield Fold("Place by place", lambda: [places], printed=True)
-    yield Fold("Smooth corrections", lambda: _smooth(d), printed=True)
-    yield Fold("Error budget", lambda: [gap_table(d)], printed=True)
+    yield say.Fold("Place by place", lambda: [place_table(d)], printed=True)
+    yield say.Fold("Smooth corrections", lambda: _smooth(d), printed=True)
+    yield say.Fold("Error budget", lambda: [gap_table(d)], printed=True)
     best = candidate_table(d)
-    yield Fold("Candidates", lambda: [best], printed=True)
-    yield Fold("Rivals", lambda: [pair_table(d)], printed=True)
-    yield Fold("Where the error comes from", lambda: [location_table(d), structure_table(d)])
-    yield Fold("Not tested", lambda: [untested_table(d)], printed=True)
+    yield say.Fold("Candidates", lambda: [best], printed=True)
+    yield say.Fold("Rivals", lambda: [pair_table(d)], printed=True)
+    yield say.Fold("Where the error comes from", lambda: [location_table(d), structure_table(d)])
+    yield say.Fold("Not tested", lambda: [untested_table(d)], printed=True)
     revolute = ("revolute",) * len(d.noise.repeatability)
     kinds = revolute if d.model is None else d.model.chain.kinds
     noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
-    yield Fold("Noise", lambda: [Lines(noise)], printed=True)
+    yield say.Fold("Noise", lambda: [say.Lines(noise)], printed=True)
     if d.noise.faulty:
         faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
-        found = outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
-        yield Fold("Outliers excluded", lambda: found)
+        found = say.outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
+        yield say.Fold("Outliers excluded", lambda: found)
     if d.calibrated is not None:
-        yield Fold("Residuals of the calibrated arm", lambda: _residuals(d),
+        yield say.Fold("Residuals of the calibrated arm", lambda: _residuals(d),
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
 
 
-def _figures(d: Diagnosis) -> Iterator[Figure]:
+def _figures(d: Diagnosis) -> Iterator[say.Figure]:
     from elastocal.report.figures import unknown_curves, waterfall
 
     if d.budget:
@@ -143,21 +106,21 @@ def _figures(d: Diagnosis) -> Iterator[Figure]:
         yield unknown_curves(d)
 
 
-def _shapes(d: Diagnosis) -> Iterator[Figure]:
+def _shapes(d: Diagnosis) -> Iterator[say.Figure]:
     from elastocal.report.figures import effects_over_joints
 
     if (found := effects_over_joints(d)) is not None:
         yield found
 
 
-def _residuals(d: Diagnosis) -> Iterator[Block]:
+def _residuals(d: Diagnosis) -> Iterator[say.Block]:
     from elastocal.report.arm_view import residual_arm
     from elastocal.report.figures import Residuals
 
     base = d.calibrated
     assert base is not None
     residuals = Residuals(base.model, base.observed, base.residual)
-    yield Sentence("What the model leaves before the effects found are added.")
+    yield say.Sentence("What the model leaves before the effects found are added.")
     yield residual_arm(base.model, base.observed, base.x, base.residual)
     yield from residuals.figures()
     yield from residuals.over_time()
@@ -168,40 +131,40 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
     text = "; nothing was stated"
     if noise.stated:
         text = (
-            f", {significant(noise.stated_factor, 2)} times what is stated, and "
-            f"{significant(noise.ratio_to_stated)} times with the scatter of the joints"
+            f", {say.significant(noise.stated_factor, 2)} times what is stated, and "
+            f"{say.significant(noise.ratio_to_stated)} times with the scatter of the joints"
         )
-    yield f"A reading scatters by {length(noise.reading_sigma)} rms per axis{text}."
+    yield f"A reading scatters by {say.length(noise.reading_sigma)} rms per axis{text}."
     joints = [
-        f"joint {i + 1} {significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
+        f"joint {i + 1} {say.significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
         for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
         if value > 0
     ]
     yield f"Repeatability from visit to visit: {', '.join(joints) or 'none found'}."
     if noise.shared > 0:
-        times = significant(noise.shared, 2)
+        times = say.significant(noise.shared, 2)
         yield f"Visits of a configuration have a common scatter of {times} times that."
     if noise.drift > 0:
-        drift = length(noise.drift)
+        drift = say.length(noise.drift)
         yield f"The drift of {drift} that [noise] of the cell states counts as noise."
     if noise.pure_error is None:
         yield "No repeats: the noise is estimated from residuals only."
     else:
-        yield f"Repeats scatter by {length(noise.pure_error)} rms per axis."
+        yield f"Repeats scatter by {say.length(noise.pure_error)} rms per axis."
     if (near := noise.near_repeats) is not None:
         times = ""
         if near.soon is not None and near.later is not None:
             times = (
-                f" (measured soon after each other {length(near.soon)}, in other parts of the "
-                f"session {length(near.later)})"
+                f" (measured soon after each other {say.length(near.soon)}, in other parts of the "
+                f"session {say.length(near.later)})"
             )
         yield (
-            f"Readings at nearly the same pose ({counted(near.pairs, 'pair')}) scatter by "
-            f"{length(near.scatter)} rms per axis{times}."
+            f"Readings at nearly the same pose ({say.counted(near.pairs, 'pair')}) scatter by "
+            f"{say.length(near.scatter)} rms per axis{times}."
         )
     if n := len(noise.faulty):
-        worst = length(max(f.error for f in noise.faulty))
-        yield f"{counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
+        worst = say.length(max(f.error for f in noise.faulty))
+        yield f"{say.counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
 
 
 # The verdict, and what beside it
@@ -209,26 +172,30 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
 
 def diagnosis_headline(d: Diagnosis) -> str:
     if d.groups:
-        return capital(headline_of_causes(d))
+        return say.capital(headline_of_causes(d))
     likely = []  # each effect with its probability and, where it happened once, when
     for f in d.effects:
         moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
         when = f"; {settings_of(d, moments)}" if moments else ""
-        likely.append(f"{effect_at(f)} (probability {probability(f.probability)}{when})")
+        likely.append(f"{say.effect_at(f)} (probability {say.probability(f.probability)}{when})")
     if d.verdict == "explained":
         one = "s" * (len(d.effects) == 1)
-        return f"{capital(together(likely))} explain{one} the remaining error."
+        return f"{say.capital(say.together(likely))} explain{one} the remaining error."
     if d.verdict == "ambiguous":
-        sets = [f"either {together([effect_at(e) for e in s], 'or')}" for s in d.indistinguishable]
+        sets = [
+            f"either {say.together([say.effect_at(e) for e in s], 'or')}"
+            for s in d.indistinguishable
+        ]
         verb = "causes" if len(sets) == 1 else "cause"
-        return f"{capital(together(sets))} {verb} the remaining error; these data cannot decide."
+        told = say.capital(say.together(sets))
+        return f"{told} {verb} the remaining error; these data cannot decide."
     if d.verdict != "unknown_effect":
-        none = probability(d.probability_nothing)
+        none = say.probability(d.probability_nothing)
         return f"No further effect exceeds the noise; probability of none: {none}."
     where = location_text(d.location) if d.location else ""
     if likely:
         verb = "cause" if len(likely) > 1 else "causes"
-        text = f"{capital(together(likely))} {verb} part of the remaining error; an effect "
+        text = f"{say.capital(say.together(likely))} {verb} part of the remaining error; an effect "
         return f"{text}outside the catalogue acts{f' {where}' if where else ''}."
     text = "An effect outside the catalogue causes the remaining error"
     return f"{text}, {where}." if where else f"{text}; the data do not show where."
@@ -238,22 +205,22 @@ def headline_of_causes(d: Diagnosis) -> str:
     """The largest causes with their shares, and what is left open."""
     large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
     told = [
-        f"{effect_at_places(g.name, g.places)} "
+        f"{say.effect_at_places(g.name, g.places)} "
         f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
         for k, g in enumerate(large)
     ]
     if more := len(d.groups) - len(told):
-        told.append(counted(more, "smaller cause"))
+        told.append(say.counted(more, "smaller cause"))
     first = d.groups[0]
     several = len(d.groups) > 1 or len(first.places) > 1 or first.name.endswith("errors")
-    text, one = together(told), "s" * (not several)
+    text, one = say.together(told), "s" * (not several)
     if d.verdict == "explained":
         return f"{text} explain{one} the remaining error."
     if d.verdict == "ambiguous":
         n = len(d.indistinguishable)
         names = "one effect" if n == 1 else f"{n} effects"
         return f"{text} cause{one} the remaining error; these data leave {names} of it open."
-    at = places(dict.fromkeys(c.where for c in d.components if not c.named))
+    at = say.places(dict.fromkeys(c.where for c in d.components if not c.named))
     return (
         f"{text} cause{one} part of the remaining error; an effect outside the catalogue acts"
         f"{f' at {at}' if at else ''}."
@@ -261,9 +228,9 @@ def headline_of_causes(d: Diagnosis) -> str:
 
 
 def location_text(location: Location) -> str:
-    at, stage = place(location.where), STAGES[location.stage]
+    at, stage = say.place(location.where), say.STAGES[location.stage]
     where = f"at {at}, in the {stage}" if at != stage else f"at the {at}"
-    return f"{where} (probability {probability(location.probability)})"
+    return f"{where} (probability {say.probability(location.probability)})"
 
 
 def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
@@ -272,24 +239,24 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
     if d.gap.unexplained > MATERIAL * d.gap.noise_floor:  # what looks like noise and is none
         yield (
             "Error",
-            f"{length(d.gap.unexplained)} rms are unexplained: they look like scatter of the arm, "
-            "but repeats do not show them, neighbours in pose or time share them, or joints do not "
-            "scatter that much.",
+            f"{say.length(d.gap.unexplained)} rms are unexplained: they look like scatter of the "
+            "arm, but repeats do not show them, neighbours in pose or time share them, or joints "
+            "do not scatter that much.",
         )
     unknown = d.verdict == "unknown_effect"
     if unknown:
-        told = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in d.dependences]
+        told = [f"{say.driver_name(t.driver)} ({say.size_of(t.p_family)})" for t in d.dependences]
         more = len(told) - MOST_NAMED
-        named = together(told[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+        named = say.together(told[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
         named = named or "no single driver that was tested shows it; see the curves for its shape"
         yield "Depends on", f"{named}."
     chance = " after correction for all candidates."
     if not d.effects and d.p_value > STRUCTURE:
         chance = " for the strongest candidate, corrected for all candidates."
     if d.groups:
-        if spans := [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]:
+        if spans := [f"{curve_span(curve)} ({say.place(curve.entry)})" for curve in d.curves]:
             text = "the joints' errors against their own angles span"
-            yield "Curves", f"{text} {together(spans)}."
+            yield "Curves", f"{text} {say.together(spans)}."
         matters = any(c.family == "move" for c in d.components) or "approach" in d.model_keys
         if matters and d.calibrated and d.calibrated.observed.table.time is None:
             yield (
@@ -297,14 +264,14 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
                 "the last move is that from the visit before, in the order of the rows; if they "
                 "were not measured so, do not rely on effects of the last move.",
             )
-        yield "Chance", f"{size_of(d.p_value)}{chance}"
+        yield "Chance", f"{say.size_of(d.p_value)}{chance}"
         return
     for curve in d.curves if unknown else ():
-        moved = f"{driver_name(curve.driver)} moves {driver_name(curve.entry)}"
+        moved = f"{say.driver_name(curve.driver)} moves {say.driver_name(curve.entry)}"
         yield "Shape", f"{moved} by {curve_span(curve)} in all."
     open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
     for f in d.effects if d.open else ():  # beside the open question, or its likeliest answer
-        text = f"{effect_at(f)} (probability {probability(f.probability)}"
+        text = f"{say.effect_at(f)} (probability {say.probability(f.probability)}"
         text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
         yield "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
     if d.verdict == "nothing_significant":
@@ -312,32 +279,32 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
             yield "Sensitivity", text
     elif d.verdict == "ambiguous" and d.location is not None:
         yield "Location", f"{location_text(d.location)}."
-    yield "Chance", f"{size_of(d.p_value)}{chance}"
+    yield "Chance", f"{say.size_of(d.p_value)}{chance}"
 
 
 def _error_line(d: Diagnosis) -> str:
     """Error on held-out poses before and after, and the part of it that the effects remove."""
-    calibrated, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
+    calibrated, floor = say.length(d.gap.calibrated), say.length(d.gap.noise_floor)
     if not d.effects:
         return f"Held-out error: {calibrated} rms (noise alone: {floor})."
     text = (
-        f"Held-out error: {calibrated} rms, with the effects found {length(d.gap.explained)} rms "
-        f"(noise alone: {floor})."
+        f"Held-out error: {calibrated} rms, with the effects found {say.length(d.gap.explained)} "
+        f"rms (noise alone: {floor})."
     )
     if d.groups:  # the table of causes says what each takes away
-        nameless = [length(s.heldout_rms) for s in d.budget if s.step.startswith("unknown:")]
+        nameless = [say.length(s.heldout_rms) for s in d.budget if s.step.startswith("unknown:")]
         told = [f"With unnamed smooth corrections: {left}." for left in nameless[-1:]]
         return " ".join([text, *told])
     if len(d.effects) == 1:
-        return f"{text} The noise-free error at new poses falls by {reduction(d.effects[0])}."
-    each = [f"{effect_at(f)} removes {reduction(f)}" for f in d.effects]
-    return f"{text} Added last, {together(each)} of the noise-free error at new poses."
+        return f"{text} The noise-free error at new poses falls by {say.reduction(d.effects[0])}."
+    each = [f"{say.effect_at(f)} removes {say.reduction(f)}" for f in d.effects]
+    return f"{text} Added last, {say.together(each)} of the noise-free error at new poses."
 
 
 def settings_of(d: Diagnosis, settings: Mapping[str, float]) -> str:
     table = None if d.calibrated is None else d.calibrated.observed.table
     lines = () if table is None or table.time is not None else np.unique(by_rows(table)).tolist()
-    return settings_text(settings, lines)
+    return say.settings_text(settings, lines)
 
 
 def sensitivity(d: Diagnosis) -> list[str]:
@@ -346,14 +313,14 @@ def sensitivity(d: Diagnosis) -> list[str]:
     lines = []
     if math.isfinite(d.smallest_seen):
         lines.append(
-            f"effects above about {significant(d.smallest_seen * 1e6, 2)} µm rms at the markers, "
-            "not absorbed by fitted parameters, would have been found."
+            f"effects above about {say.significant(d.smallest_seen * 1e6, 2)} µm rms at the "
+            "markers, not absorbed by fitted parameters, would have been found."
         )
     visible = [c for c in d.candidates if c.visible]
     faint = [c for c in d.candidates if c.hidden]
     text = f"of {len(d.candidates)} candidates {len(visible)} would have been found at typical size"
     if faint:
-        names = list(dict.fromkeys(plain_name(c.effect) for c in faint))
+        names = list(dict.fromkeys(say.plain_name(c.effect) for c in faint))
         more = len(names) - MOST_NAMED
         text += f"; below the noise even then: {len(faint)} ({', '.join(names[:MOST_NAMED])}"
         text += f" and {more} more kinds)" if more > 0 else ")"
@@ -364,22 +331,22 @@ def diagnosis_steps(d: Diagnosis) -> list[str]:
     """What to do now: the remedies of the findings, what extra poses promise, what to record."""
     steps = [f.remedy for f in d.findings if f.remedy]
     if (extra := d.extra) is not None:
-        rivals, n = together([name_of(name) for name in extra.rivals], "or"), extra.n_poses
+        rivals, n = say.together([say.name_of(name) for name in extra.rivals], "or"), extra.n_poses
         if not extra.separable:
             steps.append(f"No pose that this cell allows separates {rivals}.")
         else:
             steps.append(
-                f"{counted(n, 'more pose')} to separate {rivals}: the probability of the right "
-                f"answer rises from {probability(extra.probability_before)} to "
-                f"{probability(extra.probability_after)} (as many random poses: "
-                f"{probability(extra.probability_random)})."
+                f"{say.counted(n, 'more pose')} to separate {rivals}: the probability of the right "
+                f"answer rises from {say.probability(extra.probability_before)} to "
+                f"{say.probability(extra.probability_after)} (as many random poses: "
+                f"{say.probability(extra.probability_random)})."
             )
             for group in extra.inseparable:
-                names = together([name_of(name) for name in group])
-                steps.append(f"{capital(names)} count as one.")
-        steps += [capital(printable(text)) for text in extra.advice]
+                names = say.together([say.name_of(name) for name in group])
+                steps.append(f"{say.capital(names)} count as one.")
+        steps += [say.capital(printable(text)) for text in extra.advice]
     # One piece of advice serves many effects.
-    return steps + list(dict.fromkeys(capital(printable(u.advice)) for u in d.untested))
+    return steps + list(dict.fromkeys(say.capital(printable(u.advice)) for u in d.untested))
 
 
 def alike(d: Diagnosis) -> list[str]:
@@ -389,41 +356,41 @@ def alike(d: Diagnosis) -> list[str]:
 
     def told(e: EffectAt) -> str:
         p = taken.get((e.effect, e.where))
-        return effect_at(e) + ("" if p is None else f" (probability {probability(p)})")
+        return say.effect_at(e) + ("" if p is None else f" (probability {say.probability(p)})")
 
-    return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
+    return [say.together([told(e) for e in rivals]) for rivals in d.indistinguishable]
 
 
 # Tables
 
 
-def gap_table(d: Diagnosis) -> ShownTable:
-    return budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
+def gap_table(d: Diagnosis) -> say.ShownTable:
+    return say.budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
 
 
 def _named_steps(d: Diagnosis) -> list[tuple[str, float, tuple[float, float]]]:
     models = (step for step in d.budget if step.step != "noise_floor")
-    return [(name_of(step.step), step.heldout_rms, step.ci95) for step in models]
+    return [(say.name_of(step.step), step.heldout_rms, step.ci95) for step in models]
 
 
-def candidate_table(d: Diagnosis) -> ShownTable:
+def candidate_table(d: Diagnosis) -> say.ShownTable:
     """The likeliest candidates; an unknown effect and none are candidates as well."""
     rows = []
     for c in d.candidates[:MOST_CANDIDATES]:
         seen = "–"
         if math.isfinite(c.seen_from):
-            seen = f"> {ABSURD:.0f}" if c.seen_from > ABSURD else significant(c.seen_from, 2)
+            seen = f"> {ABSURD:.0f}" if c.seen_from > ABSURD else say.significant(c.seen_from, 2)
         rows.append(
-            (effect_at(c), probability(c.probability), f"{c.score:+.1f}",
-             significant(c.detectable, 2), seen, settings_of(d, c.settings))
+            (say.effect_at(c), say.probability(c.probability), f"{c.score:+.1f}",
+             say.significant(c.detectable, 2), seen, settings_of(d, c.settings))
         )  # fmt: skip
     title = f"Candidates{' one at a time' if d.groups else ''}"
     title += f", rank 1 to {len(rows)} of {len(d.candidates)}"
     none = ("", "", "", "")
-    rows.append(("an effect outside the catalogue", probability(d.probability_unknown), *none))
-    rows.append(("no further effect", probability(d.probability_nothing), *none))
+    rows.append(("an effect outside the catalogue", say.probability(d.probability_unknown), *none))
+    rows.append(("no further effect", say.probability(d.probability_nothing), *none))
     heads = ("candidate", "probability", "evidence", "d", "seen from", "settings")
-    table = ShownTable(heads, rows, (0, 5), title=title, note=(
+    table = say.ShownTable(heads, rows, (0, 5), title=title, note=(
         "evidence: log marginal likelihood over that of no further effect. d: standard deviations "
         "by which the typical size moves the data; below 3 it is below the noise. seen from: "
         "smallest detectable size, in typical sizes."
@@ -431,84 +398,90 @@ def candidate_table(d: Diagnosis) -> ShownTable:
     return table.when_narrow(5) if any(row[5] for row in rows) else table.without(5)
 
 
-def added_parameter_table(d: Diagnosis) -> ShownTable:
+def added_parameter_table(d: Diagnosis) -> say.ShownTable:
     rows: list[tuple[str, ...]] = []
     for f in d.effects:
         for p in f.parameters:
-            rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
+            rows.append((printable(p.name), *say.estimate(p.value, NORMAL_95 * p.std, p.unit)))
         if f.settings:
-            rows.append((f"{effect_at(f)}: {settings_of(d, f.settings)}", "", "", ""))
+            rows.append((f"{say.effect_at(f)}: {settings_of(d, f.settings)}", "", "", ""))
     title = "Parameters of the effects found"
-    return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
+    return say.ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
 
 
-def structure_table(d: Diagnosis) -> ShownTable:
+def structure_table(d: Diagnosis) -> say.ShownTable:
     """Tests that name no effect, the most conspicuous first."""
     tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:MOST_TESTS]
-    rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
-    return ShownTable(("depends on", "p", "p, all tests"), rows, note=(
+    rows = [
+        (say.driver_name(t.driver), say.p_value(t.p_value), say.p_value(t.p_family)) for t in tests
+    ]
+    return say.ShownTable(("depends on", "p", "p, all tests"), rows, note=(
         "Does the residual depend on it at all? These tests name no effect: whole configurations "
         f"change sign, and the last column counts all {len(d.structure)}."
     ))  # fmt: skip
 
 
-def pair_table(d: Diagnosis) -> ShownTable:
+def pair_table(d: Diagnosis) -> say.ShownTable:
     rows = [
-        (f"{name_of(pair.first)} or {name_of(pair.second)}",
-         significant(pair.distance_before, 2), significant(pair.distance_after, 2))
+        (f"{say.name_of(pair.first)} or {say.name_of(pair.second)}",
+         say.significant(pair.distance_before, 2), say.significant(pair.distance_after, 2))
         for pair in (() if d.extra is None else d.extra.pairs)
     ]  # fmt: skip
     heads = ("rivals", "d so far", "d with the extra poses")
-    return ShownTable(heads, rows, title="Rivals", note=(
+    return say.ShownTable(heads, rows, title="Rivals", note=(
         "d is the distance of the two in standard deviations of the data; the best test between "
         "them is right with probability Φ(d/2)."
     ))  # fmt: skip
 
 
-def untested_table(d: Diagnosis) -> ShownTable:
+def untested_table(d: Diagnosis) -> say.ShownTable:
     """Effects that could not be tested, those with the same reason and remedy in one row."""
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
         effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
-        effects.setdefault(plain_name(u.effect), []).append(u.where)
+        effects.setdefault(say.plain_name(u.effect), []).append(u.where)
     rows = [
-        (", ".join(f"{name} ({places(at, True)})" for name, at in effects.items()), *reason)
+        (", ".join(f"{name} ({say.places(at, True)})" for name, at in effects.items()), *reason)
         for reason, effects in groups.items()
     ]
-    return ShownTable(("effect", "why", "record or measure"), rows, (0, 1, 2), title="Not tested")
+    return say.ShownTable(
+        ("effect", "why", "record or measure"), rows, (0, 1, 2), title="Not tested"
+    )
 
 
-def location_table(d: Diagnosis) -> ShownTable:
+def location_table(d: Diagnosis) -> say.ShownTable:
     """The stages of the chain from commanded joints to tracker with the evidence for each, and the
     likeliest places."""
     location = d.location
     if location is None:
-        return ShownTable((), [])
+        return say.ShownTable((), [])
     found = location.shares or location.stages
     rows = [
-        (name, share_text(min(value, 1.0)) if location.shares else probability(value))
-        for stage, name in STAGES.items()
+        (name, share_text(min(value, 1.0)) if location.shares else say.probability(value))
+        for stage, name in say.STAGES.items()
         for value in (found.get(stage, 0.0),)
     ]
     if location.shares:
-        return ShownTable(("where", "share of the error"), rows, groups={0: "stages"})
+        return say.ShownTable(("where", "share of the error"), rows, groups={0: "stages"})
     groups = {0: "stages", len(rows): "places"}
     order = sorted(location.places.items(), key=lambda item: -item[1])
-    rows += [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
-    return ShownTable(("where", "probability"), rows, groups=groups)
+    rows += [(say.place(where), say.probability(p)) for where, p in order[:MOST_PLACES]]
+    return say.ShownTable(("where", "probability"), rows, groups=groups)
 
 
 # Many causes at once: findings, and their places below them.
 
 
 def _error_of(c: ComponentShare) -> str:
-    return FAMILIES.get(c.family, plain_name(c.family))
+    return FAMILIES.get(c.family, say.plain_name(c.family))
 
 
 def _unnamed(d: Diagnosis) -> list[tuple[str, ComponentShare]]:
     """What has no name, each by itself."""
     return [
-        (f"{NAMELESS}, {_error_of(c)} at {place(c.where)}", c) for c in d.components if not c.named
+        (f"{NAMELESS}, {_error_of(c)} at {say.place(c.where)}", c)
+        for c in d.components
+        if not c.named
     ]
 
 
@@ -532,10 +505,10 @@ def span_text(ends: Interval, middle: float) -> str:
     return f"{share_text(low, fine).removesuffix(' %')} to {share_text(high, fine)}"
 
 
-def cause_table(d: Diagnosis) -> ShownTable:
+def cause_table(d: Diagnosis) -> say.ShownTable:
     rows = [
         (
-            effect_at_places(g.name, g.places), share_text(g.share),
+            say.effect_at_places(g.name, g.places), share_text(g.share),
             span_text(g.share_ci90, g.share), share_text(g.gap_reduction),
             span_text(g.gap_reduction_ci90, g.gap_reduction),
         )
@@ -548,17 +521,17 @@ def cause_table(d: Diagnosis) -> ShownTable:
     if d.gap.unexplained_share >= FINE**2:
         rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
     heads = ("cause", "share", "90 %", "error falls by", "90 %")
-    return ShownTable(heads, rows, title="Causes of the remaining error", note=(
+    return say.ShownTable(heads, rows, title="Causes of the remaining error", note=(
         "share: part of the squared remaining error that goes when this is added last. error falls "
         "by: at new poses, if only this is added to the model."
     ))  # fmt: skip
 
 
-def place_table(d: Diagnosis) -> ShownTable:
+def place_table(d: Diagnosis) -> say.ShownTable:
     """What acts at each place, below the finding that it belongs to."""
     named = [c for c in d.components if c.named]
     found = [
-        (effect_at_places(g.name, g.places),
+        (say.effect_at_places(g.name, g.places),
          [c for c in named if c.where in g.places and set(c.effects) & set(g.effects)])
         for g in d.groups
     ]  # fmt: skip
@@ -571,18 +544,18 @@ def place_table(d: Diagnosis) -> ShownTable:
         if parts:
             groups[len(rows)] = name
         for c in parts:
-            low, high = map(length, c.rms_ci95)
+            low, high = map(say.length, c.rms_ci95)
             low = low.removesuffix(high[high.rfind(" ") :])  # "266 to 293 µm"
             rows.append((
-                place(c.where), _error_of(c),
-                ", ".join(map(plain_name, c.effects)) if c.named else NAMELESS,
-                f"{length(c.rms)} ({low} to {high})",
+                say.place(c.where), _error_of(c),
+                ", ".join(map(say.plain_name, c.effects)) if c.named else NAMELESS,
+                f"{say.length(c.rms)} ({low} to {high})",
                 f"{share_text(c.share)} ({span_text(c.share_ci90, c.share).removesuffix(' %')})",
-                probability(c.probability),
+                say.probability(c.probability),
             ))  # fmt: skip
         told += parts
     heads = ("place", "error", "as", "rms (95 %)", "share (90 %)", "probability")
-    table = ShownTable(heads, rows, (0, 1, 2), groups, title="Place by place")
+    table = say.ShownTable(heads, rows, (0, 1, 2), groups, title="Place by place")
     return table.when_narrow(2)  # what it is as effects stands in the table of parameters too
 
 
@@ -590,24 +563,24 @@ def curve_span(curve: Curve) -> str:
     """How far a curve goes from its lowest to its highest point."""
     moved = max(curve.y) - min(curve.y)
     if curve.y_unit == "m":
-        return length(moved)
-    shown, unit = display(moved, curve.y_unit)
-    return f"{significant(shown)} {unit}"
+        return say.length(moved)
+    shown, unit = say.display(moved, curve.y_unit)
+    return f"{say.significant(shown)} {unit}"
 
 
 # Corrections that have no name.
 
 
-def _smooth(d: Diagnosis) -> Iterator[Block]:
+def _smooth(d: Diagnosis) -> Iterator[say.Block]:
     """Where the corrections without a name are, what they follow, how large and how smooth."""
     if d.slight:
-        yield Sentence(
+        yield say.Sentence(
             f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "
             "the remaining error. They correct the arm and are not findings."
         )
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
-    yield ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=(
+    yield say.ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=(
         "Smooth functions without a physical name; they hold where the arm was measured: size "
         "(standard deviation) and the length over which they change."
     ))  # fmt: skip
@@ -626,10 +599,12 @@ def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
         of = name.rstrip("_").partition("_")[2]
         timed = of == "time"
         yield (
-            place(f.where),
-            "the time" if timed else f"the angle of {place(of)}" if of else "its own angle",
-            f"{significant(value * 1e3, 2)} {unit}",
-            setting_value("over_s" if timed else "over_rad", over) if math.isfinite(over) else "–",
+            say.place(f.where),
+            "the time" if timed else f"the angle of {say.place(of)}" if of else "its own angle",
+            f"{say.significant(value * 1e3, 2)} {unit}",
+            say.setting_value("over_s" if timed else "over_rad", over)
+            if math.isfinite(over)
+            else "–",
             *told,
         )
         told = ("", "")
@@ -642,4 +617,4 @@ def added_text(found: Sequence[FoundEffect]) -> str:
     at: dict[str, list[str]] = {}
     for f in found:
         at.setdefault(f.effect, []).append(f.where)
-    return ", ".join(f"{printable(name)} ({places(where)})" for name, where in at.items())
+    return ", ".join(f"{printable(name)} ({say.places(where)})" for name, where in at.items())

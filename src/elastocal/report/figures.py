@@ -28,17 +28,7 @@ from elastocal.identification.weighted_problem import least_norm
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.report.blocks import (
-    Figure,
-    ShownTable,
-    driver_name,
-    effect_at,
-    length,
-    short_name,
-    signed,
-    significant,
-    typeset,
-)
+from elastocal.report import blocks as say
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
@@ -104,7 +94,7 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", {**_STYLE, "axes.prop_cycle": cycle}])
 
 
-def figure_of(block: Figure, place: SubFigure | None = None) -> Drawing | SubFigure:
+def figure_of(block: say.Figure, place: SubFigure | None = None) -> Drawing | SubFigure:
     """matplotlib's Figure of a block, or what is drawn of it in a `place` of another figure."""
     from matplotlib.figure import Figure as Drawing
 
@@ -116,7 +106,7 @@ def figure_of(block: Figure, place: SubFigure | None = None) -> Drawing | SubFig
     return figure
 
 
-def svg(block: Figure) -> str:
+def svg(block: say.Figure) -> str:
     from matplotlib.figure import Figure as Drawing
 
     with style():
@@ -164,11 +154,13 @@ NO_ENDS = (math.nan, math.nan)
 def rows_of_dots(
     name: str, title: str, rows: Sequence[tuple[str, float, tuple[float, float], str]], axis: str,
     caption: str = "", line: tuple[str, float] | None = None, lengths: bool = False,
-) -> Figure:  # fmt: skip
+) -> say.Figure:  # fmt: skip
     """Rows (name, value, both ends of its interval or NaN, text), a dot each, and a dashed line at
     a value that has a name.  `lengths`: values in µm, which may span decades."""
     # On two lines, cut where a name is longer.
-    wrapped = [textwrap.wrap(typeset(short_name(n, 2 * LONGEST)), LONGEST) for n, *_ in rows]
+    wrapped = [
+        textwrap.wrap(say.typeset(say.short_name(n, 2 * LONGEST)), LONGEST) for n, *_ in rows
+    ]
     names = ["\n".join(w[:2]) + "…" * (len(w) > 2) for w in wrapped]
     lines = [name.count("\n") for name in names]
     at = np.cumsum([0.0, *(1 + 0.4 * (a + b) for a, b in pairwise(lines))])
@@ -181,19 +173,19 @@ def rows_of_dots(
         for y, (_, value, ends, text) in zip(at, rows, strict=True):
             axes.plot(ends, [y, y], color=SERIES[0], linewidth=2.0)
             axes.plot([value], [y], "o", color=SERIES[0], markersize=7)
-            axes.annotate(typeset(text), (np.nanmax([value, ends[1]]), y), (7, 0), va="center",
+            axes.annotate(say.typeset(text), (np.nanmax([value, ends[1]]), y), (7, 0), va="center",
                           textcoords="offset points", fontsize=9)  # fmt: skip
         axes.set_yticks(at, names, fontsize=9.5)
         axes.set_ylim(at[-1] + 0.6, -0.9)
         if dashed:
-            told = f"{dashed[0]} ({length(dashed[1] * 1e-6)})"
+            told = f"{dashed[0]} ({say.length(dashed[1] * 1e-6)})"
             axes.axvline(dashed[1], color=SERIES[1], linestyle="--", linewidth=1.2, label=told)
             figure.legend(loc="outside upper right")
         _scaled(axes, known, lengths)
         axes.set_xlabel(axis)
         axes.grid(axis="y", visible=False)
 
-    return Figure(name, title, draw, 0.95 + ROW * (float(at[-1]) + 1.5), caption)
+    return say.Figure(name, title, draw, 0.95 + ROW * (float(at[-1]) + 1.5), caption)
 
 
 def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
@@ -215,9 +207,9 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
 def waterfall(
     name: str, steps: Sequence[tuple[str, float, tuple[float, float]]],
     floor: tuple[str, float] | None,
-) -> Figure:  # fmt: skip
+) -> say.Figure:  # fmt: skip
     """Steps (name, held-out rms in m, 95 % interval), and the `floor` (m) that noise leaves."""
-    rows = [(n, v * 1e6, (low * 1e6, high * 1e6), length(v)) for n, v, (low, high) in steps]
+    rows = [(n, v * 1e6, (low * 1e6, high * 1e6), say.length(v)) for n, v, (low, high) in steps]
     caption = (
         "Held-out 3-D rms error with its 95 % interval, as the model gains one part after the "
         "other. "
@@ -262,7 +254,7 @@ class Panel:
 def panelled(
     name: str, title: str, panels: Sequence[Panel], caption: str, height: float,
     across: int = 1, columns: int = 2, **share: Any,
-) -> Figure:  # fmt: skip
+) -> say.Figure:  # fmt: skip
     """Panels in a grid `across` wide, under one legend of `columns`."""
 
     def draw(figure: Drawing) -> None:
@@ -277,7 +269,7 @@ def panelled(
         if labels:
             figure.legend(handles, labels, loc="outside upper right", ncols=columns)
 
-    return Figure(name, title, draw, height, caption)
+    return say.Figure(name, title, draw, height, caption)
 
 
 def _panel(axes: Axes, panel: Panel) -> None:
@@ -366,7 +358,7 @@ ABSCISSA = {
 ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
 
 
-def unknown_curves(d: Diagnosis) -> Figure:
+def unknown_curves(d: Diagnosis) -> say.Figure:
     """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
     panels = []
     for curve in d.curves:
@@ -375,8 +367,8 @@ def unknown_curves(d: Diagnosis) -> Figure:
         x, y, sd = wide * np.array(curve.x), high * np.array(curve.y), high * np.array(curve.sd)
         band = np.stack([y - 2 * sd, y + 2 * sd])
         panels.append(Panel(
-            f"{short_name(driver_name(curve.driver), LONGEST_ENTRY)} in {x_unit}",
-            f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}",
+            f"{say.short_name(say.driver_name(curve.driver), LONGEST_ENTRY)} in {x_unit}",
+            f"{say.short_name(say.driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}",
             [Series("-", x, np.zeros(len(x)), FAINT),
              Series("band", x, band, label="± 2 standard deviations"),
              Series("-", x, y, INK, "estimated shape")],
@@ -434,11 +426,11 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
         lead = observed.lead[good]
         side = np.zeros(len(lead)) if table.approach is None else table.approach[lead, joint]
         kind = model.chain.kinds[joint]
-        found.append((effect_at(f), kind, table.q[lead, joint], seen, explained, side))
+        found.append((say.effect_at(f), kind, table.q[lead, joint], seen, explained, side))
     return found
 
 
-def effects_over_joints(d: Diagnosis) -> Figure | None:
+def effects_over_joints(d: Diagnosis) -> say.Figure | None:
     panels = []
     for name, kind, at, seen, explained, side in effect_shapes(d):
         (q, unit), series = _in_unit(kind, at), list[Series]()
@@ -463,7 +455,7 @@ def effects_over_joints(d: Diagnosis) -> Figure | None:
     return panelled("effects", title, panels, caption, 0.6 + 2.2 * len(panels))
 
 
-def plan_curve(plan: Plan) -> Figure:
+def plan_curve(plan: Plan) -> say.Figure:
     n, value = (np.array([getattr(s, name) for s in plan.curve]) for name in ("poses", "value"))
     bound = np.array([math.nan if s.bound is None else s.bound for s in plan.curve])
     series = [
@@ -506,7 +498,7 @@ class Residuals:
             chosen = np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False)
             self.shown = np.sort(chosen)
 
-    def figures(self) -> Iterator[Figure]:
+    def figures(self) -> Iterator[say.Figure]:
         yield self.by_configuration()
         yield self.over_joints()
 
@@ -517,7 +509,7 @@ class Residuals:
             return ""
         return f" Dots are a random choice of {drawn} of {total} readings; all else uses all."
 
-    def by_configuration(self) -> Figure:
+    def by_configuration(self) -> say.Figure:
         table, shown = self.observed.table, self.shown
         codes, first, own = np.unique(
             self.observed.configuration, return_index=True, return_inverse=True
@@ -529,12 +521,12 @@ class Residuals:
         x = np.argsort(order)[own] + 0.6 * (marker - (many - 1) / 2) / many
         several = 1 < many <= len(SERIES)
         every = range(0, len(labels), -(-len(labels) // MOST_LABELS))
-        ticks = list(every), [short_name(labels[i]) for i in every]
+        ticks = list(every), [say.short_name(labels[i]) for i in every]
         panels = []
         for name, unit, values in zip(self.components, self.units, self.value.T, strict=True):
             series = [
                 Series("dots", x[at], values[at], SERIES[m],
-                       short_name(table.marker_names[used[m]]) if several else "",
+                       say.short_name(table.marker_names[used[m]]) if several else "",
                        2.6 if len(shown) <= 1500 else 1.6)
                 for m in range(many if several else 1)
                 for at in (shown[marker[shown] == m] if several else shown,)
@@ -559,7 +551,7 @@ class Residuals:
               for k, v in each),
         ]  # fmt: skip
 
-    def over_joints(self) -> Figure:
+    def over_joints(self) -> say.Figure:
         n, shown, height = self.lengths.shape[1], self.shown, reach(self.lengths)
         if len(shown) * n > MOST_JOINT_DOTS:
             shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
@@ -579,7 +571,7 @@ class Residuals:
             sharey=True,
         )  # fmt: skip
 
-    def over_time(self) -> Iterator[Figure]:
+    def over_time(self) -> Iterator[say.Figure]:
         if self.observed.table.time is None:
             return
         at, unit = self.observed.table.time[self.observed.lead] / 60, "min"
@@ -596,7 +588,7 @@ class Residuals:
             2.9, columns=3,
         )  # fmt: skip
 
-    def table(self) -> ShownTable:
+    def table(self) -> say.ShownTable:
         """Mean, rms and largest residual of every direction, marker, load state and configuration.
 
         Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
@@ -604,13 +596,13 @@ class Residuals:
         rows: list[tuple[str, ...]] = []
 
         def add(name: str, sizes: Array, mean: str, largest: str, unit: str = "µm") -> None:
-            rms = significant(float(np.sqrt((sizes**2).mean())))
+            rms = say.significant(float(np.sqrt((sizes**2).mean())))
             rows.append((name, str(len(sizes)), mean, rms, largest, unit))
 
         groups = {0: "direction"}
         for name, unit, value in zip(self.components, self.units, self.value.T, strict=True):
             largest = float(value[np.argmax(np.abs(value))])
-            add(name, value, signed(float(value.mean())), signed(largest), unit)
+            add(name, value, say.signed(float(value.mean())), say.signed(largest), unit)
         every = np.ones(len(self.observed.value), dtype=bool)
         for by, code, names in groupings(self.observed, every):
             if by == "component":
@@ -619,9 +611,14 @@ class Residuals:
             for k, name in enumerate(names[:MOST_CONFIGURATIONS]):
                 own = self.lengths[code[:: self.observed.size] == k]
                 sizes, mean = np.linalg.norm(own, axis=1), float(np.linalg.norm(own.mean(axis=0)))
-                add(printable(name), sizes, significant(mean), significant(float(sizes.max())))
+                add(
+                    printable(name),
+                    sizes,
+                    say.significant(mean),
+                    say.significant(float(sizes.max())),
+                )
         heads = ("readings of", "number", "mean", "rms", "largest", "unit")
-        return ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
+        return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 
 # Over the work space
@@ -631,7 +628,7 @@ FEWEST = 3  # readings from which on a cell is told
 FEWEST_ON_MAP = 30  # poses
 
 
-def uncertainty_map(result: Calibration) -> Figure | None:
+def uncertainty_map(result: Calibration) -> say.Figure | None:
     """How sure the tool's place is over reach and height, under the loads measured: rms in µm of
     each part of the workspace; empty where the model asks for more than joints and load."""
     model, point = result.model, None
@@ -663,7 +660,7 @@ def uncertainty_map(result: Calibration) -> Figure | None:
         "flange stands: poses over the joint limits, under the loads measured. It counts the "
         "covariance of the estimates, what these poses do not show, and possible model error."
     )
-    return Figure("sureness", "Expected error over the work space", draw, 4.2, caption)
+    return say.Figure("sureness", "Expected error over the work space", draw, 4.2, caption)
 
 
 def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
@@ -680,7 +677,7 @@ def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
         x, y = (low + side * key).tolist()
         axes.add_patch(Rectangle((x, y), side, side, facecolor=SERIES[0], linewidth=0,
                                  alpha=0.75 * size / largest))  # fmt: skip
-        axes.text(x + side / 2, y + side / 2, significant(float(size), 2), ha="center",
+        axes.text(x + side / 2, y + side / 2, say.significant(float(size), 2), ha="center",
                   va="center", fontsize=9)  # fmt: skip
     high = low + side * (keys.max(axis=0) + 1)
     axes.set_xlim(float(low[0]) - 0.05 * side, float(high[0]) + 0.05 * side)

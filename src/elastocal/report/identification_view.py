@@ -35,30 +35,8 @@ from elastocal.identification.result import (
 from elastocal.identification.scrutiny import stage_of
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
+from elastocal.report import blocks as say
 from elastocal.report import judgement_view as words
-from elastocal.report.blocks import (
-    Block,
-    Fold,
-    KeyFigures,
-    Lines,
-    Report,
-    Sentence,
-    ShownTable,
-    ShownVerdict,
-    budget_table,
-    counted,
-    display,
-    estimate,
-    length,
-    outlier_blocks,
-    plain,
-    resolution,
-    rounded_alike,
-    sentence,
-    significant,
-    title_of,
-    with_ends,
-)
 from elastocal.report.judgement_view import judgement, warnings_beside
 from elastocal.text import listed, printable
 from elastocal.units import Array
@@ -84,40 +62,40 @@ READINGS = {
 
 def calibration_report(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
-) -> Report:
+) -> say.Report:
     """An identification; `truth` and `published` (SI) stand beside the estimates."""
     found = _blocks(result, truth, published)
-    title = title_of(result.model.chain.name, result.model.cell.name)
-    return Report("Identification", title, found, result.model.backend_report())
+    title = say.title_of(result.model.chain.name, result.model.cell.name)
+    return say.Report("Identification", title, found, result.model.backend_report())
 
 
 def _blocks(
     result: Calibration, truth: Truth | None, published: Published | None
-) -> Iterator[Block]:
+) -> Iterator[say.Block]:
     budget = cache(lambda: gap_budget(result))
-    yield Fold("", lambda: [_key(result, budget())])
+    yield say.Fold("", lambda: [_key(result, budget())])
     verdict = judgement(result)
-    yield ShownVerdict(verdict.tone, verdict.headline)
+    yield say.ShownVerdict(verdict.tone, verdict.headline)
     new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
-    yield Lines([
+    yield say.Lines([
         ("Error (rms)", error_line(result)), *new,
         *(("Next", step) for step in verdict.steps),
         *warnings_beside(result),
     ])  # fmt: skip
-    yield Fold("", lambda: _error_figures(result, budget()), figures=("waterfall", "sureness"))
+    yield say.Fold("", lambda: _error_figures(result, budget()), figures=("waterfall", "sureness"))
     yield parameter_table(result, truth, published)
     if result.combinations:
         told = "Combinations that are determined although their members are not"
         yield _open_if_few(combination_table(result, truth), told)
         whole = [(shortened(c, len(c.terms)), shortened(c)) for c in result.combinations]
-        longer = [Sentence(every) for every, some in whole if every != some]
-        yield Fold("Combinations with all their members", lambda: longer)
+        longer = [say.Sentence(every) for every, some in whole if every != some]
+        yield say.Fold("Combinations with all their members", lambda: longer)
     for line in undetermined_lines(result, FEW):
-        yield Sentence(sentence(line), soft=True)
+        yield say.Sentence(say.sentence(line), soft=True)
     constraints, prior = words.constraints_line(result), words.prior_line(result)
     hit, n = coverage(result, truth) if truth else (0, 0)
     held = f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
-    yield Lines([
+    yield say.Lines([
         ("Readings", readings(result)),
         ("Identified", what_was_identified(result)),
         *joint_lines(result),
@@ -127,56 +105,58 @@ def _blocks(
         *([("Truth", held)] if truth else []),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    yield Fold("", lambda: _residuals(result).figures(), figures=("residuals", "against_joints"))
+    yield say.Fold(
+        "", lambda: _residuals(result).figures(), figures=("residuals", "against_joints")
+    )
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
-    yield Fold("Method, noise and intervals", lambda: _method(result), printed=True)
+    yield say.Fold("Method, noise and intervals", lambda: _method(result), printed=True)
     missing = undetermined_table(result, truth)
     if missing.rows:
         why = f"Every parameter without a value, and why ({len(missing.rows)})"
-        remedy = Sentence(
+        remedy = say.Sentence(
             "To see an invisible parameter, measure poses and loads that move the markers through "
             "it. To separate a combination, add markers, loads or poses in which its members "
             "differ.",
             soft=True,
         )
-        yield Fold(why, lambda: [missing, remedy], printed=True)
+        yield say.Fold(why, lambda: [missing, remedy], printed=True)
     if result.correlations:
-        yield Fold("Correlations over 0.9", lambda: [_correlation_table(result)], printed=True)
-    yield Fold("Errors in numbers", lambda: _errors(result, budget()))
-    yield Fold(
+        yield say.Fold("Correlations over 0.9", lambda: [_correlation_table(result)], printed=True)
+    yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
+    yield say.Fold(
         "Residuals on the arm, over time and by group", lambda: _on_the_arm(result),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
     if single or words.fault_lines(result):
-        yield Fold(f"Outliers ({single})", lambda: _outliers(result))
-    yield Fold("Which configurations decide the fit", lambda: [_influence_table(result)])
+        yield say.Fold(f"Outliers ({single})", lambda: _outliers(result))
+    yield say.Fold("Which configurations decide the fit", lambda: [_influence_table(result)])
 
 
-def _open_if_few(table: ShownTable, summary: str) -> Block:
+def _open_if_few(table: say.ShownTable, summary: str) -> say.Block:
     if len(table.rows) <= FEW:
         return table
-    return Fold(f"{summary} ({len(table.rows)})", lambda: [table], printed=True)
+    return say.Fold(f"{summary} ({len(table.rows)})", lambda: [table], printed=True)
 
 
-def _key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
+def _key(result: Calibration, budget: ErrorBudget | None) -> say.KeyFigures:
     """The error before and after, and the noise that is in both."""
     held = math.isfinite(result.heldout_rms)
     after = result.heldout_rms if held else result.residual_rms
-    figures = [(NOMINAL, length(result.nominal_rms))]
-    figures.append(("held-out poses" if held else "fitted poses, not held out", length(after)))
+    figures = [(NOMINAL, say.length(result.nominal_rms))]
+    figures.append(("held-out poses" if held else "fitted poses, not held out", say.length(after)))
     if result.test is not None:
-        figures.append(("test data", length(result.test.rms)))
+        figures.append(("test data", say.length(result.test.rms)))
     if (at := result.verdict.at) is not None:
-        figures.append(("new poses, without noise", f"≤ {length(at)}"))
-    headline = f"{length(result.nominal_rms)} → {length(after)}"
+        figures.append(("new poses, without noise", f"≤ {say.length(at)}"))
+    headline = f"{say.length(result.nominal_rms)} → {say.length(after)}"
     if budget is not None and budget.floor is not None:
-        figures.append((f"noise ({budget.floor_name})", length(budget.floor)))
-        headline += f" (noise {length(budget.floor)})"
-    return KeyFigures(headline, figures)
+        figures.append((f"noise ({budget.floor_name})", say.length(budget.floor)))
+        headline += f" (noise {say.length(budget.floor)})"
+    return say.KeyFigures(headline, figures)
 
 
-def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
+def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
     from elastocal.report.figures import uncertainty_map, waterfall
 
     if budget is not None:
@@ -191,7 +171,7 @@ def _residuals(result: Calibration) -> Residuals:
     return Residuals(result.model, result.observations, result.residual)
 
 
-def _on_the_arm(result: Calibration) -> Iterator[Block]:
+def _on_the_arm(result: Calibration) -> Iterator[say.Block]:
     from elastocal.report.arm_view import residual_arm
 
     residuals = _residuals(result)
@@ -200,13 +180,13 @@ def _on_the_arm(result: Calibration) -> Iterator[Block]:
     yield residuals.table()
 
 
-def _method(result: Calibration) -> Iterator[Block]:
-    yield Lines([
-        ("Method", sentence(words.method_and_weights(result))),
+def _method(result: Calibration) -> Iterator[say.Block]:
+    yield say.Lines([
+        ("Method", say.sentence(words.method_and_weights(result))),
         ("Degrees of freedom", f"{result.dof}."),
         *prediction_lines(result),
         *words.noise_lines(result),
-        ("Intervals", sentence(words.intervals_line(result))),
+        ("Intervals", say.sentence(words.intervals_line(result))),
     ])  # fmt: skip
     if len((tried := words.candidate_table(result.noise)).rows) > 1:
         yield tried
@@ -214,26 +194,26 @@ def _method(result: Calibration) -> Iterator[Block]:
         yield words.deviating_table(result.residual_summary)
 
 
-def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
+def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
     if budget is not None:
-        yield budget_table(*budget_steps(result, budget))
+        yield say.budget_table(*budget_steps(result, budget))
     yield spread_table(before_and_after(result, budget), "readings")
 
 
-def _outliers(result: Calibration) -> Iterator[Block]:
+def _outliers(result: Calibration) -> Iterator[say.Block]:
     if groups := words.fault_lines(result):
-        yield Lines([("Groups", text) for text in groups])
+        yield say.Lines([("Groups", text) for text in groups])
         assert result.faulty_report is not None  # which the groups are of
         share = 100 * result.faulty_report.false_alarm
         told = f"False-alarm rate: at most {share:g} % of tables without outliers."
-        yield Sentence(told, soft=True)
+        yield say.Sentence(told, soft=True)
     kept = f"Kept in the fit; {option('outliers', 'drop')} excludes them"
     for title, found in ((kept, result.outliers), ("Excluded from the fit", result.excluded)):
         if found:
-            yield from outlier_blocks(title, [(o, o.residual, o.ratio) for o in found])
+            yield from say.outlier_blocks(title, [(o, o.residual, o.ratio) for o in found])
 
 
-def _correlation_table(result: Calibration) -> ShownTable:
+def _correlation_table(result: Calibration) -> say.ShownTable:
     rows = [
         (printable(a), printable(b), f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}")
         for a, b, r in result.correlations[:MOST_CORRELATIONS]
@@ -244,17 +224,17 @@ def _correlation_table(result: Calibration) -> ShownTable:
         "it, and so does every prediction."
     )
     note += f" {more} more are in the result's file." if more else ""
-    return ShownTable(("parameter", "and", "correlation"), rows, (0, 1), note=note)
+    return say.ShownTable(("parameter", "and", "correlation"), rows, (0, 1), note=note)
 
 
 def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, ALONE)), len(result.combinations)
-    text = f"{alone} of {counted(len(result.ordinary), 'parameter')}"
+    text = f"{alone} of {say.counted(len(result.ordinary), 'parameter')}"
     if n:
         absorbed = len(names_of(result, ABSORBED))
         text += (
-            f", and {counted(n, 'combination')} of parameters that these readings cannot separate "
-            f"({absorbed} held in exchange)"
+            f", and {say.counted(n, 'combination')} of parameters that these readings cannot "
+            f"separate ({absorbed} held in exchange)"
         )
     told = {
         **NO_VALUE, INVISIBLE: "not visible in these data",
@@ -266,7 +246,7 @@ def what_was_identified(result: Calibration) -> str:
     if (far := result.finding("unheard_of")) is not None:
         text += f"; {len(far.listed('parameters'))} with implausible values"
     if smooth := [part.coefficients for part in result.smooth if part.scale]:
-        many = counted(len(smooth), "smooth function")
+        many = say.counted(len(smooth), "smooth function")
         text += f"; and {many} of {sum(smooth)} coefficients"
     return f"{text}."
 
@@ -281,27 +261,27 @@ def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
         told.append("Whole blocks in time were held out, with another day's drift.")
     if held and result.excluded:
         told.append(
-            f"With the {counted(len(result.excluded), 'reading')} excluded as outliers, the "
-            f"held-out error is {length(result.heldout_all_rms)} rms."
+            f"With the {say.counted(len(result.excluded), 'reading')} excluded as outliers, the "
+            f"held-out error is {say.length(result.heldout_all_rms)} rms."
         )
     if (t := result.test) is not None:
         told.append(
-            f"Test error ({counted(t.n, 'reading')}, not fitted): {length(t.rms)} rms, "
-            f"{length(t.mean)} mean, {length(t.maximum)} maximum."
+            f"Test error ({say.counted(t.n, 'reading')}, not fitted): {say.length(t.rms)} rms, "
+            f"{say.length(t.mean)} mean, {say.length(t.maximum)} maximum."
         )
     return [("Prediction", " ".join(told))] if told else []
 
 
 def at_new_poses(found: PredictedError) -> str:
     low, high = found.ci95
-    parts = [f"parameters {length(found.parameters)}"]
+    parts = [f"parameters {say.length(found.parameters)}"]
     if found.open > 0:
-        parts.append(f"undetermined parameters {length(found.open)}")
+        parts.append(f"undetermined parameters {say.length(found.open)}")
     if found.lacking:
-        parts.append(f"possible model error {length(found.lacking)}")
+        parts.append(f"possible model error {say.length(found.lacking)}")
     return (
-        f"{length(found.rms)} rms at new poses, 95 %: {length(low)} to {length(high)}, measurement "
-        f"noise excluded ({', '.join(parts)}). New poses: {found.source}."
+        f"{say.length(found.rms)} rms at new poses, 95 %: {say.length(low)} to {say.length(high)}, "
+        f"measurement noise excluded ({', '.join(parts)}). New poses: {found.source}."
     )
 
 
@@ -313,12 +293,12 @@ def error_line(result: Calibration) -> str:
     }
     if result.test is not None:
         sizes["test data"] = result.test.rms
-    text = ", ".join(f"{name} {length(value)}" for name, value in sizes.items())
+    text = ", ".join(f"{name} {say.length(value)}" for name, value in sizes.items())
     if result.observations.kind == "pose":
         turns = (r.reshape(-1, 6)[:, 3:] for r in (result.residual, result.held_out))
         rms = (float(np.sqrt((turn**2).sum(axis=1).mean())) for turn in turns)
         told = (
-            f"{significant(v * 1e6)} µrad" if math.isfinite(v) else "not available" for v in rms
+            f"{say.significant(v * 1e6)} µrad" if math.isfinite(v) else "not available" for v in rms
         )
         text += f"; rotations {next(told)} fitted, {next(told)} held out"
     return text
@@ -335,8 +315,8 @@ def readings(result: Calibration) -> str:
     markers = len(np.unique(observed.table.marker[observed.lead]))
     return (
         f"{len(observed.lead)} {READINGS[observed.kind]} in "
-        f"{counted(observed.n_configurations, 'configuration')}, "
-        f"{counted(markers, 'marker')} ({printable(observed.table.source)})"
+        f"{say.counted(observed.n_configurations, 'configuration')}, "
+        f"{say.counted(markers, 'marker')} ({printable(observed.table.source)})"
     )
 
 
@@ -369,25 +349,25 @@ def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[st
 
 def spread_table(
     found: dict[str, Array], count: str, title: str = "Before and after"
-) -> ShownTable:
+) -> say.ShownTable:
     """Mean, standard deviation, 95 % quantile and maximum of lengths (n,) in m, by name."""
     rows = []
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
-        rows.append((name, str(len(e)), *(length(float(size)) for size in sizes)))
+        rows.append((name, str(len(e)), *(say.length(float(size)) for size in sizes)))
     heads = ("error of the position", count, "mean", "std", "95 %", "max")
-    return ShownTable(heads, rows, title=title)
+    return say.ShownTable(heads, rows, title=title)
 
 
-def _influence_table(result: Calibration) -> ShownTable:
+def _influence_table(result: Calibration) -> say.ShownTable:
     """The configurations that decide most, by Cook's distance; those without others to judge them
     first."""
     found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
     rows = [
         (
-            printable(c.configuration), str(c.readings), significant(c.leverage, 2),
-            significant(c.cook, 2) if math.isfinite(c.cook) else "∞", printable(c.moved),
-            significant(c.by, 2) if math.isfinite(c.by) else "undetermined",
+            printable(c.configuration), str(c.readings), say.significant(c.leverage, 2),
+            say.significant(c.cook, 2) if math.isfinite(c.cook) else "∞", printable(c.moved),
+            say.significant(c.by, 2) if math.isfinite(c.by) else "undetermined",
         )
         for c in found
     ]  # fmt: skip
@@ -400,7 +380,7 @@ def _influence_table(result: Calibration) -> ShownTable:
         "of them together: at 1 they move about to the edge of their 50 % region. To depend less "
         "on one, measure more like it."
     )
-    return ShownTable(heads, rows, (0, 4), note=note)
+    return say.ShownTable(heads, rows, (0, 4), note=note)
 
 
 # The parameters as tables, and why some have no value of their own.
@@ -417,7 +397,7 @@ def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     kept = sorted(rest, key=lambda term: -abs(term[1]))[: most - 1]
     text = printable(first)
     for name, factor in [term for term in rest if term in kept]:
-        size = significant(abs(factor))
+        size = say.significant(abs(factor))
         number = "" if float(size) == 1 else f"{size}·"
         member = deviation(printable(name), combination.held.get(name), 4)
         text += f" {'-' if factor < 0 else '+'} {number}{member}"
@@ -444,16 +424,16 @@ def limits(result: Calibration, e: Estimate) -> str:
     assert e.limits is not None
     p = result.model.parameters[result.model.names.index(e.name)]
     if p.beyond(e.limits):
-        value, half, unit = estimate(e.held, (e.limits[1] - e.limits[0]) / 2, e.unit)
+        value, half, unit = say.estimate(e.held, (e.limits[1] - e.limits[0]) / 2, e.unit)
         return f"{value} ± {half} {unit}"
-    low, high = (significant(display(end, e.unit)[0], 2) for end in e.limits)
-    held, unit = display(e.held, e.unit)
+    low, high = (say.significant(say.display(end, e.unit)[0], 2) for end in e.limits)
+    held, unit = say.display(e.held, e.unit)
     text = f"{low} to {high} {unit}"
     if e.limits[0] <= p.lower <= e.limits[1]:
         text = f"at most {high} {unit}"
     elif e.limits[0] <= p.upper <= e.limits[1]:
         text = f"at least {low} {unit}"
-    used = "nominal" if e.held == e.nominal and e.held else significant(held, 2)
+    used = "nominal" if e.held == e.nominal and e.held else say.significant(held, 2)
     return f"{text}; {used} is used"
 
 
@@ -508,7 +488,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
     return lines
 
 
-def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
+def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
     heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
     rows, standing = list[tuple[str, ...]](), standings(result)
     known = {p.name: p for p in result.model.parameters}
@@ -526,26 +506,26 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> Shown
             why = f"{NO_VALUE[kind]}: {limits(result, e)}"
         else:
             why = WITHOUT.get(kind, why)
-        nominal = plain(display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–"
+        nominal = say.plain(say.display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–"
         true = [texts(e, truth.get(e.name))[3]] if truth else []
-        rows.append((printable(e.name), nominal, display(0.0, e.unit)[1], *true, why))
-    return ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
+        rows.append((printable(e.name), nominal, say.display(0.0, e.unit)[1], *true, why))
+    return say.ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
 
 
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
     """Value, half width or both ends, unit and true value; "–" for what is not determined."""
     if e.value is None or e.ci95 is None:
-        known = "–" if true is None else plain(display(true, e.unit)[0])
-        return "–", "–", display(0.0, e.unit)[1], known
+        known = "–" if true is None else say.plain(say.display(true, e.unit)[0])
+        return "–", "–", say.display(0.0, e.unit)[1], known
     if is_lopsided(e.value, e.ci95):
-        shown, low, high = (display(number, e.unit)[0] for number in (e.value, *e.ci95))
-        value, half = with_ends(shown, low, high)
-        width, unit = resolution(shown, low, high), display(e.value, e.unit)[1]
+        shown, low, high = (say.display(number, e.unit)[0] for number in (e.value, *e.ci95))
+        value, half = say.with_ends(shown, low, high)
+        width, unit = say.resolution(shown, low, high), say.display(e.value, e.unit)[1]
     else:
         width = (e.ci95[1] - e.ci95[0]) / 2
-        value, half, unit = estimate(e.value, width, e.unit)
-        width = display(width, e.unit)[0]
-    known = "–" if true is None else rounded_alike(display(true, e.unit)[0], width)
+        value, half, unit = say.estimate(e.value, width, e.unit)
+        width = say.display(width, e.unit)[0]
+    known = "–" if true is None else say.rounded_alike(say.display(true, e.unit)[0], width)
     return value, half, unit, known
 
 
@@ -562,14 +542,16 @@ def is_lopsided(value: float, ci95: tuple[float, float]) -> bool:
 
 def parameter_table(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
-) -> ShownTable:
+) -> say.ShownTable:
     own = [e for e in result.ordinary if e.identifiable]
     known = {p.name: p for p in result.model.parameters}
-    shown = [plain(display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–" for e in own]
+    shown = [
+        say.plain(say.display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–" for e in own
+    ]
     after = {"nominal": shown}
     if published:
         given = [(published.get(e.name), e.unit) for e in own]
-        after["published"] = ["–" if v is None else " ± ".join(estimate(*v, unit)[:2])
+        after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])
                               for v, unit in given]  # fmt: skip
     if any(e.note for e in own):
         after["note"] = [printable(e.note) for e in own]
@@ -580,7 +562,7 @@ def parameter_table(
     return replace(table, groups=groups)
 
 
-def combination_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
+def combination_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
     found = result.combinations
     true = None if truth is None else [combination_truth(result, c, truth) for c in found]
     title = "Combinations (factors in SI units)"
@@ -590,7 +572,7 @@ def combination_table(result: Calibration, truth: Truth | None = None) -> ShownT
 def _numbers(
     title: str, names: list[str], found: Sequence[Estimate | Combination],
     truth: list[float | None] | None, after: dict[str, list[str]],
-) -> ShownTable:  # fmt: skip
+) -> say.ShownTable:  # fmt: skip
     """Names, values, intervals and units, with true values where known, and columns `after`."""
     lopsided = any(
         e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
@@ -608,5 +590,5 @@ def _numbers(
         rows.append((names[k], value, signed if lopsided else width, unit, *rest))
         brief.append((names[k], f"{value} {signed} {unit}", *held))
     words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", "in 95 %", "note"))
-    narrow = ShownTable((first, f"value {half}", *of_truth[1:]), brief, (0, 1, 2), title=title)
-    return ShownTable(heads, rows, words, title=title, narrow=narrow)
+    narrow = say.ShownTable((first, f"value {half}", *of_truth[1:]), brief, (0, 1, 2), title=title)
+    return say.ShownTable(heads, rows, words, title=title, narrow=narrow)

@@ -19,23 +19,13 @@ from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
-from elastocal.report.blocks import (
-    WARNING,
-    ShownTable,
-    Tone,
-    counted,
-    display,
-    estimate,
-    length,
-    plain,
-    significant,
-)
+from elastocal.report import blocks as say
 from elastocal.text import gathered, listed, printable
 
 
 @dataclass(frozen=True)
 class Judgement:
-    tone: Tone
+    tone: say.Tone
     headline: str
     steps: tuple[str, ...]
 
@@ -64,11 +54,11 @@ def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
     said = {f.kind for f in result.verdict.missing} & told
     notes = {f.kind for f in result.findings if f.severity == "note"}
     kinds = [(getattr(w, "kind", ""), printable(str(w))) for w in result.warnings]
-    return [("Note" if kind in notes else WARNING, w) for kind, w in kinds if kind not in said]
+    return [("Note" if kind in notes else say.WARNING, w) for kind, w in kinds if kind not in said]
 
 
 def _length(f: Finding, name: str) -> str:
-    return length(f.number(name) * 1e-6)
+    return say.length(f.number(name) * 1e-6)
 
 
 # What speaks against a calibration, in words.
@@ -87,11 +77,11 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         )
     ),
     "residual_above_stated_noise": lambda f: (
-        f"the residual is {significant(f.number('ratio'))} times the stated noise"
+        f"the residual is {say.significant(f.number('ratio'))} times the stated noise"
     ),
     "residual_below_stated_noise": lambda f: (
-        f"the stated noise is too large (the residual is {significant(f.number('ratio'))} times "
-        "it), so a missing effect would not show"
+        f"the stated noise is too large (the residual is {say.significant(f.number('ratio'))} "
+        "times it), so a missing effect would not show"
     ),
     "residuals_heavy_tailed": lambda f: (
         "large errors are more frequent than in normal noise (excess kurtosis "
@@ -102,7 +92,7 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"the names of markers {listed(map(str, f.listed('markers')))} are exchanged"
     ),
     "load_unit": lambda f: (
-        f"the compliances are {significant(f.number('ratio'), 2)} times those expected from "
+        f"the compliances are {say.significant(f.number('ratio'), 2)} times those expected from "
         f"{f.numbers['by']}: the loads may be in another unit"
     ),
     "impossible_values": lambda f: _impossible(f),
@@ -114,8 +104,8 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"the held-out error is larger than the fitted one ({_length(f, 'residual_rms_um')})"
     ),
     "scale": lambda f: (
-        f"all measured lengths are {significant(f.number('readings_over_file'), 4)} times those of "
-        "the robot's file: "
+        f"all measured lengths are {say.significant(f.number('readings_over_file'), 4)} times "
+        "those of the robot's file: "
         + (
             "most likely the cell describes another robot"
             if f.numbers["likely"] == "another robot"
@@ -125,7 +115,7 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "unheard_of": lambda f: _unheard_of(f),
     "little_gain": lambda f: "the error is hardly smaller than that of the nominal arm",
     "few_configurations": lambda f: (
-        f"{counted(int(str(f.numbers['configurations'])), 'configuration')} give only "
+        f"{say.counted(int(str(f.numbers['configurations'])), 'configuration')} give only "
         f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters "
         f"(needed: {f.numbers['needed']})"
     ),
@@ -162,8 +152,8 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
 def _impossible(f: Finding) -> str:
     """ "impossible values: compliance of joints 2 and 3 negative (-0.3, …); most likely …" """
     values = [float(v) for v in f.listed("values")]
-    shown = [" ".join((significant(number), unit)) for number, unit in
-             map(display, values, map(str, f.listed("units")))]  # fmt: skip
+    shown = [" ".join((say.significant(number), unit)) for number, unit in
+             map(say.display, values, map(str, f.listed("units")))]  # fmt: skip
     how = "negative" if max(values) < 0 else "beyond the physical bound"
     named = printable(gathered(map(str, f.listed("parameters"))))
     likely = f"; most likely {f.numbers['likely']} is wrong" if f.numbers["likely"] else ""
@@ -178,10 +168,10 @@ def _unheard_of(f: Finding) -> str:
     )  # fmt: skip
     shown = []
     for name, value, unit, sizes in each:
-        number, shown_unit = display(float(value), str(unit))
+        number, shown_unit = say.display(float(value), str(unit))
         shown.append(
-            f"{printable(str(name))} at {significant(number)} {shown_unit}, "
-            f"{significant(float(sizes), 2)} typical deviations from nominal"
+            f"{printable(str(name))} at {say.significant(number)} {shown_unit}, "
+            f"{say.significant(float(sizes), 2)} typical deviations from nominal"
         )
     return (
         f"implausible values ({listed(shown, 3)}): most likely an effect is missing, or these "
@@ -196,28 +186,29 @@ def _accuracy(result: Calibration) -> str:
     of = f" of {kind}s" if kind in ("deflection", "distance") else ""
     own = "Expected error at new poses: not known."
     if (at := result.verdict.at) is not None:
-        own = f"Expected error at new poses: ≤ {length(at)} rms (95 %), measurement noise excluded."
-    text = f"{own} Held-out error{of}: {length(result.heldout_rms)} rms"
+        below = f"≤ {say.length(at)} rms (95 %), measurement noise excluded"
+        own = f"Expected error at new poses: {below}."
+    text = f"{own} Held-out error{of}: {say.length(result.heldout_rms)} rms"
     if not math.isfinite(result.heldout_rms):
-        text = f"{own} Residual{of}: {length(result.residual_rms)} rms; no held-out error"
+        text = f"{own} Residual{of}: {say.length(result.residual_rms)} rms; no held-out error"
     elif only_placed(result):
         found: dict[str, list[str]] = {}
         for e in result.ordinary:
             name, _, axis = e.name.rpartition(".")
             if axis in ("x", "y", "z") and e.value is not None and e.ci95 is not None:
-                value, half, unit = estimate(e.value, (e.ci95[1] - e.ci95[0]) / 2, e.unit)
+                value, half, unit = say.estimate(e.value, (e.ci95[1] - e.ci95[0]) / 2, e.unit)
                 found.setdefault(name, []).append(f"{axis} = {value} ± {half} {unit}")
         told = [f"{printable(name.removeprefix('marker:'))} lies at {', '.join(axes)}"
                 for name, axes in found.items() if len(axes) == 3]  # fmt: skip
         text += f"; {listed(told, 3)} (95 %)" if told else ""
     else:
-        text += f" (nominal arm {length(result.nominal_rms)})"
+        text += f" (nominal arm {say.length(result.nominal_rms)})"
     if result.load_point_error is None:
         return f"{text}."
     marker = printable(next(iter(result.model.cell.tool.markers)))
     return (
         f"{text}. The load point, default of compensate, is known only to "
-        f"{length(result.load_point_error)} rms: measure a marker there, or state "
+        f"{say.length(result.load_point_error)} rms: measure a marker there, or state "
         f"{option('point')} {marker}."
     )
 
@@ -296,8 +287,8 @@ def constraints_line(result: Calibration) -> str | None:
         own = a.kind == "equality" and a.label != f"{a.names[0]} = {a.value:.6g}"
         if len(a.names) != 1 or own or a.names[0] not in units:
             return printable(a.label)
-        value, unit = display(a.value, units[a.names[0]])
-        return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
+        value, unit = say.display(a.value, units[a.names[0]])
+        return f"{printable(a.names[0])} {SIGNS[a.kind]} {say.plain(value)} {unit}"
 
     more = len(active) - MOST_NAMED
     text = "; ".join([*map(told, active[:MOST_NAMED]), *([f"and {more} more"] * (more > 0))])
@@ -375,11 +366,13 @@ def does_noise_explain_it(result: Calibration) -> str:
         elif stated or result.noise.kind == "covariance":
             text = "The residual was not compared with the stated noise"
         if result.noise.sigma is not None and method_of(result) == "ols":
-            return f"{text}; the residual amounts to {length(result.noise.sigma)} per coordinate."
+            return (
+                f"{text}; the residual amounts to {say.length(result.noise.sigma)} per coordinate."
+            )
         level = "; the noise level was estimated from the readings"
         return f"{text}{level * estimated}."
     size = (
-        f"{significant(f.number('ratio'))} times the stated noise; chance alone gives "
+        f"{say.significant(f.number('ratio'))} times the stated noise; chance alone gives "
         f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
     )
     if f.kind == "residual_agrees_with_stated_noise":
@@ -388,7 +381,7 @@ def does_noise_explain_it(result: Calibration) -> str:
     if f.kind == "residual_agrees_with_readings" and single is not None:
         text = (
             f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
-            f"scatter by {significant(single.number('ratio'))} times the stated noise."
+            f"scatter by {say.significant(single.number('ratio'))} times the stated noise."
         )
     elif f.kind == "residual_above_stated_noise":
         text = (
@@ -424,8 +417,8 @@ def _sizes(noise: Noise) -> list[str]:
 
     def size(s: NoiseSize) -> str:
         if s.sigma is None:
-            return significant(number(s))
-        return f"{significant(s.sigma * 1e6)} µrad" if s.turns else length(s.sigma)
+            return say.significant(number(s))
+        return f"{say.significant(s.sigma * 1e6)} µrad" if s.turns else say.length(s.sigma)
 
     sizes = noise.sizes or ()
     shared = [s for s in sizes if s.part]
@@ -437,7 +430,7 @@ def _sizes(noise: Noise) -> list[str]:
     return [f"{printable(n)} {size(s)}" for n, s in [*named, *((s.name, s) for s in shared)]]
 
 
-def candidate_table(noise: Noise) -> ShownTable:
+def candidate_table(noise: Noise) -> say.ShownTable:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
     words = (printable(Kind.parsed(t.kind).words) for t in tried)
@@ -450,7 +443,7 @@ def candidate_table(noise: Noise) -> ShownTable:
         "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
         "above the best is practically no support."
     )
-    return ShownTable(heads, rows, title="Noise models tried", note=note)
+    return say.ShownTable(heads, rows, title="Noise models tried", note=note)
 
 
 def _repeats_line(result: Calibration) -> str | None:
@@ -471,14 +464,14 @@ def _repeats_line(result: Calibration) -> str | None:
                 "criterion, has one; the intervals include it."
             )
         return f"{text}: readings of one configuration have no common deviation."
-    counted = {
+    includes = {
         "the noise model": "The noise model has this common deviation; the intervals include it.",
         "the intervals": "The intervals take each configuration as a whole and include it.",
     }
     return (
         f"Configurations scatter more than their repeats ({numbers}): the arm does not return to "
         "the same place, or an effect is missing. "
-        + counted.get(by, "The intervals do not include it and are too narrow.")
+        + includes.get(by, "The intervals do not include it and are too narrow.")
     )
 
 
@@ -497,8 +490,8 @@ def shape_line(summary: ResidualSummary) -> str:
             text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
     if (scatter := summary.whole.held_out_mean_square) is not None:
         text += (
-            f" In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
-            "the noise model."
+            f" In held-out configurations the scatter is {say.significant(scatter**0.5)} times "
+            "that of the noise model."
         )
     groups = [f"{row[0]} {row[2]} times" for row in deviating_table(summary).rows[:MOST_GROUPS]]
     if not groups:
@@ -508,14 +501,14 @@ def shape_line(summary: ResidualSummary) -> str:
     return f"{text} Scatter unlike the noise model: {', '.join(groups)}{tail}."
 
 
-def deviating_table(summary: ResidualSummary) -> ShownTable:
+def deviating_table(summary: ResidualSummary) -> say.ShownTable:
     rows = [
-        (f"{by} {printable(g.name)}", str(g.n), significant(float(np.sqrt(g.mean_square)), 2),
+        (f"{by} {printable(g.name)}", str(g.n), say.significant(float(np.sqrt(g.mean_square)), 2),
          f"{g.p_holm:.1g}")
         for by, g in summary.deviating
     ]  # fmt: skip
     heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
-    return ShownTable(heads, rows)
+    return say.ShownTable(heads, rows)
 
 
 def _in_time_line(result: Calibration) -> str | None:
@@ -540,7 +533,7 @@ def _in_time_line(result: Calibration) -> str | None:
 
 
 def _p(p: float) -> str:
-    return "p < 1e-6" if p < 1e-6 else f"p = {significant(p, 2)}"
+    return "p < 1e-6" if p < 1e-6 else f"p = {say.significant(p, 2)}"
 
 
 FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
@@ -563,11 +556,11 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     apart = {o.line for o in result.excluded} & set(finding.lines)
     bends = method_of(result) in FULL_WEIGHT and not apart  # readings of full weight in the fit
     how = "err in common by" if finding.pattern == "common" else "scatter by"
-    noise = f"{significant(finding.sigmas, 2)} times the noise"
+    noise = f"{say.significant(finding.sigmas, 2)} times the noise"
     text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
     # Of a pose the error is the position's, and the finding may be one of rotation.
     turned = result.observations.kind == "pose"
-    text += noise if turned else f"{length(finding.error)} ({noise})"
+    text += noise if turned else f"{say.length(finding.error)} ({noise})"
     if beyond < n:
         text += f", {beyond or 'none'} of them beyond the noise"
     names = () if result.faulty_report is None else result.faulty_report.names
@@ -575,23 +568,25 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     if not math.isfinite(finding.influence):
         return f"{text}; the other readings leave {name} undetermined."
     moves = "in the fit they move" if bends else "fitted along they would move"
-    count = significant(finding.influence, 2)
+    count = say.significant(finding.influence, 2)
     return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
 
 
 # The smooth functions that were fitted.
 
 
-def smooth_table(result: Calibration) -> ShownTable:
+def smooth_table(result: Calibration) -> say.ShownTable:
     rows = []
     for part in (part for part in result.smooth if part.scale):
         for unit, (rms, (low, high), half) in part.sizes.items():
-            size, *ends, known = (significant(display(v, unit)[0]) for v in (rms, low, high, half))
-            worth = f"{significant(part.effective, 2)} of {part.coefficients}"
+            size, *ends, known = (
+                say.significant(say.display(v, unit)[0]) for v in (rms, low, high, half)
+            )
+            worth = f"{say.significant(part.effective, 2)} of {part.coefficients}"
             rows.append(
                 (
                     printable(part.group.name), size, " to ".join(ends), known,
-                    display(0.0, unit)[1], worth,
+                    say.display(0.0, unit)[1], worth,
                 )
             )  # fmt: skip
     note = (
@@ -600,4 +595,4 @@ def smooth_table(result: Calibration) -> ShownTable:
         "the readings pay for."
     )
     heads = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
-    return ShownTable(heads, rows, (0, 4), title="Smooth functions", note=note)
+    return say.ShownTable(heads, rows, (0, 4), title="Smooth functions", note=note)

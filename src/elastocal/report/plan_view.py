@@ -12,91 +12,75 @@ from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name
-from elastocal.report.blocks import (
-    WARNING,
-    Block,
-    Figure,
-    Fold,
-    KeyFigures,
-    Lines,
-    Report,
-    ShownTable,
-    ShownVerdict,
-    counted,
-    display,
-    first_stops,
-    joint_heads,
-    joint_texts,
-    length,
-    significant,
-    title_of,
-)
+from elastocal.report import blocks as say
 from elastocal.text import listed, printable
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
 
 
-def plan_report(plan: Plan) -> Report:
+def plan_report(plan: Plan) -> say.Report:
     """A plan: what it is worth and the stops to make; behind them poses, proof and order."""
     model = plan.model
-    title = title_of(model.chain.name, model.cell.name)
-    return Report("Measurement plan", title, plan_blocks(plan), model.backend_report(), plan.seed)
+    title = say.title_of(model.chain.name, model.cell.name)
+    return say.Report(
+        "Measurement plan", title, plan_blocks(plan), model.backend_report(), plan.seed
+    )
 
 
-def plan_blocks(plan: Plan) -> Iterator[Block]:
-    def curve() -> Iterator[Block]:
+def plan_blocks(plan: Plan) -> Iterator[say.Block]:
+    def curve() -> Iterator[say.Block]:
         from elastocal.report.figures import plan_curve
 
         yield curve_table(plan)
         yield plan_curve(plan)
 
-    def arm() -> Iterator[Block]:
+    def arm() -> Iterator[say.Block]:
         from elastocal.report.arm_view import plan_arm
 
-        yield Lines([("Next", text) for text in plan_steps(plan)])
+        yield say.Lines([("Next", text) for text in plan_steps(plan)])
         yield stop_table(plan)
         yield plan_arm(plan)
 
-    yield Fold("", lambda: [_key(plan)])
+    yield say.Fold("", lambda: [_key(plan)])
     # A gap to the bound is no fault of the plan's: with few poses much of it is the bound's.
-    yield ShownVerdict("warn" if plan.warnings else "good", plan_headline(plan))
-    yield Lines([(WARNING, printable(text)) for text in plan.warnings])
-    yield Fold("", arm, figures=("poses",))
+    yield say.ShownVerdict("warn" if plan.warnings else "good", plan_headline(plan))
+    yield say.Lines([(say.WARNING, printable(text)) for text in plan.warnings])
+    yield say.Fold("", arm, figures=("poses",))
     # Less digits where there is no room.
     two, one, none = (pose_table(plan, decimals) for decimals in (2, 1, 0))
     poses = replace(two, narrow=replace(one, narrow=none))
-    yield Fold("Poses", lambda: [poses], printed=True)
+    yield say.Fold("Poses", lambda: [poses], printed=True)
     why = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
-    reasons = ShownTable(("pose", SERVES), why, (1,), title="Why each pose")
-    yield Fold("Why each pose", lambda: [reasons], printed=True)
-    yield Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
+    reasons = say.ShownTable(("pose", SERVES), why, (1,), title="Why each pose")
+    yield say.Fold("Why each pose", lambda: [reasons], printed=True)
+    yield say.Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
     if plan.curve:
-        yield Fold("Number of poses", curve, printed=True, figures=("curve",))
+        yield say.Fold("Number of poses", curve, printed=True, figures=("curve",))
     if plan.timed:
         title = "Poses and readings within the time"
         heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
         rows = [
             (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
         ]
-        yield Fold(title, lambda: [ShownTable(heads, rows, (), title=title)], printed=True)
-    yield Fold("What the plan is worth", lambda: [Lines([*plan_lines(plan)])], printed=True)
+        yield say.Fold(title, lambda: [say.ShownTable(heads, rows, (), title=title)], printed=True)
+    yield say.Fold("What the plan is worth", lambda: [say.Lines([*plan_lines(plan)])], printed=True)
 
 
-def next_report(found: NextPoses) -> Report:
+def next_report(found: NextPoses) -> say.Report:
     """Whether to measure more, what it brings, and the poses."""
 
-    def blocks() -> Iterator[Block]:
-        yield Lines([*next_lines(found)])
-        yield Fold("", lambda: [_gain(found)], figures=("gain",))
+    def blocks() -> Iterator[say.Block]:
+        yield say.Lines([*next_lines(found)])
+        yield say.Fold("", lambda: [_gain(found)], figures=("gain",))
         if found.plan is not None:
             yield from plan_blocks(found.plan)
 
-    return Report("Next poses", printable(found.source), blocks())
+    return say.Report("Next poses", printable(found.source), blocks())
 
 
-def _key(plan: Plan) -> KeyFigures:
-    n, minutes = counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
+def _key(plan: Plan) -> say.KeyFigures:
+    n, minutes = say.counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     figures = [("poses", str(len(plan.q))), ("criterion", worth)]
     if plan.of_test_poses:
@@ -107,17 +91,17 @@ def _key(plan: Plan) -> KeyFigures:
     figures.append(("time", minutes))
     if len(figures) < 4:
         figures.append(("load states", str(len(plan.forces))))
-    return KeyFigures(f"{n} → {worth}, {minutes}", figures)
+    return say.KeyFigures(f"{n} → {worth}, {minutes}", figures)
 
 
-def _gain(found: NextPoses) -> Figure:
+def _gain(found: NextPoses) -> say.Figure:
     """The error before and after the batch."""
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     g = found.gain
     names = ("measured so far", "with this batch")
     rows = [
-        (f"{name}{model}", value * 1e6, NO_ENDS, length(value))
+        (f"{name}{model}", value * 1e6, NO_ENDS, say.length(value))
         for model, values in (("", (g.before, g.after)),
                               (", if the model is right", (g.model_before, g.model_after)))
         for name, value in zip(names, values, strict=True) if math.isfinite(value)
@@ -130,21 +114,21 @@ TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "most affected if dropped (standard deviation)"
 
 
-def pose_table(plan: Plan, decimals: int = 2) -> ShownTable:
+def pose_table(plan: Plan, decimals: int = 2) -> say.ShownTable:
     """Joint values and place in the order of execution."""
     kinds = plan.model.chain.kinds
-    heads = ["pose", *joint_heads(kinds), "order"]
+    heads = ["pose", *say.joint_heads(kinds), "order"]
     heads += [] if plan.crossed else ["load"]
     heads += [] if plan.seen is None else ["markers"]
-    order = first_stops(plan)
+    order = say.first_stops(plan)
     rows: list[tuple[str, ...]] = []
     for k, name in enumerate(plan.configurations):
-        row = [name, *joint_texts(plan.q[k], kinds, decimals)]
+        row = [name, *say.joint_texts(plan.q[k], kinds, decimals)]
         row += [str(order[k]), *([] if plan.crossed else [plan.loads(k)])]
         row += [] if plan.seen is None else [printable(plan.markers(k))]
         rows.append(tuple(row))
     words = tuple(k for k, head in enumerate(heads) if head in ("load", "markers"))
-    return ShownTable(tuple(heads), rows, words, title="Poses")
+    return say.ShownTable(tuple(heads), rows, words, title="Poses")
 
 
 def served(reason: Reason) -> str:
@@ -156,30 +140,32 @@ def served(reason: Reason) -> str:
     return ", ".join(parts) or "all slightly"
 
 
-def interval_table(plan: Plan) -> ShownTable:
+def interval_table(plan: Plan) -> say.ShownTable:
     """Predicted half widths of the 95 % intervals."""
     rows: list[tuple[str, ...]] = []
     for p in plan.predicted:
-        shown, unit = display(p.half_width, p.unit)
+        shown, unit = say.display(p.half_width, p.unit)
         names = [printable(name) for name in p.combined_with]
         more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        rows.append((printable(p.name), significant(shown, 2), unit, ", ".join(names[:3]) + more))
+        rows.append(
+            (printable(p.name), say.significant(shown, 2), unit, ", ".join(names[:3]) + more)
+        )
     heads = ("parameter", "± 95 %", "unit", "together with")
-    table = ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
+    table = say.ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
     return table if any(p.combined_with for p in plan.predicted) else table.without(3)
 
 
-def curve_table(plan: Plan) -> ShownTable:
+def curve_table(plan: Plan) -> say.ShownTable:
     """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
     rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]
-    return ShownTable(heads, rows, (), title="Number of poses")
+    return say.ShownTable(heads, rows, (), title="Number of poses")
 
 
-def stop_table(plan: Plan) -> ShownTable:
+def stop_table(plan: Plan) -> say.ShownTable:
     """The stops in the order of execution: what the operator does at each, with a box to tick."""
     rows, loads, e = [], len(plan.forces) > 1, plan.execution
     for k, (stop, now) in enumerate(zip(e.stops, e.arrivals, strict=True)):
@@ -187,7 +173,7 @@ def stop_table(plan: Plan) -> ShownTable:
         load = [f"{' '.join(f'{f:g}' for f in plan.forces[stop.load])}{change}"] if loads else []
         rows.append((str(k + 1), stop.name(plan.configurations), *load, f"{now / 60:.0f}", "☐"))
     heads = ("stop", "pose", *(["load in N"] if loads else []), "minute", "done")
-    return ShownTable(heads, rows, (2,) if loads else (), title="Stops in order")
+    return say.ShownTable(heads, rows, (2,) if loads else (), title="Stops in order")
 
 
 APART = 0.02  # of the criterion, between starts of the search: more of them may find better
@@ -196,7 +182,7 @@ VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread 
 
 def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
-    text = f"{counted(len(plan.q), 'pose')}: "
+    text = f"{say.counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
         text += f"position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
     else:
@@ -245,7 +231,7 @@ def plan_steps(plan: Plan) -> list[str]:
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
         steps.append(
-            f"{counted(together, 'parameter')} will be determined only in sums: more "
+            f"{say.counted(together, 'parameter')} will be determined only in sums: more "
             "markers or load states separate them, more poses like these do not."
         )
     return [*steps, "Then: elastocal identify with the same cell and the measurements."]
@@ -285,7 +271,7 @@ def plan_lines(plan: Plan) -> Told:
         )
     if plan.timed:
         spec, took = plan.model.cell.design, plan.execution.total / 60
-        text = f"{took:.0f} minutes with {counted(spec.repeats, 'reading')} of each marker"
+        text = f"{took:.0f} minutes with {say.counted(spec.repeats, 'reading')} of each marker"
         yield "Time", f"{text}, moves and changes of load included."
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
@@ -328,7 +314,7 @@ def _chosen_lines(plan: Plan) -> Told:
     if s.used != "all":
         counts = (plan.readings > 0).sum(axis=0)
         text = listed(
-            f"{counted(int(n), 'pose')} {'' if name == 'unloaded' else 'under '}{name}"
+            f"{say.counted(int(n), 'pose')} {'' if name == 'unloaded' else 'under '}{name}"
             for n, name in zip(counts, map(load_name, plan.forces), strict=True)
             if n
         )
@@ -419,8 +405,8 @@ def _certificate_lines(plan: Plan) -> Told:
         ends = " to ".join(dict.fromkeys(f"{e:.4g}" for e in (min(c.starts), max(c.starts))))
         yield (
             "Certificate",
-            f"{counted(len(c.starts), 'start')} of the search ended with {name} = {ends}{unit}, "
-            f"the bound is {bound:.4g}{unit}. The difference is what no start found, or what only "
+            f"{say.counted(len(c.starts), 'start')} of the search ended with {name} = "
+            f"{ends}{unit}, the bound is {bound:.4g}{unit}. The difference is what no start found, or what only "
             "weights can reach: the fewer poses, the more of the latter.",
         )
 
@@ -436,7 +422,7 @@ def _execution_lines(plan: Plan) -> Told:
     if parts:
         text += f"; {parts} poses are measured unloaded at start and end (half the readings each)"
     if e.load_changes:
-        text += f", {counted(e.load_changes, 'load change')} by hand"
+        text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
     text += f", {via} via points around obstacles" if via else ""
     if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
@@ -466,7 +452,7 @@ def _execution_lines(plan: Plan) -> Told:
 
 def next_lines(found: NextPoses) -> Told:
     """Whether to measure more, what it brings, and what may be missing."""
-    g, n = found.gain, counted(found.batch, "pose")
+    g, n = found.gain, say.counted(found.batch, "pose")
     limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
     verdicts = {
         "measure": f"measure {n} more; then run it again with all readings in one table",

@@ -16,11 +16,11 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import date
 from functools import cache, partial
 from html import escape
-from importlib import metadata
+from importlib import import_module, metadata
 from io import BytesIO, StringIO
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -30,27 +30,10 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal import __version__
-from elastocal.compensation.compensate import commands_csv, in_file_units, joint_columns
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, check_ending, open_input
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.report.blocks import (
-    WARNING,
-    Block,
-    Figure,
-    Fold,
-    Heading,
-    KeyFigures,
-    Lines,
-    Report,
-    Sentence,
-    ShownTable,
-    ShownVerdict,
-    first_stops,
-    resource,
-    typeset,
-    unfolded,
-)
+from elastocal.report import blocks as say
 from elastocal.screen import safe_console, shown
 from elastocal.text import cell_meaning, did_you_mean, listed, printable, quoted
 
@@ -65,27 +48,23 @@ if TYPE_CHECKING:
     from elastocal.planning.plan import Plan
 
 
-def report_of(result: object, certificate: bool = False, **told: Any) -> Report:
+def report_of(result: object, certificate: bool = False, **told: Any) -> say.Report:
     """What is to be said of a result.  Each kind has its view, which no other result loads."""
-    kind, report = type(result).__name__, cast(Any, None)
-    if certificate:
-        from elastocal.report.smaller_views import certificate_report as report
-    elif kind == "Calibration":
-        from elastocal.report.identification_view import calibration_report as report
-    elif kind == "Diagnosis":
-        from elastocal.report.diagnosis_view import diagnosis_report as report
-    elif kind == "Plan":
-        from elastocal.report.plan_view import plan_report as report
-    elif kind == "NextPoses":
-        from elastocal.report.plan_view import next_report as report
-    elif kind == "Comparison":
-        from elastocal.report.smaller_views import changes_report as report
-    elif kind == "Compensation":
-        from elastocal.report.smaller_views import compensation_report as report
-    else:
-        from elastocal.report.smaller_views import readings_report as report
-    found: Report = report(result, **told)
+    room, view = VIEWS["certificate" if certificate else type(result).__name__]
+    found: say.Report = getattr(import_module(f"elastocal.report.{room}"), view)(result, **told)
     return found
+
+
+VIEWS = {
+    "certificate": ("smaller_views", "certificate_report"),
+    "Calibration": ("identification_view", "calibration_report"),
+    "Diagnosis": ("diagnosis_view", "diagnosis_report"),
+    "Plan": ("plan_view", "plan_report"),
+    "NextPoses": ("plan_view", "next_report"),
+    "Comparison": ("smaller_views", "changes_report"),
+    "Compensation": ("smaller_views", "compensation_report"),
+    "Measurements": ("smaller_views", "readings_report"),
+}
 
 
 PRINTED_WIDTH = 100  # columns of a result as plain text
@@ -111,15 +90,15 @@ def printed_text(result: object) -> str:
     return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
 
 
-def print_blocks(console: Console, blocks: Iterable[Block], details: bool = False) -> None:
+def print_blocks(console: Console, blocks: Iterable[say.Block], details: bool = False) -> None:
     """Print blocks; a blank line separates tables from sentences."""
     heading, before = "", None
-    for block in unfolded(blocks, lambda fold: details and fold.printed):
-        if isinstance(block, Heading):
+    for block in say.unfolded(blocks, lambda fold: details and fold.printed):
+        if isinstance(block, say.Heading):
             heading = block.text
         elif shown := list(_shown(console, block)):
-            kind = Lines if isinstance(block, ShownVerdict) else type(block)
-            if before not in (None, kind, ShownTable):  # a table ends with one
+            kind = say.Lines if isinstance(block, say.ShownVerdict) else type(block)
+            if before not in (None, kind, say.ShownTable):  # a table ends with one
                 console.print()
             if heading and _needs(heading, block):
                 console.print(Text(heading, style="bold underline"))
@@ -128,24 +107,24 @@ def print_blocks(console: Console, blocks: Iterable[Block], details: bool = Fals
             heading, before = "", kind
 
 
-def _needs(heading: str, block: Block) -> bool:
+def _needs(heading: str, block: say.Block) -> bool:
     """Whether the heading says more than the block below it."""
-    told = block.title if isinstance(block, ShownTable) else ""
-    if isinstance(block, Lines):
+    told = block.title if isinstance(block, say.ShownTable) else ""
+    if isinstance(block, say.Lines):
         told = block.items[0][0]
     return not (told and heading.startswith(told.partition(" (")[0].partition(",")[0]))
 
 
-def _shown(console: Console, block: Block) -> Iterable[RenderableType]:
-    if isinstance(block, ShownVerdict):
+def _shown(console: Console, block: say.Block) -> Iterable[RenderableType]:
+    if isinstance(block, say.ShownVerdict):
         style = "bold" if block.tone == "good" else "bold yellow"
         yield _line("Verdict", block.sentence, style)
-    elif isinstance(block, Lines):
+    elif isinstance(block, say.Lines):
         for label, text in block.items:
-            yield _line(label, text, "bold yellow" if label == WARNING else "bold")
-    elif isinstance(block, Sentence):
+            yield _line(label, text, "bold yellow" if label == say.WARNING else "bold")
+    elif isinstance(block, say.Sentence):
         yield Text(printable(block.text), style="dim" if block.soft else "")
-    elif isinstance(block, ShownTable) and block.rows:
+    elif isinstance(block, say.ShownTable) and block.rows:
         shown, room = block, console.options.update(max_width=WIDEST)
         marked = "" in shown.heads  # by a last column, which is cut unless the others give way
         while True:
@@ -165,7 +144,7 @@ def _line(label: str, text: str, style: str) -> Text:
     return Text.assemble((f"{label}: ", style), printable(text))
 
 
-def table_of(shown: ShownTable, tight: bool = False) -> Table:
+def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
     """For the terminal: under its title, with a rule below its heads and no frame; words to the
     left, numbers to the right.  `tight`: only what is longer than a word gives way, and heads."""
     table = Table(title=shown.title or None, title_justify="left", title_style="bold",
@@ -250,7 +229,7 @@ def _framed(head: str, body: str, space: bool, kind: str) -> str:
     """The whole page.  Where it has a 3-D view, plotly.js comes along.  It runs these two scripts,
     named by their hashes, and no other: not even one that slipped into a name."""
     source, packed = plotly() if space else ("", "")
-    script = resource("report.js")
+    script = say.resource("report.js")
     hashes = " ".join(f"'sha256-{_digest(text)}'" for text in (script, source) if text)
     carried = f'<script type="application/octet-stream" id="plotly">{packed}</script>'
     return f"""<!doctype html>
@@ -262,7 +241,7 @@ style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="generator" content="elastocal {__version__}">
 <title>{head}</title>
-<style>{resource("style.css")}</style>
+<style>{say.resource("style.css")}</style>
 </head>
 <body class="{kind}">
 <h1>{head}</h1>
@@ -282,11 +261,11 @@ VIEW = '<script type="application/json" class="view-data">'
 def text_of(text: str, minus: bool = True) -> str:
     """A text as HTML, as it can be read; `minus`: with proper minus signs before numbers."""
     found = escape(shown(text))
-    return typeset(found) if minus else found
+    return say.typeset(found) if minus else found
 
 
 def html_of(
-    blocks: Iterable[Block], deep: int = 2, pictures: bool = True, summary: str = ""
+    blocks: Iterable[say.Block], deep: int = 2, pictures: bool = True, summary: str = ""
 ) -> str:
     """Blocks as HTML under heads of level `deep`; figures that follow each other stand in a row.
 
@@ -294,7 +273,7 @@ def html_of(
     repeat the `summary` that they stand behind.
     """
     parts = []
-    for flat, several in groupby(blocks, lambda b: isinstance(b, Figure) and b.space is None):
+    for flat, several in groupby(blocks, lambda b: isinstance(b, say.Figure) and b.space is None):
         found = [_html(block, deep, pictures, summary) for block in several]
         if flat and pictures:
             found = [f'<div class="figures">{"".join(found)}</div>']
@@ -302,29 +281,29 @@ def html_of(
     return "\n".join(part for part in parts if part)
 
 
-def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
-    if isinstance(block, ShownVerdict):
+def _html(block: say.Block, deep: int, pictures: bool, summary: str) -> str:
+    if isinstance(block, say.ShownVerdict):
         tone = '<span class="tone" aria-hidden="true"></span>'
         return (
             f'<section class="judgement {block.tone}" aria-label="Verdict"><p class="headline">'
             f"{tone} {text_of(block.sentence)}</p></section>"
         )
-    if isinstance(block, KeyFigures):
+    if isinstance(block, say.KeyFigures):
         figures = "".join(
             f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
             for name, number in block.figures
         )
         line = f'<p class="change">{text_of(block.headline)}</p>'
         return f'{line}<dl class="key">{figures}</dl>'
-    if isinstance(block, Heading):
+    if isinstance(block, say.Heading):
         return f"<h{deep}>{text_of(block.text)}</h{deep}>"
-    if isinstance(block, Sentence):
+    if isinstance(block, say.Sentence):
         return f'<p class="{"soft" if block.soft else "told"}">{text_of(block.text)}</p>'
-    if isinstance(block, Lines):
+    if isinstance(block, say.Lines):
         return _lines(block)
-    if isinstance(block, ShownTable):
+    if isinstance(block, say.ShownTable):
         return _table(block, deep, summary) if block.rows else ""
-    if isinstance(block, Fold):
+    if isinstance(block, say.Fold):
         if not (pictures or block.printed):
             return ""
         inside = html_of(block.blocks(), deep + bool(block.summary), pictures, block.summary)
@@ -334,18 +313,18 @@ def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
     return _picture(block) if pictures else ""
 
 
-def _lines(block: Lines) -> str:
+def _lines(block: say.Lines) -> str:
     """A label once for sentences that follow each other."""
     parts = []
     for label, items in groupby(block.items, lambda item: item[0]):
         texts = [text_of(text) for _, text in items]
         told = texts[0] if len(texts) == 1 else f"<ul><li>{'</li><li>'.join(texts)}</li></ul>"
-        tone = ' class="warned"' if label == WARNING else ""
+        tone = ' class="warned"' if label == say.WARNING else ""
         parts.append(f"<dt{tone}>{text_of(label)}</dt><dd>{told}</dd>")
     return f'<dl class="lines">{"".join(parts)}</dl>' if parts else ""
 
 
-def _table(t: ShownTable, deep: int, summary: str) -> str:
+def _table(t: say.ShownTable, deep: int, summary: str) -> str:
     told = not t.title or summary.startswith(t.title.partition(" (")[0])
     title = "" if told else f"<h{deep}>{text_of(t.title)}</h{deep}>\n"
     below = f'\n<p class="soft">{text_of(t.note)}</p>' if t.note else ""
@@ -376,7 +355,7 @@ def _cell(kind: str, head: str, text: str) -> str:
     return f'<td class="{kind}{tone}" data-head="{before}">{text_of(text)}</td>'
 
 
-def _picture(block: Figure) -> str:
+def _picture(block: say.Figure) -> str:
     from elastocal.report.figures import svg
 
     caption = f"<figcaption>{text_of(block.caption)}</figcaption>" if block.caption else ""
@@ -445,17 +424,17 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
 
     Raises InputError for a kind that the result does not have, and one that cannot be turned.
     """
-    folds = [block for block in report_of(result).blocks if isinstance(block, Fold)]
+    folds = [block for block in report_of(result).blocks if isinstance(block, say.Fold)]
     every = [name for fold in folds for name in fold.figures]
     arms = [name for name in every if name in ("space", "poses")]
     chosen = kind or DEFAULTS.get(type(result).__name__, every[0])
     if interactive and kind is None and arms:
         chosen = arms[0]
-    opened = unfolded(folds, lambda fold: chosen in fold.figures)
-    found = [b for b in opened if isinstance(b, Figure) and b.name == chosen]
+    opened = say.unfolded(folds, lambda fold: chosen in fold.figures)
+    found = [b for b in opened if isinstance(b, say.Figure) and b.name == chosen]
     if not found:
-        opened = unfolded(folds, lambda fold: bool(fold.figures))
-        there = [block.name for block in opened if isinstance(block, Figure)]
+        opened = say.unfolded(folds, lambda fold: bool(fold.figures))
+        there = [block.name for block in opened if isinstance(block, say.Figure)]
         raise InputError(
             f"no figure {quoted(chosen)}{did_you_mean(chosen, there)}; there are {listed(there)}"
         )
@@ -509,6 +488,8 @@ def _plan_frame(plan: Plan | None) -> pd.DataFrame:
     """One row per pose: joints in ° or mm, place in the order, and the load where it states one."""
     import pandas as pd
 
+    from elastocal.compensation.compensate import in_file_units, joint_columns
+
     if plan is None:
         return pd.DataFrame()
     columns: dict[str, Any] = {"configuration": list(plan.configurations)}
@@ -516,7 +497,7 @@ def _plan_frame(plan: Plan | None) -> pd.DataFrame:
     columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
     if plan.level_joint is not None:
         columns["level"] = plan.group + 1
-    order = first_stops(plan)
+    order = say.first_stops(plan)
     columns["order"] = [order.get(k) for k in range(len(plan.q))]
     return pd.DataFrame(columns)
 
@@ -548,6 +529,8 @@ def _candidates(d: Diagnosis) -> pd.DataFrame:
 def _commands(c: Compensation) -> pd.DataFrame:
     """One row per target: the columns of the commands file, NaN where a target is not reached."""
     import pandas as pd
+
+    from elastocal.compensation.compensate import commands_csv
 
     text = StringIO(commands_csv(c, c.chain.kinds))
     frame = pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])

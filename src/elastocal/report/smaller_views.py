@@ -17,30 +17,7 @@ from elastocal.errors import InputError
 from elastocal.identification.error_budget import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
-from elastocal.report.blocks import (
-    WARNING,
-    Block,
-    Figure,
-    Fold,
-    Heading,
-    KeyFigures,
-    Lines,
-    Report,
-    Sentence,
-    ShownTable,
-    ShownVerdict,
-    counted,
-    estimate,
-    length,
-    load_text,
-    loads_text,
-    newtons,
-    p_value,
-    resource,
-    sentence,
-    size_of,
-    title_of,
-)
+from elastocal.report import blocks as say
 from elastocal.report.identification_view import (
     at_new_poses,
     before_and_after,
@@ -73,20 +50,20 @@ OF_LOADS = {
 }
 
 
-def changes_report(c: Comparison) -> Report:
+def changes_report(c: Comparison) -> say.Report:
     model = c.old.model
-    title = title_of(model.chain.name, model.cell.name)
-    return Report("Comparison", title, _changes(c), model.backend_report())
+    title = say.title_of(model.chain.name, model.cell.name)
+    return say.Report("Comparison", title, _changes(c), model.backend_report())
 
 
-def _changes(c: Comparison) -> Iterator[Block]:
-    rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
-    most = length(float(c.distance.max()))
+def _changes(c: Comparison) -> Iterator[say.Block]:
+    rms, noise = (say.length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
+    most = say.length(float(c.distance.max()))
     figures = [
         ("the tool has moved, rms", rms), ("at most", most), ("noise alone", noise),
-        ("all parameters together", size_of(c.p)),
+        ("all parameters together", say.size_of(c.p)),
     ]  # fmt: skip
-    yield Fold("", lambda: [KeyFigures(f"moved by {rms} (noise {noise})", figures)])
+    yield say.Fold("", lambda: [say.KeyFigures(f"moved by {rms} (noise {noise})", figures)])
     same = c.verdict == "no_change_shown" and not c.one_result
     names = ", ".join(printable(change.name) for change in c.changed[:MOST_NAMED])
     names += f" and {len(c.changed) - MOST_NAMED} more" if len(c.changed) > MOST_NAMED else ""
@@ -108,15 +85,15 @@ def _changes(c: Comparison) -> Iterator[Block]:
         verdict = "The arm has changed, but no single parameter is significant."
         if c.verdict == "no_change_shown":
             verdict = "No significant change: the differences are within the noise."
-    yield ShownVerdict("good" if same else "warn", verdict)
+    yield say.ShownVerdict("good" if same else "warn", verdict)
     moved = (
         f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
-        f"poses within the joint limits under {loads_text(c.forces, '{}', '{} loads in turn')}, "
-        f"{OF_LOADS[c.loads_of]}; noise alone gives {noise} rms."
+        f"poses within the joint limits under "
+        f"{say.loads_text(c.forces, '{}', '{} loads in turn')}, {OF_LOADS[c.loads_of]}; noise alone gives {noise} rms."
     )
     chance = (
-        f"All {len(c.changes)} parameters together: {size_of(c.p)}. Each alone by Holm's rule: if "
-        f"nothing has changed, the probability of any finding is {c.level:g} at most."
+        f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by Holm's rule: "
+        f"if nothing has changed, the probability of any finding is {c.level:g} at most."
     )
     compared = [
         "The arm itself. Base and markers are set up anew each time: a change that a motion of the "
@@ -127,41 +104,41 @@ def _changes(c: Comparison) -> Iterator[Block]:
             "The sessions determined other parameters; the new ones are given in those of the old, "
             "to first order."
         )
-    yield Lines([
+    yield say.Lines([
         ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
         *(("Next", step) for step in steps),
     ])  # fmt: skip
-    yield Fold("", lambda: [_moves(c)], figures=("moved",))
+    yield say.Fold("", lambda: [_moves(c)], figures=("moved",))
     yield _change_table(c)
 
 
-def _change_table(c: Comparison) -> ShownTable:
+def _change_table(c: Comparison) -> say.ShownTable:
     """A row for each parameter, the changed first, then by their effect at the tool."""
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
     for one in sorted(c.changes, key=lambda x: (not x.changed, -x.moves)):
-        value, half, unit = estimate(one.change, one.std, one.unit)
-        old, new = (estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
+        value, half, unit = say.estimate(one.change, one.std, one.unit)
+        old, new = (say.estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
         with_others = f" (with {listed(one.combined_with, 3)})" if one.combined_with else ""
         rows.append(
-            (printable(one.name + with_others), old, new, value, half, unit, p_value(one.p_family),
-             length(one.moves), "changed" * one.changed)
+            (printable(one.name + with_others), old, new, value, half, unit,
+             say.p_value(one.p_family), say.length(one.moves), "changed" * one.changed)
         )  # fmt: skip
     note = (
         "± std: standard deviation of the difference, of both sessions together. p (Holm): chance "
         "of such a difference where nothing has changed, corrected for all parameters. Moves the "
         "tool: rms over the poses, by this change alone."
     )
-    table = ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
+    table = say.ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
     return replace(table, narrow=table.without(1, 2).when_narrow(2, 4))
 
 
-def _moves(c: Comparison) -> Figure:
+def _moves(c: Comparison) -> say.Figure:
     """How far the tool moves by each change alone, the largest first."""
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     most = sorted(c.changes, key=lambda change: -change.moves)[:MOST_DRAWN]
-    rows = [(one.name, one.moves * 1e6, NO_ENDS, length(one.moves)) for one in most]
+    rows = [(one.name, one.moves * 1e6, NO_ENDS, say.length(one.moves)) for one in most]
     noise = ("all by noise alone", 1e6 * float(np.sqrt(np.mean(c.chance**2))))
     caption = "The largest changes by what each alone moves the tool, rms over the poses."
     title = "How far each change moves the tool"
@@ -171,7 +148,7 @@ def _moves(c: Comparison) -> Figure:
 # Commands
 
 
-def compensation_report(c: Compensation) -> Report:
+def compensation_report(c: Compensation) -> say.Report:
     from elastocal.compensation.compensate import in_file_units, joint_columns, summary
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
@@ -190,17 +167,17 @@ def compensation_report(c: Compensation) -> Report:
     heads = ("configuration", *joint_columns(kinds), "std_um", "status")
     more = len(c.status) - len(rows)
     note = f"and {more} more in the file of commands" if more else ""
-    commands = ShownTable(heads, rows, (0, len(heads) - 1), note=note)
+    commands = say.ShownTable(heads, rows, (0, len(heads) - 1), note=note)
     told = compensation_blocks({"commands": summary(c, kinds, commands=False)})
-    errors = Fold(
+    errors = say.Fold(
         "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, lengths=True)],
         figures=("errors",),
     )  # fmt: skip
-    blocks = [*told, errors, Fold("Commands", lambda: [commands])]
-    return Report("Compensation", printable(c.chain.name), blocks)
+    blocks = [*told, errors, say.Fold("Commands", lambda: [commands])]
+    return say.Report("Compensation", printable(c.chain.name), blocks)
 
 
-def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
+def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
     """Errors before and after, uncertainty and warnings.
 
     `content`: the summary of the `commands`, that of the correction `table`, or both.
@@ -216,39 +193,39 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
         yield _spreads("Position of the tool, predicted", rows)
         for k, command in enumerate(commands.get("commands", ())):
             joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
-            yield Sentence(f"target {k + 1}: {joints or command['status']}")
-        yield Sentence(
+            yield say.Sentence(f"target {k + 1}: {joints or command['status']}")
+        yield say.Sentence(
             f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
             f"targets in the {commands['frame']} frame."
         )
-        yield Lines([(WARNING, text) for text in commands["warnings"]])
+        yield say.Lines([(say.WARNING, text) for text in commands["warnings"]])
     if table is not None:
         rows = {"without the table": table["error_without_um"]}
         rows["with it, interpolated"] = table["error_with_um"]
         yield _spreads(
             f"Position of the tool at {table['checked_between']} points between the grid's", rows
         )
-        yield Sentence(
+        yield say.Sentence(
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
             "first order (beside singular postures or limits)."
         )
-        yield Lines([(WARNING, text) for text in table["warnings"]])
+        yield say.Lines([(say.WARNING, text) for text in table["warnings"]])
 
 
-def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> ShownTable:
+def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
     def shown(um: float | None) -> str:
         if um is None:
             return "–"
-        return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
+        return "< 0.01 µm" if um < 0.01 else say.length(um * 1e-6)
 
     cells = [(name, *map(shown, values.values())) for name, values in rows.items()]
-    return ShownTable(("", "rms", "95 %", "max"), cells, title=title)
+    return say.ShownTable(("", "rms", "95 %", "max"), cells, title=title)
 
 
 # Readings
 
 
-def readings_report(table: Measurements) -> Report:
+def readings_report(table: Measurements) -> say.Report:
     from elastocal.compensation.compensate import in_file_units, joint_columns
     from elastocal.report.figures import rows_of_dots
 
@@ -260,7 +237,7 @@ def readings_report(table: Measurements) -> Report:
     ]  # fmt: skip
     heads = ("column", "different", "least", "largest")
     source = printable(table.source)
-    shown = ShownTable(heads, rows, title=f"{len(table)} rows of {source}")
+    shown = say.ShownTable(heads, rows, title=f"{len(table)} rows of {source}")
     q = in_file_units(table.q, table.kinds)
     ends = [(float(v.min()), float(v.max())) if len(v) else (0.0, 0.0) for v in q.T]
     dots = [
@@ -268,8 +245,8 @@ def readings_report(table: Measurements) -> Report:
         for name, (a, b) in zip(joint_columns(table.kinds), ends, strict=True)
     ]
     axis, title = "middle and ends of the values, in ° or mm", "Where each joint stood"
-    joints = Fold("", lambda: [rows_of_dots("joints", title, dots, axis)], figures=("joints",))
-    return Report("Readings", source, [shown, joints])
+    joints = say.Fold("", lambda: [rows_of_dots("joints", title, dots, axis)], figures=("joints",))
+    return say.Report("Readings", source, [shown, joints])
 
 
 # The calibrated arm in a file
@@ -284,9 +261,9 @@ FORMATS = {
 }
 
 
-def export_blocks(done: Exported) -> Iterator[Block]:
+def export_blocks(done: Exported) -> Iterator[say.Block]:
     def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
-        return "< 0.001 µm" if metres < 1e-9 else length(metres)
+        return "< 0.001 µm" if metres < 1e-9 else say.length(metres)
 
     cost, (name, in_title), refit = done.cost, FORMATS[done.format], done.refit
     if cost.effects:
@@ -294,48 +271,48 @@ def export_blocks(done: Exported) -> Iterator[Block]:
         rows = []
         for effect, d, note in [*every, ("all of it", cost.total, "")]:
             sizes = () if d is None else (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
-            rows.append((effect, *([length(size) for size in sizes] or [""] * 4), note))
+            rows.append((effect, *([say.length(size) for size in sizes] or [""] * 4), note))
         heads = ("effect", "markers rms", "max", "flange rms", "max", "")
-        yield ShownTable(heads, rows, (0, 5), title=f"What {in_title} cannot hold")
-        yield Sentence(
+        yield say.ShownTable(heads, rows, (0, 5), title=f"What {in_title} cannot hold")
+        yield say.Sentence(
             f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
             f"joint {'ranges measured' if cost.measured else 'limits'} under "
-            f"{loads_text(cost.forces, 'a load of {}', 'the {} loads measured')}, each effect left "
-            "out alone."
+            f"{say.loads_text(cost.forces, 'a load of {}', 'the {} loads measured')}, each effect "
+            "left out alone."
         )
     else:
-        yield Sentence(f"{name} holds all of the calibrated model.")
+        yield say.Sentence(f"{name} holds all of the calibrated model.")
     if refit is not None:
-        told = f"the markers are {length(refit.after)} rms off"
+        told = f"the markers are {say.length(refit.after)} rms off"
         if refit.correction is not None:
-            told += f", with its joint correction {length(refit.correction)}"
+            told += f", with its joint correction {say.length(refit.correction)}"
         if refit.taken or refit.correction is not None:
             told = (
                 f"Refitted to the calibrated arm at {refit.visits} measured visits: {told}, with "
-                f"the values identified {length(refit.before)}"
+                f"the values identified {say.length(refit.before)}"
             )
         else:
             told = f"Values as identified; no refit is better: {told}"
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
-        nominal = length(refit.nominal)
-        yield Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
+        nominal = say.length(refit.nominal)
+        yield say.Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
     if done.checked is not None:
-        yield Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
+        yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
-        yield Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
+        yield say.Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
     if held := list(done.held):
         more = f" and {len(held) - 8} more" if len(held) > 8 else ""
-        yield Sentence(
+        yield say.Sentence(
             "Not determined by the data, at the values that the identification predicts with: "
             f"{', '.join(held[:8])}{more}."
         )
     if done.of_the_measurement:
         left = ", ".join(done.of_the_measurement)
-        yield Sentence(f"Left out, effects of the measurement: {left}.")
+        yield say.Sentence(f"Left out, effects of the measurement: {left}.")
     for warning in done.warnings:
-        yield Sentence(f"Note: {warning}.")
+        yield say.Sentence(f"Note: {warning}.")
     if cost.total.marker_rms > WORTH_TELLING:
-        yield Sentence(
+        yield say.Sentence(
             "Next: if that matters, elastocal compensate corrects it with the same cell and result."
         )
 
@@ -353,7 +330,7 @@ def left_out(found: Imported) -> list[str]:
     for observed in found.understood:
         if n := len(observed.ignored):
             rows = listed((f"line {line} ({reason})" for line, reason in observed.ignored), 8)
-            lines.append(f"{observed.path}: passed over {counted(n, 'line')}: {rows}")
+            lines.append(f"{observed.path}: passed over {say.counted(n, 'line')}: {rows}")
     if (joined := found.joined) is not None:
         for told, names in (("left out, without joint values: %d points", joined.left_out),
                             ("poses without a point: %d", joined.unused)):  # fmt: skip
@@ -361,7 +338,7 @@ def left_out(found: Imported) -> list[str]:
     return lines
 
 
-def import_blocks(found: Imported, width: int) -> Iterator[Block]:
+def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
     """Files and their columns, the first rows, ranges, counts, what was left out, warnings.
 
     `width`: columns of letters that there is room for.
@@ -369,13 +346,13 @@ def import_blocks(found: Imported, width: int) -> Iterator[Block]:
     for seen in found.understood:
         preset = f"preset {seen.preset}, " if seen.preset else ""
         decimals = ", decimal commas" if seen.decimal == "," else ""
-        yield Heading(
-            f"{seen.path}: {counted(seen.rows, 'row')} of {ROLES[seen.role]} "
+        yield say.Heading(
+            f"{seen.path}: {say.counted(seen.rows, 'row')} of {ROLES[seen.role]} "
             f"({preset}{seen.encoding}, {seen.layout}{decimals})"
         )
         rows = [(name, column, unit or "–") for name, column, unit in seen.columns]
-        yield ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
-        yield Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
+        yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
+        yield say.Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
     columns = found.assembled.columns
     first = range(min(FIRST_ROWS, len(found.assembled)))
     every = {n: [_cell(columns[n], i) for i in first] for n in columns if n != "note_source"}
@@ -386,17 +363,17 @@ def import_blocks(found: Imported, width: int) -> Iterator[Block]:
     words = tuple(k for k, n in enumerate(shown) if not isinstance(columns[n], np.ndarray))
     cells = [tuple(every[n][i] for n in shown) for i in first]
     title = "The first rows of the table" + (f", {rest} more columns" if rest else "")
-    yield ShownTable(tuple(shown), cells, words, title=title)
+    yield say.ShownTable(tuple(shown), cells, words, title=title)
     ranges = [
         (name, f"{values.min():.6g}", f"{values.max():.6g}")
         for name, values in columns.items()
         if isinstance(values, np.ndarray) and name != "repeat"
     ]
-    yield ShownTable(("column", "least", "largest"), ranges, title="Ranges")
-    yield Lines([
+    yield say.ShownTable(("column", "least", "largest"), ranges, title="Ranges")
+    yield say.Lines([
         *_counts(found),
         *(("Left out", text) for text in left_out(found)),
-        *((WARNING, text) for text in found.warnings),
+        *((say.WARNING, text) for text in found.warnings),
     ])  # fmt: skip
 
 
@@ -411,15 +388,16 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
     alike = np.column_stack([table.configuration, table.marker, table.force])
     repeats = np.unique(alike, axis=0, return_counts=True)[1]
     span = " to ".join(dict.fromkeys((str(repeats.min()), str(repeats.max()))))
-    poses = counted(len(table.configuration_labels), "configuration")
+    poses = say.counted(len(table.configuration_labels), "configuration")
     yield (
         "Table",
-        (f"{counted(len(table), 'reading')} of {poses}, {span} per configuration, marker and load"),
+        f"{say.counted(len(table), 'reading')} of {poses}, {span} per configuration, marker and "
+        "load",
     )
     yield "Markers", listed(table.marker_names, 20)
     forces, sizes = np.unique(table.force, axis=0, return_counts=True)
     loads = [
-        f"{load_text(force)}: {counted(int(n), 'reading')}"
+        f"{say.load_text(force)}: {say.counted(int(n), 'reading')}"
         for force, n in zip(forces, sizes, strict=True)
     ]
     yield "Loads", "; ".join(loads[:8] + [f"{len(loads) - 8} more"] * (len(loads) > 8))
@@ -446,18 +424,18 @@ FEWEST = 3  # readings of one place from which on a repeatability is told
 SIDES = math.sqrt(3.0)  # a 3-D rms over that of one coordinate
 
 
-def certificate_report(result: Calibration) -> Report:
+def certificate_report(result: Calibration) -> say.Report:
     """A page to print and file: entries, verdict, conformity, uncertainty, pose accuracy."""
     cell = result.model.cell
     kind = "Calibration report" if cell.certificate.missing else "Calibration certificate"
-    title = title_of(result.model.chain.name, cell.name)
-    return Report(kind, title, _certificate(result), result.model.backend_report(), filed=True)
+    title = say.title_of(result.model.chain.name, cell.name)
+    return say.Report(kind, title, _certificate(result), result.model.backend_report(), filed=True)
 
 
-def _certificate(result: Calibration) -> Iterator[Block]:
+def _certificate(result: Calibration) -> Iterator[say.Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
     verdict, certified = judgement(result), certified_values(result, budget)
-    yield ShownVerdict(verdict.tone, verdict.headline)
+    yield say.ShownVerdict(verdict.tone, verdict.headline)
     told = [
         (name.replace("_", " "), printable(value))
         for name, value in vars(entries).items() if isinstance(value, str)
@@ -465,23 +443,23 @@ def _certificate(result: Calibration) -> Iterator[Block]:
     if entries.temperature is not None:
         told.append(("temperature", f"{entries.temperature:g} °C"))
     if (own := entries.instrument_uncertainty) is not None:
-        told.append(("instrument's expanded uncertainty, k = 2", length(own)))
-    yield ShownTable(("entry", ""), told, (0, 1), title="Entries")
+        told.append(("instrument's expanded uncertainty, k = 2", say.length(own)))
+    yield say.ShownTable(("entry", ""), told, (0, 1), title="Entries")
     if told and entries.missing:
-        yield Sentence(
+        yield say.Sentence(
             f"Not a certificate: [certificate] of the cell lacks {listed(entries.missing)}.",
             soft=True,
         )
     if entries.limit is not None:
-        yield Heading("Statement of conformity")
-        yield Sentence(certified.conformity(entries.limit))
+        yield say.Heading("Statement of conformity")
+        yield say.Sentence(certified.conformity(entries.limit))
     yield from _uncertainty(certified)
     yield from _poses(result, budget, certified)
     stated = result.model.cell.tracker.noise
     noise = "none stated" if result.observations.table.sigma is None else "stated with each reading"
     if stated is not None:
         noise = ", ".join(
-            f"{name.replace('_', ' ')} {', '.join(map(length, _each(value)))}"
+            f"{name.replace('_', ' ')} {', '.join(map(say.length, _each(value)))}"
             + (" per m" if name.endswith("per_m") else "")
             for name, value in vars(stated).items()
         )
@@ -490,13 +468,13 @@ def _certificate(result: Calibration) -> Iterator[Block]:
         *joint_lines(result),
         ("Instrument, standard deviations", noise),
         ("Readings", readings(result)),
-        ("Loads", "; ".join(newtons(f) for f in measured_loads(result.observations))),
+        ("Loads", "; ".join(say.newtons(f) for f in measured_loads(result.observations))),
         ("Identified", what_was_identified(result)),
-        ("Method", sentence(method_and_weights(result))),
+        ("Method", say.sentence(method_and_weights(result))),
         *([("Expected error", at_new_poses(result.predicted))] if result.predicted else []),
         *prediction_lines(result),
     ]
-    yield ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
+    yield say.ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
 
 
 def _each(value: float | Array) -> list[float]:
@@ -537,8 +515,9 @@ class Certified:
             return "No statement: no position error was measured at places that were not fitted."
         guard = self.of_deviations
         numbers = (
-            f"largest position error {length(self.error)} ({self.places}), limit {length(limit)}, "
-            f"guard band {length(guard)} (U, k = 2, of a measured distance)"
+            f"largest position error {say.length(self.error)} ({self.places}), "
+            f"limit {say.length(limit)}, guard band {say.length(guard)} (U, k = 2, of a "
+            "measured distance)"
         )
         if self.error + guard <= limit:
             text = "Conforms: the error and its guard band are within the limit"
@@ -593,16 +572,16 @@ def pose_repeatability(result: Calibration) -> Array:
     return np.array(found)
 
 
-def _uncertainty(certified: Certified) -> Iterator[Block]:
+def _uncertainty(certified: Certified) -> Iterator[say.Block]:
     if not certified.sources:
         return
     square = sum(u**2 for *_, u in certified.sources)
     rows = [
-        (name, kind, length(u), f"{100 * u**2 / square if square else 0:.0f} %")
+        (name, kind, say.length(u), f"{100 * u**2 / square if square else 0:.0f} %")
         for name, kind, u in certified.sources
     ]
-    rows.append(("combined", "", length(math.sqrt(square)), "100 %"))
-    rows.append(("expanded, U with k = 2", "", length(certified.expanded), ""))
+    rows.append(("combined", "", say.length(math.sqrt(square)), "100 %"))
+    rows.append(("expanded, U with k = 2", "", say.length(certified.expanded), ""))
     heads = ("source", "type", "standard uncertainty", "share of the variance")
     note = (
         "Of a coordinate of a position that the calibrated model predicts, against one reading "
@@ -610,12 +589,12 @@ def _uncertainty(certified: Certified) -> Iterator[Block]:
     )
     if all(name != INSTRUMENT for name, *_ in certified.sources):
         note += " Without the instrument's own calibration, which [certificate] does not state."
-    yield ShownTable(heads, rows, (0, 1), title="Uncertainty", note=note)
+    yield say.ShownTable(heads, rows, (0, 1), title="Uncertainty", note=note)
 
 
 def _poses(
     result: Calibration, budget: ErrorBudget | None, certified: Certified
-) -> Iterator[Block]:
+) -> Iterator[say.Block]:
     if budget is not None and len(budget.steps) > 1:
         ends = (budget.steps[0], budget.steps[-1])
         found = {
@@ -623,7 +602,7 @@ def _poses(
             for name, step in zip(before_and_after(result, budget), ends, strict=False)
         }
         yield spread_table(found, "places", "Pose accuracy before and after")
-        yield Sentence(
+        yield say.Sentence(
             "In the sense of ISO 9283: the distance between the place that was meant and the mean "
             "of what was read there, at every configuration, marker and load. “Calibrated” is what "
             "the calibrated model predicts for a configuration that was left out of the fit; both "
@@ -632,12 +611,14 @@ def _poses(
             soft=True,
         )
     else:
-        yield Sentence("Pose accuracy is not known: no configuration can be left out of the fit.")
+        yield say.Sentence(
+            "Pose accuracy is not known: no configuration can be left out of the fit."
+        )
     if len(rp := certified.repeatability):
-        yield Sentence(
-            f"Pose repeatability RP (ISO 9283): {length(float(rp.mean()))} in the mean of "
-            f"{len(rp)} places read {FEWEST} times or more, {length(float(rp.max()))} at most; the "
-            "instrument's noise is included."
+        yield say.Sentence(
+            f"Pose repeatability RP (ISO 9283): {say.length(float(rp.mean()))} in the mean of "
+            f"{len(rp)} places read {FEWEST} times or more, {say.length(float(rp.max()))} at most; "
+            "the instrument's noise is included."
         )
 
 
@@ -697,7 +678,7 @@ def dcc_text(result: Calibration) -> str:
         **vars(c), "version": __version__, "robot": name, "statement": statement,
         "location": "customer" if c.place == c.customer else "other",
     }  # fmt: skip
-    text = Template(resource("dcc.xml")).substitute(
+    text = Template(say.resource("dcc.xml")).substitute(
         {key: _xml("" if value is None else str(value)) for key, value in told.items()},
         ambient=_quantity("temperature", c.temperature, "\\degreecelsius"),
         results="".join(results),
