@@ -406,8 +406,8 @@ def _certificate_lines(plan: Plan) -> Told:
         yield (
             "Certificate",
             f"{say.counted(len(c.starts), 'start')} of the search ended with {name} = "
-            f"{ends}{unit}, the bound is {bound:.4g}{unit}. The difference is what no start found, or what only "
-            "weights can reach: the fewer poses, the more of the latter.",
+            f"{ends}{unit}, the bound is {bound:.4g}{unit}. The difference is what no start "
+            "found, or what only weights can reach: the fewer poses, the more of the latter.",
         )
 
 

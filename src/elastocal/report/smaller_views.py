@@ -86,10 +86,11 @@ def _changes(c: Comparison) -> Iterator[say.Block]:
         if c.verdict == "no_change_shown":
             verdict = "No significant change: the differences are within the noise."
     yield say.ShownVerdict("good" if same else "warn", verdict)
+    loads = say.loads_text(c.forces, "{}", "{} loads in turn")
     moved = (
         f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
-        f"poses within the joint limits under "
-        f"{say.loads_text(c.forces, '{}', '{} loads in turn')}, {OF_LOADS[c.loads_of]}; noise alone gives {noise} rms."
+        f"poses within the joint limits under {loads}, {OF_LOADS[c.loads_of]}; noise alone gives "
+        f"{noise} rms."
     )
     chance = (
         f"All {len(c.changes)} parameters together: {say.size_of(c.p)}. Each alone by Holm's rule: "
