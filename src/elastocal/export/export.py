@@ -83,13 +83,6 @@ def _placed(T: Array) -> dict[str, list[float]]:
     }
 
 
-def _yaml(data: Any) -> str:
-    import yaml
-
-    text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=np.inf)
-    return text
-
-
 # Smooth functions as a table: what no format of geometry holds, for controllers of one's own.
 
 CORRECTIONS_HEADER = (
@@ -269,7 +262,12 @@ def export(
         found = WRITERS[wish.format](calibrated, wish, kept, pieces)
     else:
         document = _parameters(calibrated, pieces, cost)
-        found = Written(_yaml(document) if wish.format == "yaml" else json_text(document) + "\n")
+        text = json_text(document) + "\n"
+        if wish.format == "yaml":
+            import yaml
+
+            text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
+        found = Written(text)
     if found.checked is not None and not np.isfinite(found.checked):
         raise InsufficientDataError(
             f"{calibrated.source}: its corrections are larger than a file of a robot can hold; "

@@ -701,8 +701,10 @@ def _least_squares(
     rows = table.take(np.repeat(poses, len(names)))
     marker = np.tile(np.arange(len(names)), len(poses))
     rows = replace(rows, marker=marker, marker_names=names, position=np.zeros((len(marker), 3)))
-    free = [k for k, p in enumerate(model.parameters) if _is_free(p.effect, geometry)]
-    turns = [k for k, p in enumerate(model.parameters) if p.effect == JointOffset.name]
+    effects = [p.effect for p in model.parameters]
+    yields = [effect_of(e).registered or effect_of(e).elastic for e in effects]
+    free = [k for k, e in enumerate(effects) if (geometry if e in GEOMETRY else yields[k])]
+    turns = [k for k, e in enumerate(effects) if e == JointOffset.name]
     curves = None if measured is None else _Curves(rows, measured)
     asked = np.array(sorted({*free, *(turns if curves else ())}), dtype=np.int64)
     size = curves.count if curves else 0
@@ -727,12 +729,6 @@ def _least_squares(
         u = u + _step(B / sigma, r / sigma, sizes, u - first, least - u)
         x[free] = u[: len(free)]
     return x, start if curves is None else curves.correction(start, u[len(free) :])
-
-
-def _is_free(effect: str, geometry: bool) -> bool:
-    if effect in GEOMETRY:
-        return geometry
-    return effect_of(effect).registered or effect_of(effect).elastic
 
 
 def _step(B: Array, r: Array, size: Array, away: Array, least: Array) -> Array:

@@ -28,7 +28,6 @@ from elastocal.units import Array
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
     from elastocal.diagnosis.diagnosis import Candidate, EffectAt, FoundEffect
-    from elastocal.model.effects.base import Effect
     from elastocal.planning.plan import Plan
 
 # good: use it; warn: use it knowing what is wrong, or look what changed; poor: do not use it.
@@ -590,13 +589,14 @@ def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
     on, entries = {choice.name for choice in given.model.effects}, []
     for effect in CATALOGUE.values():
         where = effect.places(chain, given)
+        first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
         try:
             parameters = effect.parameters(where[0], chain, given) if where else ()
         except InputError:  # of link weights without masses: settings of the cell make them
             parameters = ()
         entries.append({
             "name": effect.name, "stage": effect.stage,
-            "on": effect.name in on or effect.acts_unasked(given), "what": what_it_is(effect),
+            "on": effect.name in on or effect.acts_unasked(given), "what": " ".join(first.split()),
             "places": list(where), "needs": list(effect.needed(given)),
             "parameters": [
                 {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
@@ -604,12 +604,6 @@ def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
             ],
         })  # fmt: skip
     return entries
-
-
-def what_it_is(effect: Effect) -> str:
-    """The first paragraph of the effect's own text, on one line."""
-    first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
-    return " ".join(first.split())
 
 
 def effect_head(entry: dict[str, Any]) -> str:

@@ -71,9 +71,9 @@ def _blocks(d: Diagnosis) -> Iterator[say.Block]:
     lines += [("Not separable", say.capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
     yield say.Lines([*lines, *((say.WARNING, say.capital(printable(text))) for text in d.warnings)])
-    yield say.Fold("", lambda: _figures(d), figures=("budget", "curves"))
+    yield say.Fold("", lambda: _figures(d, "budget"), figures=("budget", "curves"))
     shapes = "" if len(d.effects) <= FEW else "Found effects over the joints they act at"
-    yield say.Fold(shapes, lambda: _shapes(d), figures=("effects",))
+    yield say.Fold(shapes, lambda: _figures(d, "effects"), figures=("effects",))
     yield cause_table(d)
     yield added_parameter_table(d)
     yield say.Fold("Place by place", lambda: [place_table(d)], printed=True)
@@ -97,20 +97,16 @@ def _blocks(d: Diagnosis) -> Iterator[say.Block]:
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
 
 
-def _figures(d: Diagnosis) -> Iterator[say.Figure]:
-    from elastocal.report.figures import unknown_curves, waterfall
+def _figures(d: Diagnosis, which: str) -> Iterator[say.Figure]:
+    from elastocal.report.figures import effects_over_joints, unknown_curves, waterfall
 
+    if which == "effects":
+        yield from effects_over_joints(d)
+        return
     if d.budget:
         yield waterfall("budget", _named_steps(d), ("noise alone", d.gap.noise_floor))
     if d.curves:
         yield unknown_curves(d)
-
-
-def _shapes(d: Diagnosis) -> Iterator[say.Figure]:
-    from elastocal.report.figures import effects_over_joints
-
-    if (found := effects_over_joints(d)) is not None:
-        yield found
 
 
 def _residuals(d: Diagnosis) -> Iterator[say.Block]:

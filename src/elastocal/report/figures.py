@@ -430,7 +430,7 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
     return found
 
 
-def effects_over_joints(d: Diagnosis) -> say.Figure | None:
+def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
     panels = []
     for name, kind, at, seen, explained, side in effect_shapes(d):
         (q, unit), series = _in_unit(kind, at), list[Series]()
@@ -445,14 +445,13 @@ def effects_over_joints(d: Diagnosis) -> say.Figure | None:
         height = reach(1e6 * np.concatenate([seen, explained]))
         motion = "µrad" if kind == "revolute" else "µm"
         panels.append(Panel(f"joint in {unit}", f"motion in {motion}", series, height, name))
-    if not panels:
-        return None
     caption = (
         "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
         "each reading when all is fitted."
     )
     title = "Found effects over the joints they act at"
-    return panelled("effects", title, panels, caption, 0.6 + 2.2 * len(panels))
+    if panels:
+        yield panelled("effects", title, panels, caption, 0.6 + 2.2 * len(panels))
 
 
 def plan_curve(plan: Plan) -> say.Figure:

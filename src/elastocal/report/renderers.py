@@ -14,7 +14,7 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
 from datetime import date
-from functools import cache, partial
+from functools import cache
 from html import escape
 from importlib import import_module, metadata
 from io import BytesIO, StringIO
@@ -453,15 +453,15 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
         ax.remove()
         return figure_of(found[0], spot.get_gridspec().figure.add_subfigure(spot))
     figure: Any = figure_of(found[0])
+
+    def png() -> bytes:
+        picture = BytesIO()
+        figure.savefig(picture, format="png", dpi=100, facecolor="white")
+        return picture.getvalue()
+
     # So that a notebook shows it although pyplot, whose hooks do so, is not loaded.
-    figure._repr_png_ = partial(_png, figure)
+    figure._repr_png_ = png
     return figure
-
-
-def _png(figure: Any) -> bytes:
-    picture = BytesIO()
-    figure.savefig(picture, format="png", dpi=100, facecolor="white")
-    return picture.getvalue()
 
 
 def frame(result: object) -> pd.DataFrame:
