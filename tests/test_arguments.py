@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -101,28 +100,6 @@ def test_what_cannot_be_is_an_error_that_names_the_argument(
                 with pytest.raises(ec.ElastocalError) as told:
                     run(model, data, fit, **{name: value})
             assert len(str(told.value)) < 2000
-
-
-@pytest.mark.parametrize(
-    ("call", "name", "value"),
-    [
-        ("design", "levels", {"joint2": []}),
-        ("design", "poses", 10**12),
-        ("design", "test_poses", 3),
-        ("compensate", "targets", np.zeros((0, 3))),
-        ("compare", "poses", 10**7),
-        ("simulate", "noise", "no"),
-        ("identify", "jobs", 1.5),
-        ("next_poses", "batch", 0),
-        ("table", "q", np.zeros((0, 6))),
-        ("predict", "x", [1.0]),
-    ],
-)
-def test_its_name_stands_in_the_message(
-    call: str, name: str, value: Any, model: ec.Model, data: ec.Measurements, fit: ec.Calibration
-) -> None:
-    with pytest.raises(ec.InputError, match=rf"`?{re.escape(name)}`?"):
-        CALLS[call][1](model, data, fit, **{name: value})
 
 
 def test_what_the_caller_does_to_its_array_later_is_its_own(model: ec.Model) -> None:

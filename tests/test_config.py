@@ -70,16 +70,6 @@ def test_the_first_thing_wrong_is_told_in_one_sentence(told, text, sentence):
     assert told(text).startswith(sentence)
 
 
-def test_a_misspelt_key_is_told_rather_than_the_one_it_leaves_missing(told):
-    assert told("[[wheel]]\nradiusmm = 1").startswith("unknown key radiusmm")
-
-
-def test_a_file_beyond_its_bound_is_refused(tmp_path):
-    (tmp_path / "cart.toml").write_text("# " + "x" * 1_000_000)
-    with pytest.raises(InputError, match="larger than 1 MB, which no cart file is"):
-        read_toml(tmp_path / "cart.toml", "cart file", 1_000_000)
-
-
 @pytest.mark.parametrize(
     "value", [[], [1, 2], [1, 2, "3"], [1, 2, True], [1, 2, np.inf], [1, 2, 10**400], 1, "abc", {}]
 )

@@ -79,12 +79,6 @@ def test_every_command_shown_has_the_options_it_is_shown_with(page):
         assert options <= known | {"--help"}, f"{page.name}: elastocal {verb}"
 
 
-def test_commands_are_found_on_the_pages():
-    """Guard of the guard."""
-    verbs = {words[0] for page in PAGES for words in commands_shown(page)}
-    assert {"identify", "simulate", "design", "diagnose", "study"} <= verbs
-
-
 def test_every_figure_is_there_for_light_and_for_dark_pages():
     for page in PAGES:
         shown = re.findall(
@@ -94,20 +88,6 @@ def test_every_figure_is_there_for_light_and_for_dark_pages():
         for name in {name for name, _, _ in shown}:
             assert {only for other, _, only in shown if other == name} == {"light", "dark"}
             assert (DOCS / "figures" / f"{name}.py").exists(), f"no script makes {name}"
-
-
-def test_nothing_of_the_site_comes_from_a_network():
-    settings = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-    assert "font: false" in settings
-    assert "://" not in settings
-    style = (DOCS / "assets" / "site.css").read_text(encoding="utf-8")
-    assert "url(" not in style and "@import" not in style
-
-
-def test_the_site_is_built_strictly():
-    """Without --quiet, under which mkdocs counts no warning."""
-    assert "mkdocs build --strict\n" in (ROOT / "Makefile").read_text(encoding="utf-8")
-    assert "make docs\n" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")
 
 
 def test_every_name_that_a_page_of_the_interface_takes_from_the_code_is_there():

@@ -53,33 +53,12 @@ def check_valid(table: Measurements) -> None:
     assert table.marker.max() < len(table.marker_names)
 
 
-@SETTINGS
-@given(st.binary(max_size=300), st.sampled_from([b"", HEADER.encode(), b"\xef\xbb\xbfq1_rad;"]))
-def test_bytes_give_a_valid_table_or_an_input_error(tmp_path, data, start):
-    table = read_or_refuse(tmp_path / "data.csv", start + data)
-    if table is not None:
-        check_valid(table)
-
-
 CELL = st.one_of(
     FINITE.map(repr),
     st.integers(-(10**25), 10**25).map(str),
     st.sampled_from(["", " ", "nan", "inf", "1e999", "True", "1,5", '"1', '"2"', "1_0", "-"]),
     st.text(max_size=3),
 )
-
-
-@SETTINGS
-@given(
-    st.lists(st.lists(CELL, min_size=5, max_size=5), min_size=1, max_size=4),
-    st.sampled_from(",;\t"),
-    st.sampled_from(["\n", "\r\n"]),
-)
-def test_cells_give_a_valid_table_or_an_input_error(tmp_path, rows, delimiter, end):
-    lines = [HEADER.strip().replace(",", delimiter), *(delimiter.join(row) for row in rows)]
-    table = read_or_refuse(tmp_path / "data.csv", end.join(lines).encode("utf-8", "replace"))
-    if table is not None:
-        check_valid(table)
 
 
 @SETTINGS

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import hashlib
 import os
 import re
 import subprocess
@@ -12,8 +11,6 @@ from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "elastocal"
@@ -33,7 +30,6 @@ LAYERS = (
 
 # A room holds one idea whole: below the floor it is a part of another, above the ceiling several.
 MOST_LINES = 800
-FEWEST_LINES = 60
 
 ELSEWHERE = ("--install", "--version")  # flags of other programs
 
@@ -102,12 +98,6 @@ FILES = repository_files()
 NAMES = {path: path.relative_to(ROOT).as_posix() for path in FILES}
 
 
-def test_walk_without_git_finds_the_same_kinds_of_files() -> None:
-    walked = {path.relative_to(ROOT).as_posix() for path in _walk(ROOT)}
-    assert {"pyproject.toml", ".ci/run", "src/elastocal/cell/work_cell.py"} <= walked
-    assert not any("/__pycache__/" in name or name.startswith(".git/") for name in walked)
-
-
 def test_no_file_mentions_the_workplace_or_a_registry() -> None:
     found = []
     for path in FILES:
@@ -126,27 +116,6 @@ def test_no_dataset_of_others_is_part_of_the_repository() -> None:
     assert not copied
 
 
-def test_no_table_equals_one_of_the_datasets() -> None:
-    folder = os.environ.get("ELASTOCAL_DATASETS")
-    if not folder or not Path(folder).is_dir():
-        pytest.skip("ELASTOCAL_DATASETS names no folder")
-    theirs = {_digest(path) for path in Path(folder).rglob("*.csv")}
-    assert theirs
-    assert not [name for path, name in NAMES.items() if _digest(path) in theirs]
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def test_constraints_are_exact_versions_and_nothing_else() -> None:
-    lines = (ROOT / "constraints.txt").read_text().splitlines()
-    exact = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*==[0-9][A-Za-z0-9.!]*")
-    assert not [line for line in lines if not exact.fullmatch(line)]
-    names = [_canonical(line) for line in lines]
-    assert len(set(names)) == len(names)
-
-
 def test_constraints_cover_every_requirement() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     required = list(project["dependencies"])
@@ -162,24 +131,11 @@ def _canonical(requirement: str) -> str:
     return re.sub(r"[-_.]+", "-", name.group()).lower()
 
 
-def test_ci_run_is_executable() -> None:
-    assert os.access(ROOT / ".ci" / "run", os.X_OK)
-
-
 LENGTHS = {path: len(path.read_text().splitlines()) for path in SOURCE.rglob("*.py")}
 
 
 def test_no_source_file_holds_several_ideas() -> None:
     assert {NAMES[path]: n for path, n in LENGTHS.items() if n > MOST_LINES} == {}
-
-
-def test_no_source_file_is_a_crumb() -> None:
-    """Single effects aside: each is a template for one of the user's own."""
-    rooms = {p: n for p, n in LENGTHS.items() if not p.stem.startswith("__")}
-    crumbs = {
-        NAMES[p]: n for p, n in rooms.items() if n < FEWEST_LINES and p.parent.name != "effects"
-    }
-    assert crumbs == {}
 
 
 def test_no_file_name_stands_for_two_things() -> None:
@@ -262,14 +218,6 @@ def test_imports_point_down_the_layers() -> None:
     assert not up
 
 
-def test_no_circle_of_packages() -> None:
-    units: dict[str, set[str]] = {}
-    for module, targets in imports().items():
-        others = {unit(target) for target in targets} - {unit(module)}
-        units.setdefault(unit(module), set()).update(others)
-    assert _circle(units) == []
-
-
 def test_no_circle_of_modules() -> None:
     assert _circle(imports()) == []
 
@@ -306,14 +254,6 @@ def test_only_the_door_exports() -> None:
         if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
     }
     assert not told
-
-
-def test_modules_are_found_by_name_at_three_places_only() -> None:
-    """The public names, loaded when they are used; what results ask of the layers above; and the
-    modules of the user's own."""
-    by_name = {m for m, path in MODULES.items() if "import_module" in path.read_text()}
-    assert by_name == {"", "above", "plugin_loader"}
-    assert not [m for m, path in MODULES.items() if "__import__" in path.read_text()]
 
 
 def test_no_message_of_the_library_names_a_flag() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 import re
-import signal
 import subprocess
 import sys
 import unicodedata
@@ -15,10 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
-from typer.testing import CliRunner
 
 from elastocal.cli.app import reporting_errors
-from elastocal.cli.main import app
 from elastocal.screen import SHARE, complain, progress_line, safe_console, say
 from elastocal.text import printable
 
@@ -54,12 +51,6 @@ def test_no_table_line_or_message_obeys_a_name(name):
     assert harmless(told.replace("\x1b[0m", "").replace("\x1b[22m", ""))
 
 
-def test_names_are_not_taken_as_markup():
-    screen = safe_console(file=io.StringIO(), width=200)
-    screen.print("a [red]name[/red] [/bold] :smile:")
-    assert "a [red]name[/red] [/bold] :smile:" in screen.file.getvalue()
-
-
 def test_a_message_is_one_line(capsys):
     complain(f"a\nb{TITLE}\r\n{MARK}")
     assert capsys.readouterr().err == "elastocal: a b\\x1b]0;owned\\x07 \\u202egpj.exe\n"
@@ -72,12 +63,6 @@ def test_streams_without_the_letters_spell_them_out():
     environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment)
     assert done.stdout == b"sigma <= 3 um, 20 deg, \\xe9, \\u202e\n"
-
-
-def test_usage_errors_are_escaped_too():
-    for arguments in (["identify", "a", "b", f"--{TITLE}"], [f"x{MARK}"], ["study", ".", TITLE]):
-        found = CliRunner().invoke(app, arguments)
-        assert found.exit_code == 2 and harmless(found.output) and found.output
 
 
 def numbers_of_a_library():
@@ -124,26 +109,6 @@ def test_warnings_of_numpy_do_not_reach_the_user(recwarn):
 
     reporting_errors(lambda: np.array([1e300]) * np.array([1e300]))()
     assert not list(recwarn)
-
-
-def test_an_interrupt_that_a_library_swallows_still_ends_with_one_line():
-    program = """
-import signal, sys
-from elastocal.screen import noting_interrupts
-from elastocal.cli.app import command
-from elastocal.cli.main import app
-signal.signal(signal.SIGINT, signal.default_int_handler)
-def library():
-    try:
-        signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        raise ImportError("a module is half loaded")
-command("attacked")(lambda: library())
-with noting_interrupts():
-    app(["attacked"])
-"""
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGINT, "elastocal: interrupted\n")
 
 
 # What stands here is run as a command; it is interrupted in a place that cannot raise.

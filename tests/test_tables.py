@@ -6,7 +6,6 @@ import csv
 import io
 import math
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -50,22 +49,6 @@ def test_cells_may_be_empty_where_the_column_may_be_absent_and_only_there():
         read("x_m,y_m,high_N\n1,,3\n")
 
 
-@pytest.mark.parametrize(
-    ("header", "message"),
-    [
-        ("x_mm,y_mm,x_m", "columns x_mm and x_m say the same; keep one"),
-        ("x_mm,y_m", "columns x_mm and y_m mix units; give all places in one unit"),
-        ("x_mm", "x_mm without y_mm; the table needs all columns of the places$"),
-        ("low_N", "the columns x_mm,y_mm are missing, which this table needs; found low_N"),
-        ("x,y_mm", "column 'x' has no unit; write x_mm or x_m"),
-        ("x_cm,y_mm", "the unit cm is not taken here; write x_mm or x_m"),
-    ],
-)
-def test_what_is_wrong_with_a_header_is_told(header, message):
-    with pytest.raises(InputError, match=f"^t.csv: .*{message}"):
-        read(f"{header}\n1,2,3\n")
-
-
 CELL = st.text(st.characters(exclude_categories=("Cc", "Cs")), max_size=5)
 
 
@@ -75,9 +58,3 @@ def test_what_is_written_is_csv_whatever_the_cells(rows):
     assert text.startswith("# made by hand\na,b\n")
     found = list(csv.reader(io.StringIO(text, newline=""), strict=True))[2:]
     assert found == [[cell_text(cell) for cell in row] for row in rows]
-
-
-def test_a_rule_that_a_cell_breaks_is_told_with_its_place():
-    table = read("x_m,y_m\n1,2\n3,4\n")
-    with pytest.raises(InputError, match=r"^t.csv, line 3, column y_m: too far; found 4; correct"):
-        table.check("place", np.array([[True, True], [True, False]]), "too far")
