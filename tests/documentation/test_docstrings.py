@@ -83,17 +83,6 @@ def test_every_argument_is_explained(name):
         assert argument == "self" or parameter.annotation is not inspect.Parameter.empty
 
 
-def test_no_example_of_a_public_class_is_left_out():
-    own = {
-        f"{cls.__name__}.{name}"
-        for cls in (getattr(ec, name) for name in ec.__all__) if inspect.isclass(cls)
-        for name, value in vars(cls).items()
-        if callable(value) or isinstance(value, classmethod | property)
-        if ">>>" in (value.__doc__ or "")
-    }  # fmt: skip
-    assert own - {"Cell.read"} <= set(LISTED)  # which is read_cell
-
-
 @pytest.mark.parametrize(
     "name",
     [

@@ -123,8 +123,3 @@ def test_every_key_of_what_is_done_with_a_result_is_on_the_page(
     done = CliRunner().invoke(app, [*command.split(), "--json", "--quiet"])
     assert done.exit_code == 0, done.output
     assert not missing(keys(json.loads(done.stdout)), section(heading))
-
-
-def test_a_key_that_the_page_lacks_is_noticed():
-    """Guard of the guard."""
-    assert missing(["schema", "no_such_key"], section("Result of `identify`")) == ["no_such_key"]

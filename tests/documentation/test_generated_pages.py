@@ -2,7 +2,6 @@
 
 import re
 
-import cell_keys_page
 import commands_page
 import criteria_page
 import effects_page
@@ -59,13 +58,6 @@ def test_every_verb_and_option_is_on_the_page():
         for parameter in command.params:
             shown = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name
             assert f"`{shown.upper()}`" in part or f"`{shown}`" in part, f"{name}: {shown}"
-
-
-def test_every_table_of_the_cell_file_is_on_the_page():
-    page = cell_keys_page.page()
-    for head in ("[robot]", "[model.nominal.gravity_compensator]", "[[design.test_pose]]"):
-        assert f"## `{head}`" in page
-    assert "| `urdf` |" in page and "| `workspace` |" in page
 
 
 def test_the_measured_pages_are_what_the_studies_wrote():

@@ -48,10 +48,3 @@ def test_the_picture_shows_the_imports_of_today(uses, scheme):
     picture = (ROOT / "docs" / "images" / f"house_{scheme}.svg").read_text(encoding="utf-8")
     arrows = {f"{room} uses {one}" for room, direct in uses.items() for one in direct}
     assert set(re.findall(r'id="(\w+_uses_\w+)"', picture)) == {a.replace(" ", "_") for a in arrows}
-
-
-def test_modules_that_the_page_names_are_there():
-    named = re.findall(r"`(\w+/[\w/]+\.py)`", PAGE.replace("`docs/figures/house.py`", ""))
-    assert len(named) >= 8
-    for name in named:
-        assert (ROOT / "src" / "elastocal" / name).is_file(), name

@@ -103,7 +103,3 @@ def test_notebooks_are_of_format_4_without_outputs_and_with_text(name):
         if cell["cell_type"] == "code":
             assert cell["outputs"] == [] and cell["execution_count"] is None
     assert cells(name, "markdown")[0].startswith("# ")
-
-
-def test_there_is_a_notebook_for_each_of_the_three_questions():
-    assert NOTEBOOKS == ["design", "diagnose", "identify"]

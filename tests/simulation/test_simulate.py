@@ -18,7 +18,7 @@ from elastocal.cell.arm_description import (
 from elastocal.errors import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, position_covariance
-from elastocal.simulation import draw_errors, expand_plan, simulate, values_from
+from elastocal.simulation import draw_errors, expand_plan, simulate
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 5e-5])))
 POLAR = Tracker(np.array([3.0, 0.5, 1.0]), PolarNoise(2e-6, 5e-6, 1e-5, 3e-5))
@@ -48,20 +48,6 @@ def test_without_noise_the_readings_are_the_models_prediction():
     assert np.array_equal(simulate(model, plan, truth, 0).position, table.position)
     exact = simulate(model_with(AXIS), plan, truth, 0, noise=False)
     assert np.array_equal(exact.position, table.position)
-
-
-def test_the_same_seed_gives_the_same_readings():
-    model = model_with(AXIS)
-    plan = plan_of(model)
-    a, b, c = (simulate(model, plan, model.nominal, s) for s in (5, 5, 6))
-    assert np.array_equal(a.position, b.position)
-    assert not np.array_equal(a.position, c.position)
-    generator = simulate(model, plan, model.nominal, np.random.default_rng(5))
-    assert np.array_equal(a.position, generator.position)
-    # one generator goes on
-    rng = np.random.default_rng(5)
-    first, second = (simulate(model, plan, model.nominal, rng).position for _ in range(2))
-    assert not np.array_equal(first, second)
 
 
 @pytest.mark.parametrize("tracker", [AXIS, POLAR], ids=["axis", "polar"])
@@ -100,21 +86,6 @@ def test_deflections_are_loaded_minus_unloaded_readings():
 
 
 # --- values ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("chosen", "message"),
-    [
-        ({"link2.dxx": 1.0}, r"no parameter 'link2\.dxx' \(did you mean 'link2\.dx'\?\)"),
-        ({"joint2.ofset": 1.0}, r"no parameter 'joint2\.ofset' \(did you mean 'joint2\.offset'"),
-        ({"zzzzzzzzz": 1.0}, r"no parameter 'zzzzzzzzz'; it has: base\.x, base\.y, .*marker:M1\.z"),
-        ({"base.x": float("nan")}, r"'base\.x' must be a finite number, found nan"),
-        ({"base.x": float("inf")}, r"'base\.x' must be a finite number, found inf"),
-    ],
-)
-def test_wrong_values_are_refused(chosen, message):
-    with pytest.raises(InputError, match=message):
-        values_from(model_with(), chosen)
 
 
 def test_drawn_errors_have_the_typical_sizes():
@@ -157,16 +128,6 @@ def test_an_arm_that_buckles_is_refused_with_its_line():
         simulate(model, plan, model.nominal, 0)
 
 
-def test_distances_without_equilibrium_are_refused_with_their_line():
-    nominal = Nominal(joint_compliance=(1e-3,) * 6)
-    cell = cell_of(("joint_compliance",), observe="distance", nominal=nominal)
-    model = Model.assembled(kr270_chain(), cell)
-    plan = table_at(random_poses(model.chain, 8, 0), [[0, 0, 0], [0, 0, -20000.0]])
-    with pytest.raises(Exception, match=r"table\.csv, line \d+: no static equilibrium") as caught:
-        simulate(model, plan, model.nominal, 0)
-    assert caught.value.exit_code == 2
-
-
 def test_a_drift_is_correlated_in_time_and_the_table_says_when():
     model = model_with(noise=Unsteadiness(drift=1e-4, lasting=60.0))
     plan, truth = plan_of(model), true_values(model_with(), np.random.default_rng(0))
@@ -197,18 +158,6 @@ def test_tails_have_the_stated_standard_deviation_and_many_far_readings():
     assert found[1] > 10 * max(found[0], 1e-4)
     with pytest.raises(InputError, match=r"noise\.tails is 2\.0: .* take a number > 2"):
         Unsteadiness(tails=2.0)
-
-
-def test_a_load_on_top_of_the_plans_own_forces_is_refused():
-    plan = table_at(np.zeros((2, 3)), [[0, 0, -50.0]])
-    with pytest.raises(InputError, match=r"table\.csv: the plan has forces of its own"):
-        expand_plan(plan, ("M1",), load=np.array([0.0, 0.0, -100.0]))
-
-
-def test_an_unknown_marker_is_refused():
-    model = model_with(effects=("marker_position",), markers={"A": np.zeros(3), "B": np.ones(3)})
-    with pytest.raises(InputError, match=r"marker 'C' is not one of the cell's markers: A, B"):
-        simulate(model, plan_of(model, 3, markers=("A", "C")), model.nominal, 0)
 
 
 def test_as_many_numbers_as_joints_are_needed():

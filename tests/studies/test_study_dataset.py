@@ -90,21 +90,6 @@ def test_results_of_another_study_are_refused(folder, results, script, toml, tol
     pd.testing.assert_frame_equal(numbers(results), before)
 
 
-@pytest.mark.parametrize(
-    ("name", "told"), [("task_row", "cannot be a column"), ("label", "also a value of the tasks")]
-)
-def test_a_column_of_a_taken_name_is_refused(tmp_path, name, told):
-    folder = write_study(tmp_path / "study", SCRIPT, f'{TOML}{name} = ""\n')
-    with pytest.raises(InputError, match=f"columns.{name} .*{told}"):
-        run_study(folder, tmp_path / "r")
-
-
-def test_a_finished_study_needs_no_cluster(folder, results):
-    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    ending = run_prepared(read_study(folder), results, cluster="tcp://127.0.0.1:9")
-    assert (ending.before, ending.done) == (12, 12)
-
-
 def test_a_cluster_that_cannot_be_reached_costs_no_results(folder, results, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
     monkeypatch.setattr("elastocal.study_runs.ANSWER", 0.5)

@@ -79,14 +79,6 @@ def test_what_run_returns_is_checked(tmp_path, returned, told):
     assert told in failures(tmp_path / "r")[0]
 
 
-def test_a_task_may_return_no_row_and_is_done(tmp_path):
-    script = SCRIPT[: SCRIPT.index('    return [{"mean"')] + "    return []\n"
-    folder = write_study(tmp_path / "study", script)
-    assert run_study(folder, tmp_path / "r").done == 12
-    assert run_study(folder, tmp_path / "r").before == 12
-    assert len(read_results(tmp_path / "r")) == 0
-
-
 @pytest.mark.parametrize(
     ("deaths", "failed"), [pytest.param(1, 0, marks=pytest.mark.long), (10**6, 1)]
 )

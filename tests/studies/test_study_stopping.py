@@ -1,6 +1,5 @@
 """The first signal asks, the second or a time limit stops; what was done is kept."""
 
-import signal
 import sys
 
 import pytest
@@ -62,23 +61,6 @@ def test_a_task_that_swallows_the_second_signal_is_dropped(tmp_path):
 
 def test_a_task_that_takes_too_long_to_end_is_dropped(tmp_path):
     assert stopped(tmp_path, grace=0.1, wait=60) == [0, 1]
-
-
-def test_the_handlers_that_were_there_are_put_back():
-    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
-    with StudyStop():
-        assert signal.getsignal(signal.SIGINT) != before[0]
-    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
-
-
-def test_a_signal_that_was_ignored_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        with StudyStop() as stop:
-            signal.raise_signal(signal.SIGINT)
-            assert not stop.asked
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def test_a_dropped_task_runs_in_the_next_run(tmp_path):
