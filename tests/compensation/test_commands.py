@@ -61,6 +61,21 @@ POSTURES = np.radians(
 FARTHEST = 1e-7  # m and rad
 
 
+def arm_of(*effects, rng=None, scale=1.0, std=0.0, **how):
+    """The KR 270 with effects, off its nominal values where numbers are drawn from `rng`."""
+    arm = calibrated(kr270_chain(), kr270_cell(effects, **how), std=std)
+    return arm if rng is None else replace(arm, x=erring(arm.model, rng, scale))
+
+
+def commanded(arm, targets, point="M1", near=None):
+    return compensate(arm, targets, tool_point(arm.model.cell, point), near=near)
+
+
+def at_postures(load=DOWN, n=4):
+    """The places of the nominal arm's tool in the first n postures."""
+    return targets_at("targets.csv", None, None, "base", load, q=POSTURES[:n])
+
+
 @pytest.mark.parametrize(
     "effects",
     [
@@ -84,19 +99,16 @@ def test_every_effect_is_undone(effects):
         gravity_compensator=COMPENSATOR if "gravity_compensator" in names else None,
         settings=dict(found for name, found in moments.items() if name in names),
     )
-    cell = kr270_cell(
-        (*EVERYWHERE, *effects), nominal=nominal, link_gravity=True, gear_ripple_orders=(88.5,)
-    )
-    chain, rng = kr270_chain(), np.random.default_rng(5)
-    arm = calibrated(chain, cell)
-    arm = replace(arm, x=erring(arm.model, rng))
+    rng, n = np.random.default_rng(5), len(POSTURES)
+    how = {"nominal": nominal, "link_gravity": True, "gear_ripple_orders": (88.5,)}
+    arm = arm_of(*EVERYWHERE, *effects, rng=rng, **how)
     # Targets a few mm and mrad from where the nominal flange is.
-    T, n = nominal_flanges(chain, POSTURES), len(POSTURES)
+    T = nominal_flanges(arm.model.chain, POSTURES)
     turn = Rotation.from_rotvec(2e-3 * rng.normal(size=(n, 3))).as_matrix()
     position = T[:, :3, 3] + 2e-3 * rng.normal(size=(n, 3))
     targets = targets_at("targets", position, T[:, :3, :3] @ turn, "base", SLANTED, q=POSTURES)
     targets = replace(targets, table=replace(targets.table, **circumstances(n, 6, rng)))
-    found = compensate(arm, targets, tool_point(cell, "M1"))
+    found = commanded(arm, targets)
     assert found.status == ("reached",) * n
     miss, turned = tool_errors(arm, found)
     assert miss.max() < FARTHEST and turned.max() < FARTHEST
@@ -115,15 +127,13 @@ def test_random_arms_reach_what_they_can(seed, joints, oriented, load):
     """Targets of the nominal arm: reached within the limits, or said not to be."""
     rng = np.random.default_rng(seed)
     chain = random_chain(seed, joints)
-    nominal = Nominal(joint_compliance=(1e-5,) * joints)
-    cell = cell_of(SOME, nominal=nominal)
-    arm = calibrated(chain, cell)
+    arm = calibrated(chain, cell_of(SOME, nominal=Nominal(joint_compliance=(1e-5,) * joints)))
     arm = replace(arm, x=erring(arm.model, rng, 0.3))
     q = rng.uniform(-1.8, 1.8, (4, joints))
     T = nominal_flanges(chain, q)
     goal = targets_at("t", T[:, :3, 3], T[:, :3, :3] if oriented else None, "base",
                       load * np.array([0.3, 0.2, -1.0]))  # fmt: skip
-    found = compensate(arm, goal, tool_point(cell, "M1"), near=q[0])
+    found = commanded(arm, goal, near=q[0])
     good = found.reached
     miss, turn = tool_errors(arm, found)
     assert np.all(miss[good] < FARTHEST) and np.all(turn[good] < FARTHEST)
@@ -134,43 +144,34 @@ def test_random_arms_reach_what_they_can(seed, joints, oriented, load):
 
 
 def test_a_limit_is_kept_and_named():
-    chain, rng = kr270_chain(), np.random.default_rng(1)
-    high = POSTURES[0, 2]
+    chain, high = kr270_chain(), POSTURES[0, 2]
     cell = replace(kr270_cell(EVERYWHERE), limits={"joint3": (high - 0.5, high)})
     arm = calibrated(chain, cell)
-    arm = replace(arm, x=erring(arm.model, rng))
+    arm = replace(arm, x=erring(arm.model, np.random.default_rng(1)))
     # A posture further out, which needs joint 3 beyond its limit.
     wanted = nominal_flanges(chain, POSTURES[:1] + np.array([0, 0, 0.05, 0, 0, 0]))
-    point = tool_point(cell, "0,0,0.001")
     targets = targets_at("t", wanted[:, :3, 3], wanted[:, :3, :3], "base", DOWN, q=POSTURES[:1])
-    found = compensate(arm, targets, point)
+    found = commanded(arm, targets, "0,0,0.001")
     assert found.status == ("limit",)
     assert found.after[0] > 1e-3
     assert found.q[0, 2] <= high
     assert np.isnan(found.uncertainty.std[0])
     # With the rotation free, the other joints take over, and a sentence says so.
-    free = compensate(arm, replace(targets, rotation=None), point)
+    free = commanded(arm, replace(targets, rotation=None), "0,0,0.001")
     assert free.status == ("reached",)
     assert free.q[0, 2] <= high
     assert any("joint 3 stands at its limit" in told for told in free.warnings)
 
 
 def test_a_column_that_the_model_needs_is_asked_for():
-    cell = kr270_cell(("joint_offset", "hysteresis"))
-    arm = calibrated(kr270_chain(), cell)
-    targets = targets_at("targets.csv", None, None, "base", DOWN, q=POSTURES)
     with pytest.raises(InputError, match=r"targets\.csv: the model needs the column approach_1"):
-        compensate(arm, targets, tool_point(cell, "M1"))
+        commanded(arm_of("joint_offset", "hysteresis"), at_postures())
 
 
 def test_uncertainty_is_what_other_values_would_do():
     """Σ_p by differences of the model's own predictions, not by the derivative under test."""
-    chain, rng = kr270_chain(), np.random.default_rng(4)
-    cell = kr270_cell(EVERYWHERE)
-    arm = calibrated(chain, cell, std=0.01)
-    arm = replace(arm, x=erring(arm.model, rng))
-    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
-    found = compensate(arm, targets, tool_point(cell, "M1"))
+    arm = arm_of(*EVERYWHERE, rng=np.random.default_rng(4), std=0.01)
+    found = commanded(arm, at_postures())
     std = np.sqrt(np.diag(arm.covariance))
     rows = arm.model.table(found.q)
     rows = replace(rows, force=found.force, marker=0 * rows.configuration)
@@ -184,15 +185,13 @@ def test_uncertainty_is_what_other_values_would_do():
 
 
 def test_targets_far_from_what_was_measured_are_told_and_a_point_known_worse_is_the_reason():
-    cell = kr270_cell(("joint_offset",))
-    arm = calibrated(kr270_chain(), cell, std=0.01)
-    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    arm = arm_of("joint_offset", std=0.01)
 
     def told(most, configurations=30, point="M1"):
         shown = replace(arm, shown=ShownPoses(most, configurations))
-        return " ".join(compensate(shown, targets, tool_point(cell, point)).warnings)
+        return " ".join(commanded(shown, at_postures(), point).warnings)
 
-    std = compensate(arm, targets, tool_point(cell, "M1")).uncertainty.std
+    std = commanded(arm, at_postures()).uncertainty.std
     far = "outside the measured poses"
     assert far not in told(std.max())
     assert "line 1 and 3 more" in told(std.min() / 2) and far in told(std.min() / 2)
@@ -206,13 +205,12 @@ def test_targets_far_from_what_was_measured_are_told_and_a_point_known_worse_is_
 
 def test_what_no_marker_showed_is_told():
     """Tool and last link move the markers alike, so that a marker is known and the flange not."""
-    chain = kr270_chain()
-    cell = kr270_cell(("base_frame", "link_geometry:link6", "marker_position"))
-    arm = calibrated(chain, cell, std=0.01)
+    arm = arm_of("base_frame", "link_geometry:link6", "marker_position", std=0.01)
     kept = tuple(name for name in arm.model.names if not name.startswith("link6"))
     n = len(kept)
     # What link 6 does to the markers went into the estimates of their places.
-    markers, drawn = tuple(cell.tool.markers), random_table(arm.model, Conditions(), 60, 0)
+    markers = tuple(arm.model.cell.tool.markers)
+    drawn = random_table(arm.model, Conditions(), 60, 0)
     rows = replace(
         drawn.take(np.repeat(np.arange(60), len(markers))), marker_names=markers,
         marker=np.tile(np.arange(len(markers)), 60), position=np.zeros((60 * len(markers), 3)),
@@ -224,21 +222,15 @@ def test_what_no_marker_showed_is_told():
     typical = np.array([arm.model.parameters[k].typical for k in open_])
     left = OpenParameters(tuple(arm.model.names[k] for k in open_), mixing, typical)
     arm = replace(arm, determined=kept, covariance=1e-12 * np.eye(n), left=left)
-    targets = targets_at("t", None, None, "base", None, q=POSTURES)
-    marker = compensate(arm, targets, tool_point(cell, "M1"))
-    assert np.all(marker.uncertainty.unknown < 1e-9)
-    place = compensate(arm, targets, tool_point(cell, "0.1,0.2,0.3"))
+    assert np.all(commanded(arm, at_postures(None)).uncertainty.unknown < 1e-9)
+    place = commanded(arm, at_postures(None), "0.1,0.2,0.3")
     assert np.all(place.uncertainty.unknown > 1e-3)
     assert any("link6." in told and "`point`" in told for told in place.warnings)
 
 
 def test_too_soft_an_arm_has_no_equilibrium():
-    nominal = Nominal(joint_compliance=(1e-3,) * 6)
-    cell = kr270_cell(("joint_compliance",), nominal=nominal)
-    arm = calibrated(kr270_chain(), cell)
-    found = compensate(
-        arm, targets_at("t", None, None, "base", DOWN, q=POSTURES[:2]), tool_point(cell, "M1")
-    )
+    arm = arm_of("joint_compliance", nominal=Nominal(joint_compliance=(1e-3,) * 6))
+    found = commanded(arm, at_postures(n=2))
     assert set(found.status) == {"no equilibrium"}
     assert np.isnan(found.after).all()
 
@@ -258,12 +250,8 @@ def circle(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_a_closed_path_is_followed_in_one_posture() -> None:
-    chain = kr270_chain()
-    cell = kr270_cell(("joint_compliance",))
-    position, rotation = circle(2000)
-    arm = calibrated(chain, cell)
-    targets = targets_at("path", position, rotation, "base", DOWN)
-    found = compensate(arm, targets, tool_point(cell, "0.1,0,0.2"), near=HOME)
+    targets = targets_at("path", *circle(2000), "base", DOWN)
+    found = commanded(arm_of("joint_compliance"), targets, "0.1,0,0.2", HOME)
     assert found.reached.all()
     assert np.abs(np.diff(found.q, axis=0)).max() < 0.01
     assert np.abs(found.q[-1] - found.q[0]).max() < 1e-9
@@ -271,17 +259,11 @@ def test_a_closed_path_is_followed_in_one_posture() -> None:
 
 
 def test_given_joints_that_jump_are_told() -> None:
-    chain = kr270_chain()
-    cell = kr270_cell(("joint_compliance",))
-    position, rotation = circle(40)
-    arm = calibrated(chain, cell)
-    point = tool_point(cell, "0.1,0,0.2")
-    targets = targets_at("path", position, rotation, "base", DOWN)
-    smooth = compensate(arm, targets, point, near=HOME)
-    q = smooth.nominal.copy()
+    arm, targets = arm_of("joint_compliance"), targets_at("path", *circle(40), "base", DOWN)
+    q = commanded(arm, targets, "0.1,0,0.2", HOME).nominal.copy()
     # The other posture of the wrist: q4 + 180°, −q5, q6 + 180° is the same pose.
     q[20:] = q[20:] * [1, 1, 1, 1, -1, 1] + np.array([0, 0, 0, np.pi, 0, -np.pi])
-    found = compensate(arm, replace(targets, q=q), point)
+    found = commanded(arm, replace(targets, q=q), "0.1,0,0.2")
     assert found.reached.all()
     told = [text for text in found.warnings if "solution branch changes" in text]
     assert len(told) == 1 and told[0].startswith("path, line 21:")
@@ -309,10 +291,9 @@ HIGH = np.radians([30, -70, 100, 20, 80, 20])
 
 
 def arm_and_point():
-    cell = kr270_cell(("joint_offset", "link_geometry", "joint_compliance"))
-    arm = calibrated(kr270_chain(), cell)
-    arm = replace(arm, x=erring(arm.model, np.random.default_rng(8), 0.5))
-    return arm, tool_point(cell, "M1")
+    effects = ("joint_offset", "link_geometry", "joint_compliance")
+    arm = arm_of(*effects, rng=np.random.default_rng(8), scale=0.5)
+    return arm, tool_point(arm.model.cell, "M1")
 
 
 def joint_box(counts) -> list[np.ndarray]:
