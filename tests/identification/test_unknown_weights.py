@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from model.effects.stick import model, stick
 from support.calibration import measured, table_at
 from support.cells import kr270_cell, kr270_chain, random_table
+from support.stick import model, stick
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify

@@ -1,6 +1,8 @@
-"""Evaluation of arrays is what CasADi computes: operations, chunks, shapes, complex steps."""
+"""Evaluation of arrays is what CasADi computes: operations, chunks, engines, threads."""
 
 from __future__ import annotations
+
+import threading
 
 import casadi as ca
 import numpy as np
@@ -9,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.expressions import X, Y, built
 
-from elastocal.model.evaluate import CHUNK, BatchFunction
+from elastocal.errors import InputError
+from elastocal.model.evaluate import CHUNK, FEW, BatchFunction, chosen_backend
 
 UNARY = {
     "neg": -X, "exp": ca.exp(X), "log": ca.log(X), "sqrt": ca.sqrt(X), "sq": X * X,
@@ -132,39 +135,114 @@ def test_chunk_boundaries(chunk: int, beyond: int | None) -> None:
         np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("backend", ["auto", "numpy"])
-@pytest.mark.parametrize("given_as", [
-    lambda q: np.asfortranarray(q), lambda q: np.hstack([q, q])[:, :3],
-    lambda q: np.repeat(q, 2, axis=0)[::2], lambda q: q[::-1][::-1], lambda q: q.astype(">f8"),
-    lambda q: np.frombuffer(b"x" + q.tobytes(), dtype=np.uint8)[1:].view(float).reshape(-1, 3),
-    lambda q: np.round(10 * q).astype(np.int32),
+# --- engines
+
+PAIR = ca.SX.sym("x", 2)
+ROWS = np.linspace(0.1, 2.0, 20).reshape(10, 2)
+MANY = np.linspace(0.1, 2.0, 2 * FEW + 2).reshape(FEW + 1, 2)  # too many for CasADi row by row
+
+
+@pytest.fixture(autouse=True)
+def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No choice of another test."""
+    monkeypatch.delenv("ELASTOCAL_BACKEND", raising=False)
+
+
+def by_numpy(f: BatchFunction) -> bool:
+    """Whether numpy's instructions were asked for."""
+    return "_by_numpy" in vars(f)
+
+
+def function(backend: str | None = None) -> BatchFunction:
+    return BatchFunction(
+        [PAIR], [ca.vertcat(ca.sin(PAIR[0]) * PAIR[1], PAIR[0] / PAIR[1])], backend
+    )
+
+
+def test_argument_before_environment_before_auto(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert chosen_backend() == "auto"
+    monkeypatch.setenv("ELASTOCAL_BACKEND", "numpy")
+    assert chosen_backend() == "numpy"
+    assert chosen_backend("auto") == "auto"
+
+
+def test_an_unknown_name_is_refused_with_the_nearest(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(InputError, match=r"backend: unknown backend 'nunpy'.*'numpy'"):
+        function("nunpy")
+    with pytest.raises(InputError, match="unknown backend 'fortran'; valid: auto, numpy"):
+        function("fortran")
+    monkeypatch.setenv("ELASTOCAL_BACKEND", "compiled")
+    with pytest.raises(InputError, match=r"ELASTOCAL_BACKEND in the environment: .*take auto"):
+        function()(ROWS)
+
+
+def test_few_rows_are_evaluated_by_casadi_as_by_numpy() -> None:
+    """Sparse outputs, what is the same in all rows, no row at all; and no more of them than pay."""
+    p = ca.SX.sym("p", 2)
+    sparse = ca.diagcat(
+        PAIR[0] * p[1], ca.atan2(PAIR[1], p[0]), ca.if_else(PAIR[0] > 1, PAIR[1] ** 3, 0)
+    )
+    few, plain = (BatchFunction([PAIR, p], [sparse, PAIR + p], name) for name in (None, "numpy"))
+    for n in (0, 1, 10):
+        for found, expected in zip(*(f(ROWS[:n], ROWS[3]) for f in (few, plain)), strict=True):
+            np.testing.assert_array_equal(found, expected)
+    few(MANY[:-1], ROWS[3])
+    assert by_numpy(plain) and not by_numpy(few)
+    few(MANY, ROWS[3])
+    assert by_numpy(few)
+
+
+def test_complex_numbers_are_evaluated_by_numpy() -> None:
+    auto = function()
+    found = auto(ROWS + 1e-30j)[0]
+    assert by_numpy(auto)
+    expected = np.cos(ROWS[:, 0]) * ROWS[:, 1] + np.sin(ROWS[:, 0])
+    np.testing.assert_allclose(found[:, 0, 0].imag / 1e-30, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("wrong", [
+    (), (ROWS, ROWS), (ROWS[:, :1],), (ROWS[None],), (np.ones(3),), (np.float64(1),),
 ])  # fmt: skip
-def test_arrays_of_any_layout(given_as, backend: str) -> None:
-    q = given_as(np.random.default_rng(1).normal(size=(9, 3)))
-    function = BatchFunction(*three_outputs(), backend)
-    plain = np.array(q.tolist(), dtype=float)
-    for found, exact in zip(function(q, np.ones(2)), function(plain, np.ones(2)), strict=True):
-        np.testing.assert_array_equal(found, exact)
+def test_arrays_of_other_shapes_are_refused(wrong: tuple) -> None:
+    for backend in ("auto", "numpy"):
+        with pytest.raises(ValueError, match="per row"):
+            function(backend)(*wrong)
 
 
-# --- complex steps -------------------------------------------------------------------------
-
-ANALYTIC = ("neg", "exp", "log", "sqrt", "sq", "sin", "cos", "tan", "asin", "acos", "atan",
-            "sinh", "cosh", "tanh", "inv", "log1p", "expm1", "twice", "identity",
-            "power 3", "power 2.5")  # fmt: skip
-PIECEWISE = {"fmax": ca.fmax(X, 1.0), "fmin": ca.fmin(X, 1.0), "lt": (X < 1) * X,
-             "if_else_zero": ca.if_else(X > 1, X * X, 0)}  # fmt: skip
+# --- threads
 
 
-def assert_complex_step(expression: ca.SX, at: np.ndarray) -> None:
-    step = 1e-30
-    found = BatchFunction([X], [expression], "numpy")(at + 1j * step)[0]
-    np.testing.assert_allclose(found.real, casadi_values([X], expression, at), rtol=4e-15)
-    slope = casadi_values([X], ca.jacobian(expression, X), at)
-    np.testing.assert_allclose(found.imag / step, slope, rtol=4e-14)  # 1 − tanh² cancels
+def mixed() -> tuple[list[ca.SX], list[ca.SX]]:
+    """Operations whose numpy versions treat the ends of an array by other code than its middle."""
+    x, p = ca.SX.sym("x", 3), ca.SX.sym("p")
+    y = ca.vertcat(ca.sin(x[0] * p), ca.exp(x[1]), ca.atan2(x[2], x[0]), (1 + x[1] ** 2) ** 2.5)
+    return [x, p], [y, ca.jacobian(y, x)]
 
 
-@pytest.mark.parametrize("name", [*ANALYTIC, *PIECEWISE])
-def test_complex_step_is_the_derivative(name: str) -> None:
-    expression = UNARY[name] if name in ANALYTIC else PIECEWISE[name]
-    assert_complex_step(expression, np.array([[0.3], [0.9], [1.7], [3.1]]))
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = np.abs(np.random.default_rng(0).normal(size=(3 * CHUNK + 17, 3)))
+    found = {}
+    for threads in (1, 3):
+        monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
+        function = BatchFunction(*mixed(), "numpy")
+        found[threads] = function(x, np.array([1.7]))
+    for one, three in zip(found[1], found[3], strict=True):
+        assert one.tobytes() == three.tobytes()
+
+
+def test_one_tape_may_be_called_by_several_threads() -> None:
+    function, x = BatchFunction(*mixed(), "numpy"), np.random.default_rng(1).uniform(0, 1, (500, 3))
+    expected = function(x, np.ones(1))
+    found: list = [None] * 8
+
+    def call(k: int) -> None:
+        found[k] = function(x, np.ones(1))
+
+    callers = [threading.Thread(target=call, args=(k,)) for k in range(len(found))]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    for results in found:
+        for one, other in zip(results, expected, strict=True):
+            np.testing.assert_array_equal(one, other)

@@ -94,10 +94,3 @@ def test_a_result_of_another_kind_or_model_is_refused(
     path.write_text(json.dumps(result))
     with pytest.raises(InputError, match=told):
         read_calibrated(demo.cell, path)
-
-
-def test_text_that_is_no_json_is_refused(demo: Demo, tmp_path: Path) -> None:
-    path = tmp_path / "result.json"
-    path.write_text("{")
-    with pytest.raises(InputError, match=r"result\.json, line 1: not JSON"):
-        read_calibrated(demo.cell, path)

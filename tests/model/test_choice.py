@@ -3,79 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.cells import (
-    kr270_cell,
-    kr270_chain,
-    random_table,
-)
+from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_table
+from support.registered import forgotten, write_example
 
 from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.model.effects.catalogue import CATALOGUE, choose_effects
+from elastocal.model.arm import Arm
+from elastocal.model.effects.base import DrivenEffect, Effect, JointMotion, Symbols
+from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.manipulator import Model
-
-NAMES = sorted(set(CATALOGUE) - {"payload", "link_gravity"})
-
-
-def chosen(*effects: str, **model) -> list[tuple[str, str]]:
-    cell = kr270_cell(effects, **model)
-    return [(effect.name, place) for effect, place in choose_effects(kr270_chain(), cell)]
+from elastocal.plugin_loader import load_plugins
 
 
 def model_of(*effects: str, **model) -> Model:
     return Model.assembled(kr270_chain(), kr270_cell(effects, **model))
-
-
-# --- names ---------------------------------------------------------------------------------
-
-
-def test_an_unknown_effect_meets_its_nearest() -> None:
-    with pytest.raises(InputError) as caught:
-        chosen("joint_offset", "joint_complience")
-    text = str(caught.value)
-    assert "unknown effect 'joint_complience'" in text and "mean 'joint_compliance'?" in text
-    assert "[model] effects" in text and "kr270" in text
-    assert all(name in text for name in CATALOGUE)
-
-
-@pytest.mark.parametrize(
-    "wrong, right",
-    [
-        ("joint_compliance:jiont2", "joint2"),
-        ("marker_position:marker:M4", "marker:M"),
-    ],
-)
-def test_an_unknown_place_meets_its_nearest(wrong: str, right: str) -> None:
-    name, _, place = wrong.partition(":")
-    with pytest.raises(InputError) as caught:
-        chosen(wrong)
-    text = str(caught.value)
-    assert f"unknown place of {name} '{place}'" in text
-    assert f"did you mean '{right}" in text
-
-
-# --- order and what is always there --------------------------------------------------------
-
-
-@given(order=st.permutations(NAMES))
-@settings(deadline=None)
-def test_the_users_order_does_not_matter(order: list[str]) -> None:
-    assert chosen(*order) == chosen(*NAMES)
-    names = list(dict.fromkeys(effect for effect, _ in chosen(*order)))
-    assert names == [name for name in CATALOGUE if name in names]
-
-
-@pytest.mark.parametrize("effects", [(), ("joint_offset",), ("payload",), ("payload:load",)])
-def test_the_tables_force_always_acts(effects: tuple[str, ...]) -> None:
-    assert chosen(*effects).count(("payload", "load")) == 1
-    assert model_of(*effects).names == model_of(*(e for e in effects if "pay" not in e)).names
 
 
 # --- weights -------------------------------------------------------------------------------
@@ -124,14 +72,201 @@ def test_compliances_must_be_one_per_joint() -> None:
         model_of("joint_compliance", nominal=nominal)
 
 
-def half_turn(*axis: float) -> np.ndarray:
-    """2 n nᵀ − 1, symmetric to the last bit."""
-    return 2 * np.outer(axis, axis) - np.eye(3)
+# --- settings
 
 
-@pytest.mark.parametrize("R", [half_turn(1, 0, 0), half_turn(0.6, 0, 0.8)], ids=["x", "oblique"])
-def test_the_base_may_be_half_turned(R: np.ndarray) -> None:
-    """An arm that faces its tracker, or hangs from the ceiling."""
-    nominal = model_of("base_frame", nominal=Nominal(base_rotation=R)).nominal
-    found = Rotation.from_rotvec(nominal[3:]).as_matrix()
-    np.testing.assert_allclose(found, R, rtol=0, atol=1e-7)
+def model_with(settings: dict[str, dict[str, float]], *effects: str, **spec) -> Model:
+    return Model.assembled(
+        kr270_chain(), kr270_cell(effects, nominal=Nominal(settings=settings), **spec)
+    )
+
+
+@pytest.mark.parametrize(
+    "effect, key",
+    [
+        ("encoder_jump:joint2", "joint2.* jump_time_s"),
+        ("frame_jump", "tracker.* jump_time_s"),
+        ("gear_ripple:joint3", "joint3.* ripple_order"),
+    ],
+)
+def test_what_nobody_knows_beforehand_must_be_given(effect: str, key: str) -> None:
+    with pytest.raises(InputError, match=f"nominal.settings.{key} is missing"):
+        model_with({}, effect)
+
+
+@pytest.mark.parametrize(
+    "effect, place, key, value",
+    [
+        ("joint_drift:joint2", "joint2", "time_constant_s", 59.0),
+        ("gear_ripple:joint1", "joint1", "ripple_order", 1001.0),
+        ("encoder_jump:joint1", "joint1", "jump_time_s", np.nan),
+    ],
+)
+def test_values_outside_their_range_are_refused(effect, place, key, value) -> None:
+    with pytest.raises(InputError, match=f"{place}.* {key} takes"):
+        model_with({place: {key: value}}, effect)
+
+
+@pytest.mark.parametrize(
+    "settings, parts",
+    [
+        ({"joint2": {"jump_times": 3.0}}, ["setting of joint2 'jump_times'", "'jump_time_s'"]),
+        ({"join2": {"jump_time_s": 3.0}}, ["unknown place 'join2'", "did you mean 'joint"]),
+        ({"base": {"jump_time_s": 3.0}}, ["setting of base 'jump_time_s'", "time_constant_s"]),
+    ],
+)
+def test_a_setting_that_no_effect_has_meets_its_nearest(settings, parts) -> None:
+    with pytest.raises(InputError) as caught:
+        model_with(settings, "joint_offset")
+    text = str(caught.value)
+    assert "[model] nominal.settings" in text
+    assert all(part in text for part in parts)
+
+
+@pytest.mark.parametrize("name", [n for n, e in CATALOGUE.items() if isinstance(e, DrivenEffect)])
+def test_what_drives_an_effect_is_linear_in_its_parameters(name: str) -> None:
+    """One motion of the entry per place that it enters at, D(row) p."""
+    effect, chain = CATALOGUE[name], kr270_chain()
+    # Lines and smooth functions have no parameters where no setting asks for any.
+    asked = {"order_1": 8.0, "order_sd_1": 0.1, "field_joint2_size": 1e-4, "field_time_size": 1e-4}
+    places = effect.places(chain, kr270_cell())
+    # Upright, no weight would turn joint 1.
+    tilted = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    settings = dict.fromkeys(places, asked)
+    cell = kr270_cell(nominal=Nominal(base_rotation=tilted, settings=settings))
+    for place in places:
+        arm = Arm(chain, cell)
+        keys = [s.key for s in effect.parameters(place, chain, cell)]
+        p = {key: ca.SX.sym(key) for key in keys}
+        constants = {s.key: ca.SX(7.0) for s in effect.settings(place, chain, cell)}
+        u = effect.drive(arm, place, p | constants)
+        vector = ca.vertcat(*p.values())
+        assert u.shape == (effect.entry_at(place).size * len(effect.entered_at(place, chain)), 1)
+        D = ca.jacobian(u, vector)
+        assert not ca.depends_on(D, vector)
+        assert ca.substitute(u, vector, 0 * vector).is_zero()
+        assert D.nnz() >= len(keys)
+
+
+def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
+    """Of those that diagnosis adds to a model that explains everything else."""
+    chain = kr270_chain()
+    settings = {f"joint{i}": {"jump_time_s": 3e3, "ripple_order": 8.0} for i in range(1, 7)}
+    settings |= {"tracker": {"jump_time_s": 3e3}}
+    settings |= {f"marker:{name}": {"slip_time_s": 3e3} for name in MARKERS}
+    nominal = Nominal(COMPLIANCE, settings=settings)
+    table = random_table(chain, 4, seed=9)
+    plain = Model.assembled(
+        chain, kr270_cell(["joint_compliance"], nominal=nominal, link_gravity=True)
+    )
+    names = set(CATALOGUE) - {"joint_compliance"}
+    all_of_it = Model.assembled(
+        chain,
+        kr270_cell(["joint_compliance", *names], nominal=nominal, link_gravity=True),
+    )
+    difference = all_of_it.predict(table) - plain.predict(table)
+    assert np.abs(difference).max() < 1e-14
+
+
+def sized(sizes: dict[str, dict[str, float]], *effects: str) -> Model:
+    return Model.assembled(kr270_chain(), kr270_cell(effects, nominal=Nominal(sizes=sizes)))
+
+
+@pytest.mark.parametrize(
+    "sizes, message",
+    [
+        ({"joint9": {"offset": 1.0}}, "nominal.sizes: unknown place 'joint9'"),
+        ({"joint2": {"ofset": 1.0}}, "unknown parameter of joint2 'ofset'"),
+        ({"joint2": {"curve_1": 1.0}}, "unknown parameter of joint2 'curve_1'"),
+    ],
+)
+def test_sizes_of_what_no_effect_has_are_refused(sizes, message) -> None:
+    with pytest.raises(InputError, match=message):
+        sized(sizes, "joint_offset")
+
+
+# --- traits, and effects of one's own
+
+
+class Stranger(JointMotion):
+    """Nothing but what every effect must state."""
+
+    name = "stranger"
+
+
+@pytest.mark.parametrize("observe", ["position", "pose", "distance"])
+def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> None:
+    cell = kr270_cell((), observe, link_gravity=True)
+    never = {n for n, e in CATALOGUE.items() if not e.may_be_missing(cell)}
+    only = {"marker_orientation": "pose", "distance_sensor": "distance"}
+    together = {  # judged with all other components of the gap
+        "joint_curve", "residual_field", "gear_spectrum", "gravity_sag", "link_weights",
+        "torque_coupling", "torque_tilt",
+    }  # fmt: skip
+    loads = {"payload", "link_gravity"}
+    assert never == loads | together | {n for n, o in only.items() if o != observe}
+    assert {n for n, e in CATALOGUE.items() if e.acts_unasked(cell)} == {"payload", "link_gravity"}
+    light = kr270_cell((), observe)
+    assert {n for n, e in CATALOGUE.items() if e.acts_unasked(light)} == {"payload"}
+
+
+def test_a_name_is_taken_once_but_by_the_same_class() -> None:
+    class Other(JointMotion):
+        name = "stranger"
+
+    with forgotten():
+        register(Stranger())
+        again = Stranger()
+        register(again)
+        assert CATALOGUE["stranger"] is again
+        with pytest.raises(InputError, match="there is an effect 'stranger' already"):
+            register(Other())
+
+
+class Unplaced(Effect):
+    name = "unplaced"
+    stage = "tool"
+
+    def read(self, arm: object, place: str, p: Symbols) -> None:  # type: ignore[override]
+        pass
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"name": "Big"}, "name takes lower-case letters"),
+        ({"stage": "gears"}, "stage takes transmission, geometry"),
+        ({"formats": ("urdf",)}, "formats takes rigid, elastic"),
+        (
+            {"needs": ("wind",)},
+            "needs takes time, .*, load, torque; found 'wind'",
+        ),
+    ],
+)
+def test_what_is_stated_wrongly_is_named(changes: dict[str, object], told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        register(type("Wrong", (Stranger,), changes)())
+
+
+def test_an_effect_without_places_is_refused() -> None:
+    with pytest.raises(InputError, match=r"Unplaced lacks places; it states where it can act"):
+        register(Unplaced())
+
+
+def test_the_example_of_the_page_is_one_more_effect(tmp_path: Path) -> None:
+    """It acts behind the last effect of its stage, and no other may have its parameters' names."""
+    with forgotten():
+        load_plugins(tmp_path / "cell.toml", [str(write_example(tmp_path, "three_lobes.py"))])
+        names = list(CATALOGUE)
+        k = names.index("three_lobes")
+        assert names[k - 1] == "hysteresis"
+        assert not any(CATALOGUE[name].stage == "transmission" for name in names[k + 1 :])
+        assert model_of("three_lobes:joint2").names == ("joint2.lobes_sin", "joint2.lobes_cos")
+
+        class Alike(type(CATALOGUE["three_lobes"])):  # type: ignore[misc]
+            name = "alike"
+
+        register(Alike())
+        told = r"three_lobes and alike both have a parameter 'joint2\.lobes_sin'"
+        with pytest.raises(InputError, match=told):
+            model_of("three_lobes:joint2", "alike")

@@ -6,8 +6,6 @@ arms, numpy for the gravity compensator's formulas.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -29,8 +27,6 @@ from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError
-from elastocal.model.chain import Chain, Joint, LinkMass
-from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
@@ -127,51 +123,6 @@ def test_markers_agree_with_mujoco() -> None:
     assert np.linalg.norm(bent, axis=-1).max() > 5e-3
 
 
-def test_bearings_and_base_agree_with_mujoco() -> None:
-    """Off-axis and base springs: MuJoCo gets a rigid joint for each axis they turn about."""
-    pytest.importorskip("mujoco")
-    model = kr270("joint_compliance", "off_axis_compliance", "base_compliance", link_gravity=True)
-    rng = np.random.default_rng(2)
-    across, tilt = 0.2 * K[:, None] * rng.uniform(0.5, 1.5, (6, 2)), np.array([3e-8, 5e-8])
-    values = {f"joint{i + 1}.compliance": K[i] for i in range(6)}
-    for axis, name in enumerate("xy"):
-        values[f"base.tilt_compliance_{name}"] = tilt[axis]
-        for i in range(6):
-            values[f"joint{i + 1}.off_axis_compliance_{name}"] = across[i, axis]
-    x = np.array([values[name] for name in model.names])
-
-    chain, compliance = with_bearings(kr270_chain(), K, across, tilt)
-    arm = MujocoArm(chain, compliance, LOAD_POINT, MARKERS, gravity=GRAVITY)
-    poses = kr270_poses(5)
-    ours = model.predict(table_of(poses, SLANTED), x).reshape(len(poses), -1, 3)
-    for q, predicted in zip(poses, ours, strict=True):
-        commanded = np.zeros(chain.n_joints)
-        commanded[[joint.name.startswith("moved") for joint in chain.joints]] = q
-        theirs = arm.markers(arm.equilibrium(commanded, SLANTED))
-        np.testing.assert_allclose(predicted, list(theirs.values()), rtol=0, atol=1e-6)
-    rigid = positions(kr270("joint_compliance", link_gravity=True), poses, SLANTED)
-    assert np.abs(ours - rigid).max() > 1e-4  # they do give way
-
-
-def with_bearings(chain: Chain, k: Array, across: Array, tilt: Array) -> tuple[Chain, Array]:
-    """Elastic joints before each moved one: about its own axis and across it; two at the base."""
-    weightless = LinkMass(0.0, np.zeros(3))
-    parts = [
-        (Joint(f"tilt{i}", "revolute", np.eye(4), np.eye(3)[i]), tilt[i], weightless)
-        for i in range(2)
-    ]
-    for i, joint in enumerate(chain.joints):
-        axes = (joint.axis, *transverse_axes(joint.axis))
-        for j, (axis, c) in enumerate(zip(axes, (k[i], *across[i]), strict=True)):
-            placement = joint.placement if j == 0 else np.eye(4)
-            spring = Joint(f"spring{i}{j}", "revolute", placement, axis)
-            parts.append((spring, c, weightless))
-        moved = replace(joint, name=f"moved{i}", placement=np.eye(4))
-        parts.append((moved, 0.0, chain.masses[i]))
-    joints, compliance, masses = zip(*parts, strict=True)
-    return Chain("bearings", joints, chain.flange_placement, masses), np.array(compliance)
-
-
 # --- the linear model of eq. (3) -----------------------------------------------------------
 
 
@@ -230,19 +181,3 @@ def test_a_load_without_equilibrium_is_nan_and_named() -> None:
         model.regressor(table)
     kept = model.regressor(table.take(~lost))
     assert np.isfinite(kept.B).all()
-
-
-def test_no_joint_deflects_by_a_turn() -> None:
-    """Newton's method wanders under absurd loads; where it ends is not a deflection."""
-    table = table_of(random_poses(kr270_chain(), 40, seed=1), np.array([0, 0, -1e7]), ("M1",))
-    theta = kr270(nominal=SOFT).deflection(table)
-    assert not np.any(np.abs(theta) > np.pi)
-
-
-def test_what_a_caller_does_to_deflections_changes_no_later_answer():
-    model, table = kr270(), table_of(np.zeros((2, 6)), np.array([0.0, 0.0, -2600.0]), ("M1",))
-    x = np.full(len(model.names), 1e-7)
-    first = model.deflection(table, x)
-    kept = first.copy()
-    first[:] = 1.0
-    assert np.array_equal(model.deflection(table, x), kept) and kept.any()

@@ -5,30 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.calibration import planar_chain
-from support.cells import kr270_cell, kr270_chain
 
-from elastocal.errors import InputError
-from elastocal.model.chain import Chain, finite_ranges, joint_limits, numbered
-
-
-def with_limits(**limits: tuple[float, float]):
-    return joint_limits(replace(kr270_cell(), limits=limits), kr270_chain())
-
-
-def test_a_joint_that_the_robot_lacks_is_named() -> None:
-    cell = replace(kr270_cell(), limits={"joint7": (0.0, 1.0)})
-    with pytest.raises(InputError, match=r"\[limits\] names joint7.* has 6 joints"):
-        numbered(cell, kr270_chain())
-
-
-def test_limits_beyond_the_robots_own_leave_no_range() -> None:
-    with pytest.raises(InputError, match="joint2 leaves no range"):
-        with_limits(joint2=(0.5, 1.0))
-
+from elastocal.model.chain import Chain, finite_ranges
 
 bound = st.none() | st.floats(-5, 5)
 

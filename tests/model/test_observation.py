@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from support.cells import kr270_cell, kr270_chain, random_table
@@ -11,7 +9,7 @@ from support.cells import kr270_cell, kr270_chain, random_table
 from elastocal.errors import InputError
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import SIZE, observe, pair_loaded_with_unloaded, subset
+from elastocal.model.observations import SIZE, pair_loaded_with_unloaded, subset
 
 DOWN = -2600.0
 
@@ -35,15 +33,6 @@ def readings(*rows: tuple[int, int, str, float]) -> Measurements:
     )
 
 
-def subtracted(table: Measurements) -> dict[int, dict[int, float]]:
-    """Loaded row → {row: weight} of everything that enters its deflection."""
-    lead, combine = pair_loaded_with_unloaded(table)
-    found = {}
-    for i, row in zip(lead, combine.toarray(), strict=True):
-        found[int(i)] = {int(j): float(row[j]) for j in np.flatnonzero(row)}
-    return found
-
-
 # --- pairing -------------------------------------------------------------------------------
 
 
@@ -55,25 +44,6 @@ def test_a_missing_partner_is_named(unloaded: tuple) -> None:
     wanted = r"data\.csv, line 5: .* configuration pose 2, marker M1 has no unloaded reading"
     with pytest.raises(InputError, match=wanted):
         pair_loaded_with_unloaded(table)
-
-
-# --- observed values -----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "kind, column, named",
-    [
-        ("position", "position", "x_mm, y_mm, z_mm"),
-        ("deflection", "position", "x_mm, y_mm, z_mm"),
-        ("pose", "position", "x_mm, y_mm, z_mm"),
-        ("pose", "rotation", "rx_deg"),
-        ("distance", "distance", "distance_mm"),
-    ],
-)
-def test_a_missing_column_is_named(kind: str, column: str, named: str) -> None:
-    table = replace(random_table(kr270_chain(), 2, seed=0), **{column: None})
-    with pytest.raises(InputError, match=f"table: observe = '{kind}' needs the columns {named}"):
-        observe(table, kind)
 
 
 # --- predictions and B ---------------------------------------------------------------------
@@ -95,7 +65,8 @@ def shuffled(n: int = 4, seed: int = 2) -> Measurements:
 def test_predicted_deflections_are_differences_of_predicted_positions() -> None:
     at_position, at_deflection = models()
     table = shuffled()
-    pairs = subtracted(table)
+    lead, combine = pair_loaded_with_unloaded(table)
+    pairs = {int(i): np.flatnonzero(row) for i, row in zip(lead, combine.toarray(), strict=True)}
     positions = at_position.regressor(table)
     h = positions.prediction.reshape(len(table), 3)
     B = positions.B.reshape(len(table), 3, -1)

@@ -35,13 +35,6 @@ axes = directions.map(lambda v: v / np.linalg.norm(v))
 angles = st.floats(0, np.pi - 0.01) | st.sampled_from(NEAR_ZERO)
 
 
-@given(axis=axes, angle=st.floats(-2 * np.pi, 2 * np.pi) | st.sampled_from(NEAR_ZERO))
-@settings(deadline=None)
-def test_exp_is_scipys(axis: np.ndarray, angle: float) -> None:
-    expected = Rotation.from_rotvec(angle * axis).as_matrix()
-    np.testing.assert_allclose(exp(angle * axis), expected, rtol=0, atol=2e-15)
-
-
 @given(axis=axes, angle=angles)
 @settings(deadline=None)
 def test_log_is_scipys(axis: np.ndarray, angle: float) -> None:

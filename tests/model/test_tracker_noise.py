@@ -64,20 +64,6 @@ def test_the_tables_sigmas_come_first():
     assert [available_noise(bare, t) for t in (AXIS, polar, Tracker())] == ["axis", "polar", "none"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "tracker", "message"),
-    [
-        ("rows", AXIS, r"table\.csv has no sigma_… columns"),
-        ("axis", Tracker(noise=NOISE), r"the cell has no \[tracker\] sigma_um"),
-        ("polar", AXIS, r"the cell has no \[tracker\] range_um"),
-        ("polar", Tracker(), r"the cell has no \[tracker\] range_um"),
-    ],
-)
-def test_noise_that_is_not_stated_is_refused(kind, tracker, message):
-    with pytest.raises(InputError, match=message):
-        position_covariance(table([[1.0, 2.0, 3.0]]), tracker, kind)
-
-
 def test_a_marker_inside_the_tracker_is_refused():
     with pytest.raises(InputError, match="a marker stands at the tracker's own position"):
         position_covariance(table([STATION]), Tracker(STATION, NOISE), "polar")

@@ -1,15 +1,19 @@
-"""read_urdf: the chain it returns."""
+"""URDFs: the chain that is read, every kind of wrong file, and files as they are found."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+from support.robot_files import frame, slide, told_by_init, urdf
 from support.robots import KR270
 from support.urdf_text import LIMIT, arm, joint, link
 
+import elastocal as ec
+from elastocal.errors import InputError
 from elastocal.model.rigid import nominal_flange
 from elastocal.model.urdf import read_urdf
 
@@ -54,19 +58,305 @@ def test_kinds_limits_and_default_axis(tmp_path: Path) -> None:
     assert chain.masses == ()
 
 
-def test_masses_are_lumped_into_the_joint_that_carries_them(tmp_path: Path) -> None:
-    side = link("side", 2.0, "0 0 1") + joint("s", "l4", "side", "prismatic")
-    beyond = link("tool", 2.0, "1 0 -1") + joint("t", "l4", "tool", "fixed", "")
-    text = arm(extra=side + beyond, replace={link("l0"): link("l0", 100.0)})
-    chain = read(tmp_path, text, flange="l4")
-    assert [body.mass for body in chain.masses] == [0, 0, 0, 4.0]
-    np.testing.assert_allclose(chain.masses[3].com, [0.5, 0, 1.0])
+# --- what is wrong
+
+CASES: dict[str, tuple[str, str]] = {
+    "not xml": ("hello", "not XML: syntax error in line 1, column 1"),
+    "empty": ("", "not XML: no element found in line 1, column 1"),
+    "broken": (arm().replace("</robot>", ""), "not XML: no element found in line 1, column"),
+    "root": ("<sdf/>", "root element is <sdf>, a URDF has <robot.*this is SDF"),
+    "no links": ("<robot/>", "has no <link>"),
+    "xacro element": (
+        '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="a"/></robot>',
+        r"xacro macros are left in \(<xacro:include>\); run xacro first: xacro arm.urdf > expa",
+    ),
+    "xacro prefix": ("<robot><xacro:kuka/></robot>", "xacro macros are left in.*run xacro first"),
+    "xacro value": (
+        arm(replace={'xyz="0 0 1"': 'xyz="0 0 ${d}"'}),
+        r"xacro macros are left in \('0 0 \$\{d\}' in <origin>\)",
+    ),
+    "no parent": (
+        arm(replace={'<parent link="l1"/>': ""}),
+        "joint 'q2' has no parent link; add <parent",
+    ),
+    "no child": (arm(replace={'<child link="l2"/>': "<child/>"}), "joint 'q2' has no child link"),
+    "unknown parent": (
+        arm(replace={'<parent link="l1"/>': '<parent link="l1x"/>'}),
+        r"joint 'q2': parent link 'l1x' is not there \(did you mean 'l1'\?\)",
+    ),
+    "two parents": (
+        arm(extra=joint("again", "l0", "l2")),
+        "link 'l2' has two parents, joints 'q2' and 'again'; kinematic loops are not supported",
+    ),
+    "loop through root": (
+        arm(extra=joint("back", "l4", "l0")),
+        "joints .*q1.* form a closed loop.*open it at one joint",
+    ),
+    "loop beside": (
+        arm(extra=link("a") + link("b") + joint("ab", "a", "b") + joint("ba", "b", "a")),
+        "joints (ab, ba|ba, ab) form a closed loop",
+    ),
+    "two roots": (arm(extra=link("lost")), "2 links have no parent joint: l0, lost;.*connect"),
+    "unnamed link": (arm(extra="<link/>"), 'link number 6 has no name; write <link name="…">'),
+    "unnamed joint": (arm(extra='<joint type="fixed"/>'), "joint number 5 has no name"),
+    "same link": (arm(extra=link("l3")), "two links are named 'l3'; names must be unique"),
+    "same joint": (arm(extra=joint("q1", "l0", "l1")), "two joints are named 'q1'"),
+    "no type": (arm(replace={' type="revolute"': ""}), "joint 'q1' has no type; write type="),
+    "type": (
+        arm(replace={'type="revolute"': 'type="revolut"'}),
+        r"joint 'q1': unknown joint type 'revolut' \(did you mean 'revolute'\?\); valid: revol",
+    ),
+    "zero axis": (
+        arm(replace={LIMIT: LIMIT + '<axis xyz="0 0 0"/>'}),
+        'joint \'q1\': axis is zero; give a direction such as xyz="0 0 1"',
+    ),
+    "two numbers": (
+        arm(replace={LIMIT: LIMIT + '<axis xyz="0 1"/>'}),
+        "joint 'q1', axis xyz: '0 1' is not three numbers",
+    ),
+    "nan": (
+        arm(replace={'xyz="0 0 1"': 'xyz="0 0 nan"'}),
+        "joint 'q1', origin xyz: 'nan' is not a finite number",
+    ),
+    "huge": (arm(replace={'xyz="0 0 1"': 'rpy="0 0 1e999"'}), "origin rpy: '1e999' is not a fin"),
+    "garbage": (arm(replace={'lower="-1"': 'lower="-1_0"'}), "limit lower: '-1_0' is not a finite"),
+    "no limit": (arm(replace={LIMIT: ""}), "joint 'q1' is revolute without <limit>; add <limit"),
+    "no room": (
+        arm(replace={'lower="-1" upper="2"': ""}),
+        "joint 'q1': limits lower=0, upper=0 leave no room to move",
+    ),
+    "mass": (arm(extra=link("m", -1)), "link 'm': mass -1 kg is negative"),
+    "mass text": (arm(extra=link("m", "1kg")), "link 'm', mass value: '1kg' is not a finite"),
+    "no mass": (
+        arm(extra='<link name="m"><inertial/></link>'),
+        "link 'm': <inertial> without <mass",
+    ),
+    "mimic": (
+        arm(replace={LIMIT: LIMIT + '<mimic joint="q2"/>'}),
+        "joint 'q1' mimics 'q2' and lies between base and flange; coupled joints are not supp",
+    ),
+    "mimic of nothing": (
+        arm(replace={LIMIT: LIMIT + '<mimic joint="q22"/>'}),
+        r"joint 'q1' mimics joint 'q22', which is not there \(did you mean 'q2'\?\)",
+    ),
+    "floating": (
+        arm(replace={'type="revolute"': 'type="floating"'}),
+        "joint 'q1' is floating and lies between base and flange",
+    ),
+    "few joints": (arm(3), r"3 moving joints between 'l0' and 'l3' \(q1, q2, q3\); 4 to 9 are"),
+    "many joints": (arm(10), r"10 moving joints between 'l0' and 'l10' \(q1, .*q10\); 4 to 9"),
+    "two arms": (
+        arm(extra="".join(
+            link(f"{side}{i}") + joint(f"{side}{i}", before, f"{side}{i}")
+            for side in ("left", "right")
+            for i, before in enumerate(["l0", *(f"{side}{k}" for k in range(1, 5))], start=1)
+        )),
+        "several links could be the flange, one of each arm: l4, left5, right5; name",
+    ),
+}  # fmt: skip
 
 
-def test_namespaces_gazebo_and_strange_names_are_harmless(tmp_path: Path) -> None:
-    noise = '<gazebo><joint name="q1"/></gazebo><transmission name="t"><joint name="q1"/>'
-    text = arm(extra=noise + "</transmission>", replace={'<robot name="arm">': "<robot>"})
-    text = text.replace("<robot>", '<robot xmlns="http://x" xmlns:xacro="http://wiki/xacro">')
-    text = text.replace('"l0"', '"universe"').replace('"l4"', '"a &lt; ü/1"')
-    chain = read(tmp_path, text)
-    assert (chain.n_joints, chain.name) == (4, "arm")
+@pytest.mark.parametrize("text, message", CASES.values(), ids=CASES.keys())
+def test_wrong_files_are_explained(tmp_path: Path, capfd, text: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read(tmp_path, text)
+    assert str(caught.value).startswith(f"{tmp_path / 'arm.urdf'}: ")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_base_and_flange_names_are_checked(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"base 'L0' is not there.*links: l0, l1, l2, l3"):
+        read(tmp_path, arm(), base="L0")
+    with pytest.raises(InputError, match=r"flange 'l44' is not there \(did you mean 'l4'"):
+        read(tmp_path, arm(), flange="l44")
+    with pytest.raises(InputError, match=r"flange 'Flansch' .* \(usual here: 'l4'\); links: l0"):
+        read(tmp_path, arm(), flange="Flansch")
+    with pytest.raises(InputError, match=r"flange 'l1' is not below base 'l3'; links.*: l4$"):
+        read(tmp_path, arm(), base="l3", flange="l1")
+    with pytest.raises(InputError, match=r"0 moving joints between 'l2' and 'l2' \(none\)"):
+        read(tmp_path, arm(), base="l2", flange="l2")
+
+
+def test_unreadable_files_are_explained(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file; check the path of the URDF file"):
+        read_urdf(tmp_path / "nothing.urdf")
+    with pytest.raises(InputError, match="is a directory; give the URDF file itself"):
+        read_urdf(tmp_path)
+    large = tmp_path / "large.urdf"
+    with large.open("wb") as file:
+        os.truncate(file.fileno(), 60_000_000)
+    with pytest.raises(InputError, match="larger than 10 MB, which no URDF file is"):
+        read_urdf(large)
+    binary = tmp_path / "mesh.urdf"
+    binary.write_bytes(b"\x00\x81solid\xff" * 10)
+    with pytest.raises(InputError, match="not XML"):
+        read_urdf(binary)
+    entities = tmp_path / "entities.urdf"
+    entities.write_text('<!DOCTYPE robot [<!ENTITY a "aa">]><robot name="&a;"/>')
+    with pytest.raises(InputError, match="has a <!DOCTYPE>"):
+        read_urdf(entities)
+    deep = tmp_path / "deep.urdf"
+    deep.write_text("<robot>" + "<a>" * 300_000 + "</a>" * 300_000 + "</robot>")
+    with pytest.raises(InputError, match="<a> is nested more than 32 deep"):
+        read_urdf(deep)
+    many = tmp_path / "many.urdf"
+    many.write_text("<robot>" + "".join(f'<link name="{k}"/>' for k in range(3000)) + "</robot>")
+    with pytest.raises(InputError, match="more than 2000 links"):
+        read_urdf(many)
+    encoded = tmp_path / "encoded.urdf"
+    encoded.write_bytes(b'<?xml version="1.0" encoding="shift_jis"?><robot/>')
+    with pytest.raises(InputError, match=r"not XML|has no <link>"):
+        read_urdf(encoded)
+
+
+# --- as they are found
+
+
+def write(tmp_path, text, name="arm.urdf", encoding="utf-8"):
+    path = tmp_path / name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode(encoding))
+    return path
+
+
+def flange_of(tmp_path, text):
+    code, out, err = told_by_init(write(tmp_path, text))
+    assert code == 0, err
+    return ec.read_cell(tmp_path / "cell.toml").robot.flange, out
+
+
+HAND = frame("hand", "link_6")
+MIMIC = '<mimic joint="jl"/>'
+THUMB = slide("t1", "hand", "thumb1") + slide("t2", "thumb1", "thumb2")
+
+
+@pytest.mark.parametrize(
+    ("extra", "flange"),
+    [
+        (HAND + slide("jl", "hand", "lf") + slide("jr", "hand", "rf"), "hand"),
+        (HAND + slide("jl", "hand", "lf") + slide("jr", "hand", "rf", MIMIC), "hand"),
+        (HAND + THUMB + slide("ji", "hand", "index") + slide("jm", "hand", "middle"), "hand"),
+        (HAND + slide("jl", "hand", "lf") + slide("jr", "hand", "rf") + frame("cam", "link_3"),
+         "hand"),
+        (frame("camera", "link_6"), "tool0"),
+        (slide("rod", "link_2", "rod"), "tool0"),
+    ],
+)  # fmt: skip
+def test_the_flange_is_the_link_before_fingers_branch_off(extra, flange, tmp_path):
+    text = urdf(extra).replace(frame("tool0", "link_6", "0.05 0 0"), "") if "hand" in extra else (
+        urdf(extra)
+    )  # fmt: skip
+    assert flange_of(tmp_path, text)[0] == flange
+
+
+@pytest.mark.parametrize("rpy", ["0 0 0", "-1.5707963267948966 0 0", "3.141592653589793 0 0.5"])
+def test_the_mount_stands_as_in_the_root_of_the_file(rpy, tmp_path):
+    text = urdf(frame("mount", "torso", "0 0.3 1.1", rpy), base="mount")
+    text = text.replace('<link name="mount"/>', '<link name="torso"/>', 1)
+    code, _, err = told_by_init(write(tmp_path, text), "--base", "mount")
+    assert code == 0, err
+    cell = ec.read_cell(tmp_path / "cell.toml")
+    roll, _, yaw = map(float, rpy.split())
+    up = [0, -np.sin(roll), np.cos(roll)] if yaw == 0 else [0, 0, -1]
+    np.testing.assert_allclose(cell.model.nominal.base_rotation[:, 2], np.array(up), atol=1e-5)
+    np.testing.assert_allclose(cell.workspace.keep_out[0].normal, up, atol=1e-4)
+    assert "of 'mount' in the file's 'torso', z up" in (tmp_path / "cell.toml").read_text()
+
+
+@pytest.mark.parametrize("limits", [("-inf", "inf"), ("-1e16", "1e16"), ("-1000", "1000")])
+def test_limits_that_stand_for_none_are_none(limits, tmp_path):
+    code, _, err = told_by_init(write(tmp_path, urdf(limits=limits)))
+    assert code == 0, err
+    text = (tmp_path / "cell.toml").read_text()
+    assert text.count("the file has no limit: guess") == 6 and "joint1_deg = [-180, 180]" in text
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (urdf(limits=("-65", "85")), "limits -65, 85 rad are more than 14 turns"),
+        (urdf(limits=("-166.2", "166.2")), "if these are degrees"),
+        (urdf(scale=1000), "m before joint 1 is too long"),
+        (urdf(scale=1e-3), "1.6 mm long together"),
+        (urdf(frame("cam", "link_3", rpy="0 90 0")), "90 rad is more than two turns"),
+    ],
+)
+def test_units_that_cannot_be_meant_are_refused(text, told, tmp_path):
+    code, _, err = told_by_init(write(tmp_path, text))
+    assert code == 2 and told in err
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("warning: something\n" + urdf(), "'warning: something' stands before <?xml"),
+        ("\n" + urdf(), "blanks stand before <?xml"),
+        (urdf() + "done\n", "'done' stands after the end of the robot"),
+        (urdf().replace("link_3", "lïnk_3").encode("latin-1"), "byte 0xef, which is not UTF-8"),
+        ("<!DOCTYPE html><html><body>404</body></html>", "is a web page"),
+        ("version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "git lfs pull"),
+        (urdf(name="$(arg prefix)joint_{}"), "run xacro first: xacro arm.urdf > expanded.urdf"),
+        (urdf(frame("f", "link_2", "0 0 $(optenv X 1)")), "run xacro first"),
+        (urdf().replace("link_3", "${prefix}link_3"), "run xacro first"),
+    ],
+)
+def test_what_is_no_urdf_is_told_with_what_to_do(text, told, tmp_path):
+    code, _, err = told_by_init(write(tmp_path, text))
+    assert code == 2 and told in err
+
+
+def test_a_xacro_is_to_be_expanded_and_declared_encodings_are_read(tmp_path):
+    code, _, err = told_by_init(write(tmp_path, urdf(), "arm.urdf.xacro"))
+    assert code == 2 and "xacro arm.urdf.xacro > arm.urdf" in err
+    text = urdf().replace('"1.0"?>', '"1.0" encoding="latin-1"?>').replace("arm", "ärm")
+    assert told_by_init(write(tmp_path, text, encoding="latin-1"))[0] == 0
+    text = '<robot name="arm"><gazebo><p file="$(find x)/y"/></gazebo>' + urdf().partition(
+        '<robot name="arm">'
+    )[2]  # fmt: skip
+    assert told_by_init(write(tmp_path, text))[0] == 0
+
+
+RAIL = (
+    '<link name="ground"/><joint name="linear_axis" type="prismatic"><parent link="ground"/>'
+    '<child link="base_link"/><origin xyz="0 0 0.1"/><axis xyz="1 0 0"/>'
+    '<limit lower="-2.9" upper="2.9" effort="1" velocity="1"/></joint>'
+)
+
+
+def test_names_of_the_file_may_be_used_and_a_clash_is_no_shift(tmp_path):
+    path = write(tmp_path, urdf(RAIL, name="joint{}"))
+    code, out, err = told_by_init(path)
+    assert code == 0 and "joint2 = joint1" in out, err
+    cell = (tmp_path / "cell.toml").read_text()
+    assert 'joint_names = "order"' in cell and "joint1_mm" in cell
+    unstated = tmp_path / "own.toml"
+
+    def model(limit, names="", effects='["joint_offset"]'):
+        unstated.write_text(
+            f'[robot]\nurdf = "arm.urdf"\nflange = "tool0"\n{names}\n[limits]\n{limit}\n'
+            f"[model]\neffects = {effects}\n"
+        )
+        return ec.Model(str(unstated))
+
+    with pytest.raises(ec.ElastocalError, match=r"\[limits\] names joint3, .* number 4"):
+        model("joint3_deg = [-10, 20]")
+    by_file = model("joint3_deg = [-10, 20]", 'joint_names = "file"')
+    assert set(by_file.cell.limits) == {"joint4"}
+    by_order = model("joint3_deg = [-10, 20]", 'joint_names = "order"')
+    assert set(by_order.cell.limits) == {"joint3"}
+    assert set(model("linear_axis_mm = [0, 100]").cell.limits) == {"joint1"}
+    with pytest.raises(ec.ElastocalError, match="names joint7, but robot"):
+        model("joint7_deg = [-10, 20]", 'joint_names = "file"')
+
+
+def test_a_cell_that_leaves_the_flange_open_is_told_what_init_takes(tmp_path):
+    write(tmp_path, urdf(frame("camera", "link_6")))
+    (tmp_path / "cell.toml").write_text('[robot]\nurdf = "arm.urdf"\n')
+    with pytest.raises(ec.ElastocalError, match=r"camera, tool0; .* \(init takes 'tool0'\)"):
+        ec.Model(str(tmp_path / "cell.toml"))
+
+
+def test_a_last_joint_that_looks_like_a_jaw_is_told(tmp_path):
+    text = urdf(slide("grip", "link_6", "tool0"))
+    flange, out = flange_of(tmp_path, text)
+    assert flange == "tool0"
+    assert "last joint 'grip' looks like a jaw of a gripper" in out

@@ -1,8 +1,6 @@
 """First cells run as `init` says: arms whose joints a weight does not turn, rails, the demo."""
 
 import re
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,17 +39,6 @@ def test_a_scara_simulates_at_any_seed_though_weights_turn_no_upright_joint(tmp_
             assert code == 0, err
 
 
-def test_a_pose_without_equilibrium_is_named_by_its_line_in_the_plan(tmp_path):
-    (tmp_path / "arm.urdf").write_text(urdf())
-    assert told_by_init(tmp_path / "arm.urdf")[0] == 0
-    header = "configuration," + ",".join(f"q{i}_deg" for i in range(1, 7))
-    (tmp_path / "plan.csv").write_text(f"{header}\n1,0,0,0,0,0,0\n2,0,30,0,0,0,0\n")
-    code, _, err = run("simulate", tmp_path / "cell.toml", tmp_path / "plan.csv", "-o",
-                       tmp_path / "data.csv", "--set", "joint2.compliance=0.1", "--load", 0, 0,
-                       -2000)  # fmt: skip
-    assert code == 2 and re.search(r"plan\.csv, line [23]:", err), err
-
-
 def test_the_load_is_guessed_from_the_arm_and_not_from_its_rail(tmp_path):
     (tmp_path / "arm.urdf").write_text(urdf())
     assert told_by_init(tmp_path / "arm.urdf")[0] == 0
@@ -69,21 +56,6 @@ def test_the_load_is_guessed_from_the_arm_and_not_from_its_rail(tmp_path):
     (tmp_path / "long.urdf").write_text(urdf(scale=6))
     assert told_by_init(tmp_path / "long.urdf")[0] == 0
     assert abs(ec.read_cell(tmp_path / "cell.toml").design.loads).max() <= 3000
-
-
-def test_levels_of_the_compliance_are_asked_for_in_words_that_can_be_pasted(tmp_path):
-    from elastocal.demo import example
-
-    folder = tmp_path / "demo"
-    shutil.copytree(Path(example.__file__).parent, folder)
-    cell = folder / "cell.toml"
-    done = run("design", cell, "-o", tmp_path / "plan.csv", "--effort", "quick")
-    assert done[0] == 0, done[2]
-    text = cell.read_text()
-    head, levels = text.split("[design.levels]\n")
-    cell.write_text(head)
-    code, _, err = run("design", cell, "-o", tmp_path / "other.csv", "--effort", "quick")
-    assert code == 2 and f"add [design.levels] {levels.strip()[:-3]}]" in err
 
 
 @pytest.mark.parametrize(

@@ -32,12 +32,3 @@ def one(name, folder):
 
 def test_a_packaged_arm_there_and_back(tmp_path):
     one("kr210l150", tmp_path)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(
-    "name", ["ur5_robot", "panda", "kinova", "xarm7", "z1", "tiago", "baxter", "irb140",
-             "puma560_robot", "lbr_iiwa_14_r820", "kr16_2", "so101", "al5d_robot"],
-)  # fmt: skip
-def test_packaged_arms_there_and_back(name, tmp_path):
-    one(name, tmp_path)
