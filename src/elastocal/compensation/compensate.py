@@ -656,7 +656,6 @@ def check_reached(result: Compensation) -> None:
 def check_status(
     what: str, rows: Sequence[str], status: Sequence[str], good: str, remedies: Mapping[str, str]
 ) -> None:
-    """Raise InsufficientDataError for rows of another status than `good`; `what` counts them."""
     lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
     if not lost:
         return
@@ -729,7 +728,6 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
 
 
 def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[str, Any]:
-    """What was done, JSON-ready; with `commands` also every command."""
     good, names = result.reached, joint_columns(kinds)
     change = in_file_units(result.q - result.nominal, kinds)
     content: dict[str, Any] = {

@@ -150,7 +150,6 @@ FITTED = (*FRAMED, "dh", "mdh")
 
 
 def format_of(path: Path, asked: str | None) -> str:
-    """The format `asked` for, else that of the file's ending."""
     if asked is not None:
         if asked.lower() not in FORMATS:
             raise InputError(

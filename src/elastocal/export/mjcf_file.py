@@ -229,8 +229,6 @@ TOLERANCE, AT_REST = 1e-13, 1e-10  # rad or m: last step, and what may be left
 
 
 class MujocoRest:
-    """An exported MJCF in MuJoCo."""
-
     def __init__(self, text: str) -> None:
         mujoco = import_mujoco("the check")
         try:

@@ -129,7 +129,6 @@ def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
 
 
 def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
-    """Lines of link `new` and the fixed joint parent → child, one of which is `new`."""
     ends = element("parent", {"link": parent}), element("child", {"link": child})
     joint = {"name": f"{new}_joint", "type": "fixed"}
     return [
@@ -238,7 +237,6 @@ def _is_file(tag: Tag, key: str) -> bool:
 
 
 def _set_directories(xml: XmlFile, path: Path, folder: Path) -> None:
-    """Let the last <compiler> name the directories of meshes and textures from `folder`."""
     stated = parsed(path).compiler
     places = {key: _from(folder, path.parent.resolve() / (getattr(stated, key) or ""))
               for key in ("meshdir", "texturedir")}  # fmt: skip
@@ -328,7 +326,6 @@ class DhRow:
         return DhRow(*np.where(np.abs(mine - theirs) < tolerance, theirs, mine).tolist())
 
     def turned_as(self, other: DhRow) -> DhRow:
-        """This row with the other's whole turns."""
         mine, theirs = np.array(astuple(self)), np.array(astuple(other))
         turns = np.round((theirs - mine) / (2 * np.pi)) * ARE_ANGLES
         return DhRow(*(mine + 2 * np.pi * turns).tolist())

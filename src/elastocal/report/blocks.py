@@ -37,8 +37,6 @@ TONES: dict[str, Tone] = {"good": "good", "note": "good", "care": "warn", "poor"
 
 @dataclass(frozen=True)
 class ShownVerdict:
-    """The answer in a sentence."""
-
     tone: Tone
     sentence: str
 
@@ -92,7 +90,6 @@ class ShownTable:
     narrow: ShownTable | None = None
 
     def without(self, *columns: int) -> ShownTable:
-        """The table without some columns."""
         kept = [k for k in range(len(self.heads)) if k not in columns]
         heads, *rows = (tuple(row[k] for k in kept) for row in (self.heads, *self.rows))
         words = tuple(n for n, k in enumerate(kept) if k in self.words)
@@ -289,7 +286,6 @@ def _fixed(value: float, decimals: int) -> str:
 
 
 def short_name(name: str, most: int = 12) -> str:
-    """A printable name that fits a figure's axis."""
     text = printable(name)
     return text if len(text) <= most else text[: most - 1] + "…"
 
@@ -322,7 +318,6 @@ def capital(text: str) -> str:
 
 
 def sentence(text: str) -> str:
-    """With a capital and a full stop."""
     return f"{capital(text.rstrip('.'))}."
 
 
@@ -383,7 +378,6 @@ def first_stops(plan: Plan) -> dict[int, int]:
 
 
 def resource(name: str) -> str:
-    """The text of a file beside this module."""
     return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
 
 

@@ -49,7 +49,6 @@ FAMILIES = {
 
 
 def diagnosis_report(d: Diagnosis) -> say.Report:
-    """Why the arm still differs from the model, and what follows."""
     title, backend = printable(d.data), ""
     if d.model is not None:
         title = say.title_of(d.model.chain.name, d.model.cell.name)
@@ -198,7 +197,6 @@ def diagnosis_headline(d: Diagnosis) -> str:
 
 
 def headline_of_causes(d: Diagnosis) -> str:
-    """The largest causes with their shares, and what is left open."""
     large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
     told = [
         f"{say.effect_at_places(g.name, g.places)} "
@@ -230,7 +228,6 @@ def location_text(location: Location) -> str:
 
 
 def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
-    """What stands beside the verdict, as (label, sentence)."""
     yield "Error", _error_line(d)
     if d.gap.unexplained > MATERIAL * d.gap.noise_floor:  # what looks like noise and is none
         yield (
@@ -279,7 +276,6 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
 
 
 def _error_line(d: Diagnosis) -> str:
-    """Error on held-out poses before and after, and the part of it that the effects remove."""
     calibrated, floor = say.length(d.gap.calibrated), say.length(d.gap.noise_floor)
     if not d.effects:
         return f"Held-out error: {calibrated} rms (noise alone: {floor})."
@@ -370,7 +366,6 @@ def _named_steps(d: Diagnosis) -> list[tuple[str, float, tuple[float, float]]]:
 
 
 def candidate_table(d: Diagnosis) -> say.ShownTable:
-    """The likeliest candidates; an unknown effect and none are candidates as well."""
     rows = []
     for c in d.candidates[:MOST_CANDIDATES]:
         seen = "–"
@@ -406,7 +401,6 @@ def added_parameter_table(d: Diagnosis) -> say.ShownTable:
 
 
 def structure_table(d: Diagnosis) -> say.ShownTable:
-    """Tests that name no effect, the most conspicuous first."""
     tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:MOST_TESTS]
     rows = [
         (say.driver_name(t.driver), say.p_value(t.p_value), say.p_value(t.p_family)) for t in tests
@@ -473,7 +467,6 @@ def _error_of(c: ComponentShare) -> str:
 
 
 def _unnamed(d: Diagnosis) -> list[tuple[str, ComponentShare]]:
-    """What has no name, each by itself."""
     return [
         (f"{NAMELESS}, {_error_of(c)} at {say.place(c.where)}", c)
         for c in d.components
@@ -556,7 +549,6 @@ def place_table(d: Diagnosis) -> say.ShownTable:
 
 
 def curve_span(curve: Curve) -> str:
-    """How far a curve goes from its lowest to its highest point."""
     moved = max(curve.y) - min(curve.y)
     if curve.y_unit == "m":
         return say.length(moved)
@@ -568,7 +560,6 @@ def curve_span(curve: Curve) -> str:
 
 
 def _smooth(d: Diagnosis) -> Iterator[say.Block]:
-    """Where the corrections without a name are, what they follow, how large and how smooth."""
     if d.slight:
         yield say.Sentence(
             f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "

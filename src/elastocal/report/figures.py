@@ -359,7 +359,6 @@ ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
 
 
 def unknown_curves(d: Diagnosis) -> say.Figure:
-    """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
     panels = []
     for curve in d.curves:
         wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
@@ -502,7 +501,6 @@ class Residuals:
         yield self.over_joints()
 
     def _thinned(self, drawn: int) -> str:
-        """That the dots are a choice, where they are."""
         total = len(self.value)
         if drawn >= total:
             return ""

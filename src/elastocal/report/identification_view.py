@@ -140,7 +140,6 @@ def _open_if_few(table: say.ShownTable, summary: str) -> say.Block:
 
 
 def _key(result: Calibration, budget: ErrorBudget | None) -> say.KeyFigures:
-    """The error before and after, and the noise that is in both."""
     held = math.isfinite(result.heldout_rms)
     after = result.heldout_rms if held else result.residual_rms
     figures = [(NOMINAL, say.length(result.nominal_rms))]
@@ -252,7 +251,6 @@ def what_was_identified(result: Calibration) -> str:
 
 
 def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
-    """What the verdict does not say: what was left out of the held-out error, test data."""
     told: list[str] = []
     held = math.isfinite(result.heldout_rms)
     if not held:
@@ -350,7 +348,6 @@ def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[st
 def spread_table(
     found: dict[str, Array], count: str, title: str = "Before and after"
 ) -> say.ShownTable:
-    """Mean, standard deviation, 95 % quantile and maximum of lengths (n,) in m, by name."""
     rows = []
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())

@@ -236,7 +236,6 @@ def method_of(result: Calibration) -> str:
 
 
 def method_and_weights(result: Calibration) -> str:
-    """The method, and the weights where the method does not say them."""
     method, noise = method_of(result), result.noise
     if method == "constrained":
         # The weights are those that the method before it gave to the readings.
@@ -265,7 +264,6 @@ ASSUMED = {
 
 
 def intervals_line(result: Calibration) -> str:
-    """Which kind of interval, how it was found, and what it assumes."""
     kind, description = result.noise.interval_kind, result.noise.interval_description
     name = kind.title() if "-" in kind else kind  # of two people
     told = ": ".join(text for text in (name, description) if text)
@@ -431,7 +429,6 @@ def _sizes(noise: Noise) -> list[str]:
 
 
 def candidate_table(noise: Noise) -> say.ShownTable:
-    """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
     words = (printable(Kind.parsed(t.kind).words) for t in tried)
     rows = [
@@ -476,7 +473,6 @@ def _repeats_line(result: Calibration) -> str | None:
 
 
 def shape_line(summary: ResidualSummary) -> str:
-    """Are the standardised residuals normal, and does any group scatter unlike the model?"""
     f = shape_of(summary)
     numbers = (
         f"skewness {f.number('skewness'):+.2f}, excess kurtosis {f.number('excess_kurtosis'):+.2f}"

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 
 def plan_report(plan: Plan) -> say.Report:
-    """A plan: what it is worth and the stops to make; behind them poses, proof and order."""
     model = plan.model
     title = say.title_of(model.chain.name, model.cell.name)
     return say.Report(
@@ -68,8 +67,6 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
 
 
 def next_report(found: NextPoses) -> say.Report:
-    """Whether to measure more, what it brings, and the poses."""
-
     def blocks() -> Iterator[say.Block]:
         yield say.Lines([*next_lines(found)])
         yield say.Fold("", lambda: [_gain(found)], figures=("gain",))
@@ -95,7 +92,6 @@ def _key(plan: Plan) -> say.KeyFigures:
 
 
 def _gain(found: NextPoses) -> say.Figure:
-    """The error before and after the batch."""
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     g = found.gain
@@ -115,7 +111,6 @@ SERVES = "most affected if dropped (standard deviation)"
 
 
 def pose_table(plan: Plan, decimals: int = 2) -> say.ShownTable:
-    """Joint values and place in the order of execution."""
     kinds = plan.model.chain.kinds
     heads = ["pose", *say.joint_heads(kinds), "order"]
     heads += [] if plan.crossed else ["load"]
@@ -141,7 +136,6 @@ def served(reason: Reason) -> str:
 
 
 def interval_table(plan: Plan) -> say.ShownTable:
-    """Predicted half widths of the 95 % intervals."""
     rows: list[tuple[str, ...]] = []
     for p in plan.predicted:
         shown, unit = say.display(p.half_width, p.unit)
@@ -156,7 +150,6 @@ def interval_table(plan: Plan) -> say.ShownTable:
 
 
 def curve_table(plan: Plan) -> say.ShownTable:
-    """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
     rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
@@ -181,7 +174,6 @@ VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread 
 
 
 def plan_headline(plan: Plan) -> str:
-    """What the plan is worth and how far from the best it is, in one sentence."""
     text = f"{say.counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
         text += f"position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
@@ -241,7 +233,6 @@ Told = Iterator[tuple[str, str]]  # label, sentence
 
 
 def plan_lines(plan: Plan) -> Told:
-    """What the plan is worth."""
     yield from _chosen_lines(plan)
     if not plan.of_test_poses:
         yield "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
@@ -322,7 +313,6 @@ def _chosen_lines(plan: Plan) -> Told:
 
 
 def _everywhere_lines(plan: Plan) -> Told:
-    """The error at the test poses and all over the joint ranges, beside a random plan's."""
     e = plan.everywhere
     if e is None:
         return
@@ -354,7 +344,6 @@ def _everywhere_lines(plan: Plan) -> Told:
 
 
 def _chance_lines(plan: Plan) -> Told:
-    """What as many random poses would have given."""
     c = plan.chance
     if c is None:
         return
@@ -373,7 +362,6 @@ def _chance_lines(plan: Plan) -> Told:
 
 
 def _certificate_lines(plan: Plan) -> Told:
-    """How far from the best the plan is: on the pool, on the continuum, by its starts."""
     c, name, unit = plan.certificate, _criterion(plan), f" {plan.unit}" if plan.unit else ""
     found, bound = c.efficiency_pool, plan.bound_reported
     if found is None:
@@ -451,7 +439,6 @@ def _execution_lines(plan: Plan) -> Told:
 
 
 def next_lines(found: NextPoses) -> Told:
-    """Whether to measure more, what it brings, and what may be missing."""
     g, n = found.gain, say.counted(found.batch, "pose")
     limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
     verdicts = {

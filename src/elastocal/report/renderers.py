@@ -83,7 +83,6 @@ def print_report(console: Console, result: object, details: bool = True, **told:
 
 
 def printed_text(result: object) -> str:
-    """A result as the command line prints it, without colours and trailing blanks."""
     console = safe_console(file=StringIO(), width=PRINTED_WIDTH, color_system=None)
     with console.capture() as capture:
         print_report(console, result)
@@ -108,7 +107,6 @@ def print_blocks(console: Console, blocks: Iterable[say.Block], details: bool = 
 
 
 def _needs(heading: str, block: say.Block) -> bool:
-    """Whether the heading says more than the block below it."""
     told = block.title if isinstance(block, say.ShownTable) else ""
     if isinstance(block, say.Lines):
         told = block.items[0][0]
@@ -314,7 +312,6 @@ def _html(block: say.Block, deep: int, pictures: bool, summary: str) -> str:
 
 
 def _lines(block: say.Lines) -> str:
-    """A label once for sentences that follow each other."""
     parts = []
     for label, items in groupby(block.items, lambda item: item[0]):
         texts = [text_of(text) for _, text in items]
@@ -414,7 +411,6 @@ DEFAULTS = {"Calibration": "residuals", "Diagnosis": "budget"}
 
 
 def html(result: object) -> str:
-    """A result as HTML; every text is escaped."""
     return html_of(report_of(result).blocks, 4, pictures=False)
 
 

@@ -114,7 +114,6 @@ def _changes(c: Comparison) -> Iterator[say.Block]:
 
 
 def _change_table(c: Comparison) -> say.ShownTable:
-    """A row for each parameter, the changed first, then by their effect at the tool."""
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
     for one in sorted(c.changes, key=lambda x: (not x.changed, -x.moves)):
@@ -135,7 +134,6 @@ def _change_table(c: Comparison) -> say.ShownTable:
 
 
 def _moves(c: Comparison) -> say.Figure:
-    """How far the tool moves by each change alone, the largest first."""
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     most = sorted(c.changes, key=lambda change: -change.moves)[:MOST_DRAWN]
@@ -326,7 +324,6 @@ ROLES = {"points": "points", "joints": "joint values", "both": "points and joint
 
 
 def left_out(found: Imported) -> list[str]:
-    """What is not in the table, in lines: rows passed over, and what found no partner."""
     lines = []
     for observed in found.understood:
         if n := len(observed.ignored):
