@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, Any, Self, TextIO, cast
 
 from elastocal.text import printable
 
@@ -144,6 +144,52 @@ def interrupt_check() -> Callable[[], None]:
             raise KeyboardInterrupt
 
     return check
+
+
+GRACE = 30.0  # s that running tasks of a study are waited for
+
+
+class StudyStop:
+    """Ctrl-C and SIGTERM: in a `with` block, `asked` says that no more tasks may be handed out.
+
+    A second signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check`
+    raises it again: CasADi catches one inside a solver and returns where the search stood, and
+    such a result must not be kept.
+    """
+
+    def __init__(self, grace: float = GRACE, tell: Callable[[str], None] | None = None) -> None:
+        self.asked = self._now = False
+        # In a signal handler the buffer of sys.stderr may be in use by what was interrupted.
+        self._tell = tell or (lambda text: os.write(2, f"\nelastocal: {text}\n".encode()) and None)
+        self._grace = grace
+        self._before: dict[int, Any] = {}
+
+    def check(self) -> None:
+        if self._now:
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():  # only it may set handlers
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+                if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
+                    self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        while self._before:
+            signal.signal(*self._before.popitem())
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.asked:
+            self._now = True
+            raise KeyboardInterrupt
+        self.asked = True
+        self._tell(
+            f"stopping: the running tasks have {self._grace:.0f} s to end (Ctrl-C again: at once)"
+        )
+        signal.setitimer(signal.ITIMER_REAL, self._grace)
 
 
 def end_at_once() -> None:

@@ -1,12 +1,13 @@
 """Studies: many independent tasks, each result of which is kept as it comes.
 
     study = read_study("experiment_design/coverage", options=["replicates=200"])
-    run_study(study, "look", jobs=4)  # of elastocal.study_runs
+    run_study(study, "look", jobs=4)
     frame = read_results("look")
 
 A study's folder holds `study.py` (what to compute) and `study.toml` (seed, options, columns).  What
 a worker needs of it travels as `Sources`; their hash, the seed and the task's values say
-whether a result on disk is of this very task.
+whether a result on disk is of this very task.  Only the one process that the user started writes.
+However a run ends, what was done by then is kept, and the next one goes on from there.
 """
 
 from __future__ import annotations
@@ -15,22 +16,30 @@ import atexit
 import hashlib
 import importlib
 import json
+import logging
 import math
+import os
+import queue
 import shutil
+import signal
 import sys
 import tempfile
 import threading
 import time
 import tomllib
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import CancelledError
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
+from ipaddress import ip_address
 from itertools import islice
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
@@ -39,10 +48,10 @@ from pydantic import Field
 
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
-from elastocal.errors import InputError, option, require
+from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import atomic_write_text, read_bytes, read_json, read_text
-from elastocal.screen import shown
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.screen import StudyStop, shown
+from elastocal.text import did_you_mean, json_text, listed, printable, quoted
 
 if TYPE_CHECKING:
     import pandas
@@ -58,6 +67,7 @@ KINDS: dict[str, tuple[type, str]] = {
 ASKED_FOR = {**dict(KINDS.values()), float: "a number"}  # how a type is asked for
 
 Row = dict[str, Any]
+Lines = Generator[Row, None, None]
 _LOCK = threading.Lock()
 _here: tuple[str, Path, ModuleType] | None = None  # digest, folder and study.py of what is loaded
 
@@ -131,10 +141,7 @@ class StudyFile(Table):
 
 
 def read_study(folder: str | Path, seed: int | None = None, options: Iterable[str] = ()) -> Study:
-    """Returns the study in `folder`, with another seed, and options as KEY=VALUE, where given.
-
-    Raises InputError where the folder, study.toml, study.py, an option or a task is wrong.
-    """
+    """The study in `folder`, with another seed, and options as KEY=VALUE, where given."""
     folder = Path(folder)
     require(folder.is_dir(), f"{folder}: no such folder; name the folder of a study")
     for name, what in (("study.py", "tasks() and run()"), ("study.toml", "seed and columns")):
@@ -160,12 +167,12 @@ def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
     """The files of the study as its folder stands now, without hidden folders and caches."""
     for name in stated.files:
         named = f"{path}: key files names {quoted(name)}"
-        inside = not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
+        inside = (folder / name).resolve().is_relative_to(folder)
         told = "outside the folder; a cluster cannot reach it, copy it into the folder"
         require(inside, f"{named}, {told}")
         require((folder / name).is_file(), f"{named}, which is no file of the folder")
     names = {path.relative_to(folder) for path in folder.rglob("*.py")}
-    hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
+    hidden = {n for n in names if any(p.startswith((".", "__pycache__")) for p in n.parts)}
     parts = sorted({n.as_posix() for n in names - hidden} | set(stated.files))
     return {name: read_bytes(folder / name, "file of a study", MOST_OF_A_FILE) for name in parts}
 
@@ -226,7 +233,6 @@ def _tasks(
 
 
 def _json(where: str, value: Any) -> str:
-    """`value` as JSON text; raises InputError where it has no such form."""
     try:
         return json.dumps(value, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -283,7 +289,6 @@ def _forget(folder: Path) -> None:
 
 
 def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
-    """Returns the value of `call`, which is code of the study in `folder`."""
     try:
         return call()
     except InputError:
@@ -302,10 +307,7 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
 
 
 def execute(sources: Sources, task: StudyTask) -> Row:
-    """Returns the line of results that came of the task, whatever its code raises.
-
-    Of a task that failed it has the `trace` (the traceback) beside `task_error`.
-    """
+    """The line of results that came of the task; of one that failed with its `trace`."""
     line = task.line()
     begun = time.perf_counter()
     try:
@@ -324,7 +326,6 @@ def execute(sources: Sources, task: StudyTask) -> Row:
 
 
 def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row]:
-    """What run() returned, as rows of plain values of the types that `columns` states."""
     rows = [found] if isinstance(found, Mapping) else found
     if not isinstance(rows, list | tuple) or not all(isinstance(row, Mapping) for row in rows):
         told = f"run() returned {type(found).__name__}; it returns a dict or a list of them"
@@ -366,7 +367,7 @@ MOST_RESULTS = 10_000_000_000  # bytes
 SCHEMA = "elastocal/study/1"
 RESULTS, STATEMENT, FAILURES, LOCK = "results.jsonl", "_study.json", "_failures.log", ".lock"
 PAGE = "result.md"
-OURS = {RESULTS, STATEMENT, FAILURES, PAGE, "_written.txt"}  # the last was kept by earlier versions
+OURS = {RESULTS, STATEMENT, FAILURES, PAGE, "_written.txt"}  # the last by earlier versions
 
 
 @contextmanager
@@ -395,7 +396,6 @@ def opened(folder: Path) -> Iterator[None]:
 
 
 def add_line(folder: Path, line: Row) -> None:
-    """Write the line of a task that ended; its traceback goes to the log."""
     if trace := line.pop("trace", None):
         with open(folder / FAILURES, "a", encoding="utf-8") as log:
             log.write(shown(f"task {line['task']} {json.dumps(line['values'])}\n{trace}\n"))
@@ -408,9 +408,7 @@ def as_text(line: Row) -> str:
 
 
 def result_lines(folder: Path) -> list[Row]:
-    """Returns all whole lines in the order of their tasks: a killed run may leave the beginning of
-    one.
-    """
+    """All whole lines in the order of their tasks; a killed run may leave the beginning of one."""
     path, found = folder / RESULTS, dict[int, Row]()
     text = read_text(path, "results", MOST_RESULTS) if path.exists() else ""
     for number, written in enumerate(text.split("\n")[:-1], 1):
@@ -437,12 +435,10 @@ def write_statement(folder: Path, study: Study) -> None:
         "columns": dict(study.sources.columns), "sources": study.sources.digests,
         "elastocal": __version__,
     }  # fmt: skip
-    text = json.dumps(statement, indent=1, ensure_ascii=False, allow_nan=False)
-    atomic_write_text(folder / STATEMENT, text + "\n")
+    atomic_write_text(folder / STATEMENT, json_text(statement) + "\n")
 
 
 def statement_of(folder: Path) -> dict[str, Any]:
-    """Returns what `write_statement` wrote; empty where there is none."""
     try:
         found = read_json(folder / STATEMENT, "record", MAX_BYTES, "remove it")
     except InputError:
@@ -472,3 +468,331 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     frame = pd.DataFrame(rows, columns=[*names, "task_error"])
     numbers = [name for name, unit in columns.items() if unit not in KINDS]
     return frame.astype(dict.fromkeys(numbers, "float64"))
+
+
+# The run: tasks on joblib's processes or a Dask cluster, recorded as they come, stopped.
+
+ANSWER = 10.0  # s in which a scheduler answers
+MOST_PEM_BYTES = 1_000_000
+# What limits threads of linear algebra: the processes share the cores.
+THREADS = (
+    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS",
+)  # fmt: skip
+
+
+class Processes:
+    """A process of joblib's for each task that is out, which takes one after the other."""
+
+    tries = 3  # of a task whose process dies
+
+    def __init__(self, number: int) -> None:
+        from joblib import cpu_count
+
+        self.places = number
+        self._pools, self._free = list[Any](), list[Any]()
+        threads = str(max(cpu_count() // number, 1))
+        self._env = {name: os.environ.get(name, threads) for name in THREADS}
+
+    def submit(self, *call: Any) -> Any:
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        if not self._free:
+            ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
+            self._pools.append(ProcessPoolExecutor(1, initializer=ignore, env=self._env))
+            self._free.append(self._pools[-1])
+        pool = self._free.pop()
+        future = pool.submit(*call)
+
+        def ended(future: Any) -> None:
+            if not future.cancelled() and future.exception() is None:  # the process lives
+                self._free.append(pool)
+
+        future.add_done_callback(ended)
+        return future
+
+    def deaths(self, error: Exception) -> int:
+        return int(isinstance(error, BrokenProcessPool))
+
+    def close(self, out: list[Any]) -> None:
+        for pool in self._pools:
+            pool.shutdown(kill_workers=bool(out))
+
+
+class DaskWorkers:
+    """The workers of a Dask cluster, which gives the tasks of a dead one to another, and gives up a
+    task that killed more than the cluster allows (distributed.scheduler.allowed-failures)."""
+
+    tries = 1
+
+    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
+        self._client, self._tell, self._told = client, tell, False
+
+    @property
+    def places(self) -> int:
+        if self._client.status != "running":
+            raise self._lost()
+        threads = sum(self._client.nthreads().values())
+        if not threads and not self._told:
+            self._tell("the cluster has no worker; waiting for one")
+        self._told = not threads
+        return threads
+
+    def submit(self, *call: Any) -> Any:
+        return self._client.submit(*call, pure=False)  # no other call may answer for this one
+
+    def deaths(self, error: Exception) -> int:
+        if isinstance(error, CancelledError | OSError):
+            raise self._lost() from None
+        return int(getattr(error, "allowed_failures", -1)) + 1  # as a KilledWorker has
+
+    def close(self, out: list[Any]) -> None:
+        if out and self._client.status == "running":
+            self._client.cancel(out, force=True)
+        self._client.close()
+
+    def _lost(self) -> ClusterLostError:
+        return ClusterLostError(
+            f"the scheduler at {self._client.scheduler.address} went away or cancelled the tasks; "
+            "what was done is kept, and the same command goes on with the rest"
+        )
+
+
+class ClusterLostError(ElastocalError):
+    """The scheduler went away; what was done is kept."""
+
+    exit_code = 1
+
+
+def hand_out(
+    crew: Processes | DaskWorkers, study: Study, tasks: Sequence[StudyTask], stop: StudyStop
+) -> Lines:
+    """Lines of results as they come, none twice; none new begins once `stop` is asked for.
+
+    No task waits at a worker: what is out is what is waited for on Ctrl-C.
+    """
+    waiting, out = deque(tasks), dict[Any, StudyTask]()
+    ended, died = queue.SimpleQueue[Any](), Counter[int]()
+    try:
+        while out or (waiting and not stop.asked):
+            while waiting and not stop.asked and len(out) < crew.places:
+                task = waiting.popleft()
+                future = crew.submit(execute, study.sources, task)
+                out[future] = task
+                future.add_done_callback(ended.put)
+            try:
+                future = ended.get(timeout=1.0 if out else 0.1)
+            except queue.Empty:
+                continue
+            task = out.pop(future)
+            try:
+                line = future.result()
+            except Exception as error:  # execute() returns what a task raises
+                deaths = crew.deaths(error)
+                died[task.index] += deaths
+                if deaths and died[task.index] < crew.tries:
+                    waiting.appendleft(task)
+                    continue
+                told = f"the worker could not run it: {type(error).__name__}: {error}"
+                if deaths:
+                    told = (
+                        f"its worker process died {died[task.index]} times (out of memory, killed, "
+                        "or crashed in a library)"
+                    )
+                line = task.line() | {"task_error": told, "trace": f"{told}\n{error}\n"}
+            yield line
+    finally:
+        crew.close(list(out))
+
+
+def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop) -> Lines:
+    import joblib
+
+    jobs = min(jobs or joblib.cpu_count(), len(tasks))
+    if jobs > 1:
+        yield from hand_out(Processes(jobs), study, tasks, stop)
+        return
+    for task in tasks:
+        if stop.asked:
+            return
+        yield execute(study.sources, task)
+
+
+def _security(
+    distributed: Any, address: str, unencrypted: bool = False, **files: Path | None
+) -> Any:
+    """Dask's Security for a client of `address`: with the `files` tls_ca, tls_cert and tls_key
+    (PEM) or those of Dask's configuration.
+
+    Whoever stands between could run code of their own here and there: tasks and results are
+    pickles.  So another host is reached by TLS only, unless `unencrypted` allows it.
+    """
+    given = {name: path for name, path in files.items() if path is not None}
+    for name, path in given.items():
+        read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
+    scheme, _, rest = address.rpartition("://")
+    host = rest.rsplit(":", 1)[0].strip("[]")
+    here = scheme == "inproc" or host == "localhost"
+    with suppress(ValueError):  # a name, which may lead anywhere
+        here = here or ip_address(host).is_loopback
+    require(
+        here or unencrypted or scheme in ("tls", "wss"),
+        f"{option('cluster', address)}: leads beyond this host and is not encrypted, so "
+        "whoever stands between could run code on both; use tls:// with "
+        f"{option('tls_ca')}, {option('tls_cert')} and {option('tls_key')}, a tunnel to this "
+        f"host, or allow it with {option('unencrypted', True)}",
+    )
+    keys = {"tls_ca": "tls_ca_file", "tls_cert": "tls_client_cert", "tls_key": "tls_client_key"}
+    return distributed.Security(**{keys[name]: str(path) for name, path in given.items()})
+
+
+def connect(address: str, **way: Any) -> Any:
+    """Returns a client of the scheduler at `address`, or in Dask's configuration ("config")."""
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        here = option("cluster", "ADDRESS")
+        raise InputError(
+            f"{here} needs dask.distributed; run: pip install 'elastocal[cluster]'"
+        ) from None
+    where = dask.config.get("scheduler-address", None) if address == "config" else address
+    require(
+        where is not None,
+        f"{option('cluster', 'config')}: Dask's configuration names no scheduler; set "
+        "DASK_SCHEDULER_ADDRESS or scheduler-address, or give "
+        f"{option('cluster', 'tcp://HOST:8786')}",
+    )
+    here, security = option("cluster", where), _security(distributed, str(where), **way)
+    # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
+    for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    try:
+        return distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise InputError(
+            f"{here}: no scheduler answers ({error}); check the address, or "
+            "start one for this host alone: dask scheduler"
+        ) from None
+
+
+@dataclass(frozen=True)
+class Ending:
+    """Of `total` tasks (those asked for), `done` have a result and `failed` an error."""
+
+    total: int
+    before: int
+    done: int
+    failed: int
+    stopped: bool
+
+    @property
+    def complete(self) -> bool:
+        return self.done + self.failed == self.total
+
+
+def run_study(
+    study: Study,
+    output: str | Path,
+    *,
+    jobs: int | None = None,
+    cluster: str | None = None,
+    only: int | None = None,
+    restart: bool = False,
+    retry_failed: bool = False,
+    stop: StudyStop | None = None,
+    progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
+    tell: Callable[[str], None] = print,
+    **way: Any,
+) -> Ending:
+    """Run the tasks that have no result yet (of the first `only`) and record what comes.
+
+    They run in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`,
+    reached this `way` (tls_ca, tls_cert, tls_key, unencrypted).  `restart` discards the results in
+    the folder `output`, `retry_failed` those that are errors; `progress` takes the number of tasks,
+    of those that ended and of those that failed.
+
+    Raises InputError where the results are of another study, or the cluster cannot be reached;
+    ClusterLostError where the scheduler goes away.
+    """
+    folder, stop = Path(output), stop or StudyStop()
+    with opened(folder):
+        known = [] if restart else _known(study, folder)
+        kept = [line for line in known if not (retry_failed and line["task_error"])]
+        there = {line["task"]: line["task_error"] is not None for line in kept}
+        wanted = study.tasks[:only]
+        left = [task for task in wanted if task.index not in there]
+        runner = partial(run_local, study, left, jobs, stop)
+        if cluster is not None and left:
+            # Before results are discarded: one that cannot be reached must not cost them.
+            crew = DaskWorkers(connect(cluster, **way), tell)
+            runner = partial(hand_out, crew, study, left, stop)
+        for name in OURS if restart else ():
+            (folder / name).unlink(missing_ok=True)
+        if left:  # without the beginning of a line
+            atomic_write_text(folder / RESULTS, "".join(map(as_text, kept)))
+        write_statement(folder, study)
+        total, before = len(wanted), len(wanted) - len(left)
+        ended, failed = before, sum(there.get(task.index, False) for task in wanted)
+        progress(total, ended, failed)
+        try:
+            with closing(runner()) as lines:
+                for line in lines:
+                    stop.check()
+                    add_line(folder, line)
+                    failed += line["task_error"] is not None
+                    ended += 1
+                    progress(total, ended, failed)
+        except KeyboardInterrupt:
+            if not stop.asked:
+                raise
+    return Ending(total, before, ended - failed, failed, stop.asked)
+
+
+def _known(study: Study, folder: Path) -> list[Row]:
+    here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
+    before, columns = statement_of(folder), dict(study.sources.columns)
+    require(
+        before.get("columns", columns) == columns,
+        f"{folder}: has other columns, types or units than the study now. {here}",
+    )
+    lines = result_lines(folder)
+    for line in lines:
+        at = line["task"]
+        if at < len(study.tasks) and study.tasks[at].hash != line["task_hash"]:
+            changes = _changes(study, before) or [f"task {at} was another one"]
+            told = f"{folder}: holds results of another study: {'; '.join(changes)}"
+            raise InputError(f"{told}. {here} to keep them")
+    return lines
+
+
+def _changes(now: Study, before: dict[str, Any]) -> list[str]:
+    told = []
+    sources, digests = before.get("sources", {}), now.sources.digests
+    changed = [n for n in sorted({*sources, *digests}) if sources.get(n) != digests.get(n)]
+    if sources and changed:
+        told.append(f"{', '.join(changed)} changed since")
+    if before.get("seed", now.seed) != now.seed:
+        told.append(f"the seed was {before['seed']}, now it is {now.seed}")
+    options = before.get("options", {})
+    for name, value in now.options.items():
+        if options.get(name, value) != value:
+            told.append(f"option {name} was {quoted(options[name])}, now it is {quoted(value)}")
+    return told
+
+
+def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
+    """What summary(frame) of study.py says of the rows in the order of their tasks, also written to
+    `page`; None without one."""
+    summary = getattr(study.module, "summary", None)
+    if summary is None:
+        return None
+    frame = read_results(output)
+    frame = frame[frame["task"] < len(study.tasks)]
+    text = calling(study.folder, "summary()", lambda: summary(frame))
+    if not isinstance(text, str):
+        kind = type(text).__name__
+        raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
+    lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
+    atomic_write_text(page, "\n".join(lines) + "\n")
+    return text

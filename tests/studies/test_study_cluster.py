@@ -8,14 +8,14 @@ import pytest
 from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies import read_results
-from elastocal.study_runs import (
+from elastocal.studies import (
     ClusterLostError,
     DaskWorkers,
     StudyStop,
     _security,
     connect,
     hand_out,
+    read_results,
 )
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
@@ -103,7 +103,7 @@ def test_a_task_that_always_kills_its_worker_fails_and_is_told(cluster, tmp_path
 
 
 def test_no_scheduler_is_told(monkeypatch):
-    monkeypatch.setattr("elastocal.study_runs.ANSWER", 0.5)
+    monkeypatch.setattr("elastocal.studies.ANSWER", 0.5)
     nothing = dask.config.set({"scheduler-address": None})
     with nothing, pytest.raises(InputError, match="names no scheduler"):
         connect("config")

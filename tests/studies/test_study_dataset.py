@@ -8,7 +8,7 @@ from support.study_folders import SCRIPT, TOML, numbers, run_study, write_study
 
 from elastocal.errors import InputError
 from elastocal.studies import opened, read_results, read_study
-from elastocal.study_runs import run_study as run_prepared
+from elastocal.studies import run_study as run_prepared
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_results_of_another_study_are_refused(folder, results, script, toml, tol
 
 def test_a_cluster_that_cannot_be_reached_costs_no_results(folder, results, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra 'cluster'")
-    monkeypatch.setattr("elastocal.study_runs.ANSWER", 0.5)
+    monkeypatch.setattr("elastocal.studies.ANSWER", 0.5)
     with pytest.raises(InputError, match="no scheduler answers"):
         run_prepared(read_study(folder), results, cluster="tcp://127.0.0.1:9", restart=True)
     assert len(numbers(results)) == 24

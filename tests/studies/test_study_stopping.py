@@ -5,8 +5,7 @@ import sys
 import pytest
 from support.study_folders import here, on_processes, run_study, write_study
 
-from elastocal.studies import read_results
-from elastocal.study_runs import StudyStop
+from elastocal.studies import StudyStop, read_results
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 

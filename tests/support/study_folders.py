@@ -9,9 +9,8 @@ from unittest.mock import patch
 
 import pandas as pd
 
-from elastocal.studies import Study, execute, read_results, read_study
-from elastocal.study_runs import Ending, StudyStop, run_local
-from elastocal.study_runs import run_study as run_prepared
+from elastocal.studies import Ending, Study, StudyStop, execute, read_results, read_study, run_local
+from elastocal.studies import run_study as run_prepared
 
 SCRIPT = """\
 def tasks(options):
@@ -64,7 +63,7 @@ def run_study(
     """The study in `folder` run into `results` by `runner(study)`, by default in this process."""
     study = read_study(folder, seed)
     made = (runner or here)(study)
-    with patch("elastocal.study_runs.run_local", lambda study, tasks, *_: made(tasks)):
+    with patch("elastocal.studies.run_local", lambda study, tasks, *_: made(tasks)):
         return run_prepared(study, results, **how)
 
 

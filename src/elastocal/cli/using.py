@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from elastocal.identification.result import Calibration
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.report.identification_view import Published, Truth
-    from elastocal.study_runs import Ending
+    from elastocal.studies import Ending
     from elastocal.units import Array
 
 
@@ -704,8 +704,7 @@ def study(
         retry_failed: Run tasks that failed again.
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
-    from elastocal.studies import PAGE, read_study
-    from elastocal.study_runs import StudyStop, run_study, summarise
+    from elastocal.studies import PAGE, StudyStop, read_study, run_study, summarise
 
     results = folder / "results" if output is None else output
     page = (output or folder) / PAGE
