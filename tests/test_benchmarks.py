@@ -29,21 +29,6 @@ def bench() -> Iterator[dict[str, ModuleType]]:
             sys.modules.pop(name, None)
 
 
-def test_every_way_to_b_is_the_models(bench, tmp_path: Path) -> None:
-    """At disturbed parameters; `agreement` ends the benchmark where one way differs."""
-    evaluation, arms = bench["evaluation"], bench["bench_arms"]
-    model = arms.kr270(tmp_path, arms.GEOMETRY)
-    table, x = arms.poses(model, 20), arms.truth(model)
-    rivals = bench["evaluation_rivals"]
-    symbolic = model._symbolic
-    inputs = [*symbolic.arm.inputs.values(), symbolic.p]
-    f = rivals.function_of(inputs, [symbolic.reading])
-    arrays = [*evaluation.row_inputs(symbolic.arm, table), x]
-    position = model.predict(table, x).reshape(20, 3)
-    for found in (rivals.python_loop(f, arrays, 20), rivals.Mapped(f, 7)(arrays, 20)):
-        np.testing.assert_allclose(found[0][..., 0], position, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("how", ["plain", "ols"])
 def test_a_fit_beside_its_peers_ends_at_the_arm(bench, tmp_path: Path, how: str) -> None:
     """At 30 poses of 50 µm, 25 parameters: new poses within 100 µm of where the arm is."""

@@ -19,7 +19,7 @@ import elastocal as ec
 from elastocal import plugins
 from elastocal.cli.main import app
 from elastocal.demo.example import LOAD_N, run_demo
-from elastocal.errors import option, options_as_flags
+from elastocal.errors import options_as_flags
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)
@@ -149,14 +149,6 @@ def test_a_wrong_name_is_an_input_error_with_the_nearest(fit):
     assert not str(caught.value).startswith(("'", '"'))
 
 
-def test_B_is_the_slope_of_the_prediction(fit):
-    k, step = fit.model.names.index("joint3.compliance"), 1e-10
-    x = fit.x + step * np.eye(len(fit.x))[k]
-    observed = fit.observations
-    moved, still = (fit.model.predict(observed.table, v, observed) for v in (x, fit.x))
-    np.testing.assert_allclose((moved - still) / step, fit.B[:, k], rtol=1e-4, atol=1.0)
-
-
 def test_identify_is_that_of_the_command_line(fit):
     done = command("identify", "cell.toml", "data.csv", "--test", "kept_back.csv", "--fix",
                    "joint1.compliance", "-o", "line.json", "--quiet")  # fmt: skip
@@ -269,16 +261,6 @@ def test_a_cell_without_markers_takes_those_of_the_table(folder):
     assert len(ec.identify(model, data)) == 9
 
 
-def test_arrays_become_tables(model):
-    q = np.array([[0.1, -0.4405, 0.5, 0.0, 0.5, 0.0]])
-    exact = ec.simulate(model, q, noise=False)
-    assert len(exact) == 3  # markers
-    table = model.table(q, position=exact.position[:1])
-    assert np.array_equal(table.position, exact.position[:1])
-    with pytest.raises(ec.InputError, match="q takes 6 joints per row"):
-        model.table([[0.1, 0.2]])
-
-
 # Wrong options
 
 
@@ -314,14 +296,6 @@ def test_a_wrong_option_is_named_by_its_keyword(verb, options, named, model, fit
     assert "--" not in str(caught.value)
 
 
-def test_a_load_of_another_shape_is_named(fit):
-    for load in ([0, 0], [[0, 0, 1], [0, 0, 2]]):
-        with pytest.raises(ec.InputError, match=r"^`load` takes a force \(3,\) in N, or one"):
-            fit.predict(np.zeros(6), load=load)
-    with pytest.raises(ec.InputError, match=r"^`load` takes"):
-        fit.position(np.zeros(6), load="down")
-
-
 def test_a_load_is_given_by_either_name(model, fit):
     """`load`, as an argument; `force`, as the column of a table is called."""
     q = [0.1, -1.0, 1.0, 0.0, 0.5, 0.2]
@@ -334,14 +308,6 @@ def test_a_load_is_given_by_either_name(model, fit):
             call(q, load=LOAD, force=LOAD)
     with pytest.raises(ec.InputError, match=r"^`load` takes .* found numbers beyond all measure"):
         model.pose(q, force=[0, 0, np.nan])
-
-
-def test_an_option_is_a_keyword_here_and_a_flag_on_the_command_line():
-    assert option("fixed", "joint1") == "fixed=['joint1']" and option("seed") == "`seed`"
-    with options_as_flags():
-        assert option("fixed", "joint1") == "--fix joint1" and option("seed") == "--seed"
-        assert option("frames", False) == "--no-frames" and option("base_frame") == "--base-frame"
-    assert option("outliers", "drop") == "outliers='drop'"
 
 
 def test_progress_is_told(model):

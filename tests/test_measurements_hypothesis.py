@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -91,18 +90,6 @@ def test_every_decimal_number_is_read_to_the_nearest_float(tmp_path, numbers, ma
     table = read_or_refuse(tmp_path / "data.csv", text.encode())
     assert table is not None
     assert [*table.q[0], *table.position[0]] == expected
-
-
-@SETTINGS
-@given(FINITE, st.sampled_from(["mm", "m", "um"]), st.sampled_from(["deg", "rad"]))
-def test_units_scale_and_nothing_else(tmp_path, value, length, angle):
-    text = f"q1_{angle},q2_{angle},x_{length},y_{length},z_{length}\n" + ",".join([repr(value)] * 5)
-    table = read_or_refuse(tmp_path / "data.csv", text.encode())
-    assert table is not None
-    factor = {"mm": 1e-3, "m": 1.0, "um": 1e-6}[length]
-    assert table.position[0, 0] == pytest.approx(value * factor, rel=1e-15, abs=5e-324)
-    turn = {"deg": math.pi / 180, "rad": 1.0}[angle]
-    assert table.q[0, 0] == pytest.approx(value * turn, rel=1e-15, abs=5e-324)
 
 
 @st.composite

@@ -2,7 +2,6 @@
 
 # ruff: noqa: E402  (the study is a script: its folder has to be found first)
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -64,10 +63,3 @@ def test_the_study_estimates_what_the_tool_does():
         estimate = result[name]
         assert abs(estimate.value * 1e6 - setting.truth[k] - noise.x[k]) < 0.05 * std[k]
         assert estimate.std * 1e6 == pytest.approx(std[k], rel=0.02)
-
-
-@pytest.mark.long
-def test_the_command_runs_from_nothing(tmp_path):
-    command = [sys.executable, "-m", "elastocal", "study", str(FOLDER), "--set", "replicates=50"]
-    subprocess.run([*command, "-o", str(tmp_path / "out")], check=True, capture_output=True)
-    assert "| table 1, 6 repeats |" in (tmp_path / "out" / "result.md").read_text(encoding="utf-8")

@@ -105,17 +105,3 @@ def test_an_error_in_study_py_is_told_by_its_line(tmp_path, old, new, line, told
 )
 def test_wrong_tasks_are_told(tmp_path, old, new, told):
     assert told in refused(write_study(tmp_path / "study", SCRIPT.replace(old, new, 1)))
-
-
-@pytest.mark.parametrize(
-    ("assignment", "told"),
-    [
-        ("replicats=3", "no option 'replicats' (did you mean 'replicates'?)"),
-        ("replicates=3.5", "takes a whole number"),
-        ("replicates=true", "takes a whole number"),
-        ("replicates", "`options` takes KEY=VALUE"),
-        ("scale=big", "takes a number"),
-    ],
-)
-def test_a_wrong_option_is_told(tmp_path, assignment, told):
-    assert told in refused(write_study(tmp_path / "study"), assignment)

@@ -3,7 +3,7 @@
 import sys
 
 import pytest
-from support.study_folders import here, on_processes, run_study, write_study
+from support.study_folders import on_processes, run_study, write_study
 
 from elastocal.studies import StudyStop, read_results
 
@@ -60,9 +60,3 @@ def test_a_task_that_swallows_the_second_signal_is_dropped(tmp_path):
 
 def test_a_task_that_takes_too_long_to_end_is_dropped(tmp_path):
     assert stopped(tmp_path, grace=0.1, wait=60) == [0, 1]
-
-
-def test_a_dropped_task_runs_in_the_next_run(tmp_path):
-    stopped(tmp_path, times=2)
-    ending = run_study(tmp_path / "study", tmp_path / "r", lambda s: here(s, stop_after=0))
-    assert (ending.before, ending.done) == (2, 2)

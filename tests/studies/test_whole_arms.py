@@ -14,7 +14,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diag
 sys.path.insert(0, str(FOLDER))
 
 from arm_data import ARMS
-from whole_columns import components, moments, scene_of
+from whole_columns import components, moments
 from whole_draw import WEIGHTS, draw_whole
 from whole_oracle import Sights, oracle_errors
 from world_files import write_world
@@ -53,25 +53,6 @@ def test_the_arm_moves_as_the_columns_say(sights):
     (heavy,) = (e for e in world.effects if e.name == WEIGHTS)
     load = sights.at_here.carried + sights.at_here.weighing @ moments(heavy)
     assert load == pytest.approx(sights.at_here.load, abs=2e-3 * np.abs(load).max())
-
-
-def test_columns_of_geometry_are_the_arms_own_derivatives():
-    """A base and a link moved by 1 µm, an offset by 1 µrad."""
-    world = draw_whole((8, 3), "whole", 8)
-    scene, true = scene_of(world, world.visits), world.specimen.true
-    start = world.noise_free(world.visits)
-    offset, position = true.offset.copy(), true.skeleton.position.copy()
-    offset[1] += 1e-6
-    position[3] += true.skeleton.rotation[3] @ [0.0, 1e-6, 0.0]
-    changed = {
-        "base": replace(true, base_position=true.base_position + 1e-6 * np.eye(3)[0]),
-        "joint": replace(true, offset=offset),
-        "links": replace(true, skeleton=replace(true.skeleton, position=position)),
-    }
-    for name, k in (("base", 0), ("joint", 1), ("links", 6 * 2 + 1)):
-        other = replace(world, specimen=replace(world.specimen, true=changed[name]))
-        moved = (other.noise_free(world.visits) - start).reshape(len(start), -1)
-        assert moved == pytest.approx(1e-6 * getattr(scene, name)[:, :, k], abs=1e-8)
 
 
 def test_the_oracle_errs_as_its_covariance_says():
