@@ -21,14 +21,13 @@ from elastocal.units import Array
 
 # What a solid is to geometry: its hull, its support function and its coal shape.
 
-MOST_MESH_BYTES = 100_000_000
+MESH_BYTES = 100_000_000
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 def hull(solid: Solid) -> tuple[Array, float]:
-    """Points (k, 3) in the carrier's frame and a radius: the solid lies in their convex hull
-    grown by the radius.  Exact for sphere, capsule, box and mesh; a cylinder becomes the capsule
-    around it."""
+    """Points (k, 3) in the carrier's frame and a radius: the solid is their convex hull grown by
+    the radius; a cylinder lies inside."""
     if solid.shape == "mesh":
         points, radius = mesh_hull(solid)[0], 0.0
     elif solid.shape == "box":
@@ -97,42 +96,30 @@ def coal_shape(solid: Solid) -> Any:
     import coal
 
     if solid.shape != "mesh":
-        kind, numbers = {
-            "box": (coal.Box, 3),
-            "sphere": (coal.Sphere, 1),
-            "cylinder": (coal.Cylinder, 2),
-            "capsule": (coal.Capsule, 2),
-        }[solid.shape]
-        return kind(*(float(s) for s in solid.size[:numbers]))
+        return getattr(coal, solid.shape.capitalize())(*solid.size.tolist())
     points, triangles = mesh_hull(solid)
     corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for point in points:
-        corners.append(point)
-    for a, b, c in triangles:
-        faces.append(coal.Triangle(int(a), int(b), int(c)))
+    corners.extend(points)
+    faces.extend(coal.Triangle(*corner) for corner in triangles.tolist())
     return coal.Convex(corners, faces)
 
 
 def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (k, 3) of the mesh's convex hull in the solid's own frame, and its triangles.
-
-    Raises InputError where the file is missing, cannot be read or encloses no volume.
-    """
+    """Vertices (k, 3) of the mesh's convex hull in the solid's own frame, and its triangles."""
     if solid.mesh is None:
         raise InputError(f"body '{solid.name}' is a mesh, but no file is given for it")
-    x, y, z = (float(s) for s in solid.size)
-    return _mesh_hull(solid.mesh, (x, y, z), solid.name)
+    return _mesh_hull(solid.mesh, tuple(solid.size.tolist()), solid.name)
 
 
 @lru_cache(maxsize=256)
 def _mesh_hull(
-    path: Path, scale: tuple[float, float, float], name: str
+    path: Path, scale: tuple[float, ...], name: str
 ) -> tuple[Array, NDArray[np.int64]]:
     import coal
     from scipy.spatial import QhullError
 
     try:
-        check_size(path, "mesh", check_regular(path, "mesh"), MOST_MESH_BYTES)
+        check_size(path, "mesh", check_regular(path, "mesh"), MESH_BYTES)
     except InputError as error:
         raise InputError(f"mesh of body '{name}': {error}") from None
     try:
@@ -163,20 +150,12 @@ def outward(cloud: Array) -> tuple[Array, NDArray[np.int64]]:
 
 WORLD = -1  # fixed in the data's frame
 HANGING = -2  # at the load point, axes parallel to the data's frame
-
-
-# The URDF's own collision geometry as solids carried by the chain's joints.
-
 PARENTS = 6  # directories above the URDF in which a ROS package may lie
 
 
 def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
-    """(solid, carrier) of every <collision> element; those on the base in the base's frame.
-
-    Joints off the chain stand still at their neutral position, as in the kinematics.  Mesh files
-    are looked for beside the URDF, and `package://` in the directories above it.  Raises
-    InputError for a robot without URDF, a mesh that is not there, or no geometry at all.
-    """
+    """(solid, carrier) of every <collision> element; those on the base in the base's frame.  Joints
+    off the chain stand still at their neutral position, as in the kinematics."""
     import pinocchio as pin
 
     path = cell.robot.urdf
@@ -192,9 +171,8 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
     except Exception as error:  # missing files and unreadable ones alike
         raise InputError(
             f"{where}: {path}: {' '.join(str(error).split()).rstrip('.')}; put the mesh files "
-            "where the URDF "
-            "looks for them (beside it, or in a package directory above it), or give "
-            "link_radius_mm instead"
+            "where the URDF looks for them (beside it, or in a package directory above it), or "
+            "give link_radius_mm instead"
         ) from None
     if not geometry.ngeoms:
         raise InputError(
@@ -237,22 +215,16 @@ def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
 
 
 # All bodies of a cell in one list: arm, tool, hanging load, obstacles, each with its carrier.
-#
-# A body stands at frames[:, carrier] @ solid.placement in the data's frame (`collision`).  The
-# arm is rigid here, at its nominal geometry: clearances must cover deflections of a few mm.
+# The arm is rigid here, at its nominal geometry: clearances must cover deflections of a few mm.
 
 Kind = Literal["arm", "carried", "load", "rope", "obstacle"]
-
 UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Body:
-    """A solid and what moves it.
-
-    `carrier`: i ≥ 0 the frame of joint i (0-based, after its motion), WORLD or HANGING;
-    `solid.placement` is in that frame.  What sits on the flange is carried by the last joint.
-    """
+    """A solid and what moves it: `carrier` i ≥ 0 the frame of joint i (0-based, after its motion),
+    WORLD or HANGING, in which `solid.placement` is."""
 
     solid: Solid
     carrier: int
@@ -264,7 +236,6 @@ class Body:
 
     @property
     def hangs(self) -> bool:
-        """There in loaded readings only."""
         return self.carrier == HANGING
 
 
@@ -279,11 +250,7 @@ def data_base(cell: Cell) -> Array:
 
 
 def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
-    """Every body of the cell: arm, carried bodies, hanging load and rope, obstacles.
-
-    Raises InputError where two bodies share a name, a body is carried by an unknown link, or
-    the URDF's own geometry is asked for and cannot be had.
-    """
+    """Every body of the cell: arm, carried bodies, hanging load and rope, obstacles."""
     workspace = cell.workspace
     bodies = (
         *_arm(cell, chain),
@@ -321,12 +288,8 @@ def _arm(cell: Cell, chain: Chain) -> Iterator[Body]:
 def skeleton(
     chain: Chain, radius: tuple[float, ...], T_data_base: Array, where: str
 ) -> Iterator[Body]:
-    """Capsules along the chain: link i from joint i's origin to joint i+1's at zero offset.
-
-    "base" reaches from the base's origin to joint 1 with the radius of link 1, the last link to
-    the flange.  `radius` is one per link, or one for all.  A link whose joints coincide is a
-    sphere; one of radius 0 has no body.
-    """
+    """Capsules along the chain: link i from joint i's origin to joint i+1's at zero offset, the
+    last to the flange, "base" from the base's origin to joint 1; none where a radius is 0."""
     radius = radius * chain.n_joints if len(radius) == 1 else radius
     if len(radius) != chain.n_joints:
         raise InputError(
@@ -364,10 +327,8 @@ def _carried(body: CarriedBody, cell: Cell, chain: Chain) -> Body:
 
 
 def hanging(load: HangingLoad) -> Iterator[Body]:
-    """The rope, straight down from the load point, and the load, its top at the rope's end.
-
-    The load does not turn with the flange: its axes keep their direction in the data's frame.
-    """
+    """The rope, straight down from the load point, and the load, its top at the rope's end; they do
+    not turn with the flange."""
     if load.rope > 0:
         foot = np.array([0.0, 0.0, -load.rope])
         yield Body(capsule_between("rope", np.zeros(3), foot, load.rope_radius), HANGING, "rope")
@@ -401,7 +362,6 @@ class Pair:
 
     @property
     def hangs(self) -> bool:
-        """Counts in loaded readings only."""
         return self.body.hangs or (isinstance(self.other, Body) and self.other.hangs)
 
     @property
@@ -410,15 +370,10 @@ class Pair:
 
 
 def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair, ...]:
-    """All pairs that are checked.
-
-    Every moving body against every obstacle (`clearance`) and every half-space (no margin), links
-    and tool against the mounting plane, where that stands, and
-    the arm's bodies, carried bodies, rope and load among themselves (`self_clearance`), except
-    bodies of the same carrier, neighbouring links, links that joints hold together whatever the
-    pose, the rope with the bodies that hold it, and `ignored_pairs`.  Raises InputError
-    where `ignored_pairs` names a body that is not there.
-    """
+    """Every moving body against every obstacle (`clearance`) and every half-space (no margin), links
+    and tool against the mounting plane, and the arm's bodies, carried bodies, rope and load among
+    themselves (`self_clearance`), except bodies of the same carrier, neighbouring links, links that
+    joints hold together whatever the pose, the rope with what holds it, and `ignored_pairs`."""
     workspace = cell.workspace
     ignored = _ignored(cell, bodies)
     moving = [body for body in bodies if body.carrier != WORLD]
@@ -450,11 +405,8 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
 
 
 def mounting_plane(cell: Cell, chain: Chain) -> HalfSpace | None:
-    """The side of z = 0 of the base on which the arm is; None where it does not count.
-
-    It is known where joint 1 turns about the base's z and joint 2 lies off the plane.  Raises
-    InputError where it is asked for and not known.
-    """
+    """The side of z = 0 of the base on which the arm is; None where it does not count.  It is known
+    where joint 1 turns about the base's z and joint 2 lies off the plane."""
     asked, stated = cell.workspace.mounting_plane, cell.workspace
     if asked is False or (asked is None and (stated.keep_out or stated.obstacles)):
         return None
@@ -513,11 +465,8 @@ def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[s
 
 
 def _held_together(a: Body, b: Body, workspace: Workspace, chain: Chain) -> bool:
-    """Skeleton links i < j whose ends are never further apart than the links between are long.
-
-    Such a pair is in contact at every pose and says nothing (a spherical wrist).  A prismatic
-    joint between them can part them.
-    """
+    """Skeleton links i < j whose ends are never further apart than the links between are long: in
+    contact at every pose, as in a spherical wrist."""
     if workspace.urdf_geometry:
         return False
     i, j = sorted((a.carrier, b.carrier))

@@ -51,7 +51,6 @@ class Poses:
 
     @property
     def loaded(self) -> BoolArray:
-        """(N,): the load hangs, that is, the force is not zero."""
         return np.asarray((self.force != 0).any(axis=1))
 
     @cached_property
@@ -63,8 +62,8 @@ class Poses:
 
 
 def arm_frames(chain: Chain, T_data_base: Array, q: ca.SX) -> tuple[list[ca.SX], ca.SX]:
-    """T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i) of the rigid nominal arm after
-    each joint's motion, and the flange's frame."""
+    """T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i) after each joint's motion, and the
+    flange's frame."""
     T, frames = rigid.constant(T_data_base), []
     for i, joint in enumerate(chain.joints):
         T = T @ rigid.constant(joint.placement) @ rigid.joint_motion(joint.kind, joint.axis, q[i])
@@ -96,19 +95,14 @@ class Kinematics:
         return Poses(q, force, frames, self.chain.flange_placement)
 
 
-# Collision of whole batches of poses in pinocchio and coal, without a Python loop over poses.
-#
-# The pinocchio model is the chain on T_data_base, its universe the data's frame, with one
-# spherical joint more at the load point: its configuration undoes the rotation of the last link,
-# so that what it carries stays upright.  coal tests every pair with its security margin
-# (Pan, Chitta & Manocha 2012; GJK stops as soon as the margin is seen to be kept).
+# Collision in pinocchio and coal, which tests every pair with its security margin (Pan, Chitta &
+# Manocha 2012).  The model is the chain on T_data_base, its universe the data's frame, with one
+# spherical joint more at the load point, which undoes the rotation of the last link.
 
 
 class Collisions:
-    """Tests a fixed list of pairs.
-
-    `free` bodies more, carried by n + 1, n + 2, …, may be placed at will in every pose.
-    """
+    """Tests a fixed list of pairs; `free` bodies more, carried by n + 1, n + 2, …, may be placed at
+    will in every pose."""
 
     def __init__(self, kinematics: Kinematics, pairs: Sequence[Pair], free: int = 0) -> None:
         self.pairs = tuple(pairs)
@@ -130,7 +124,6 @@ class Collisions:
         """
         import pinocchio as pin
 
-        # The hanging joint undoes the rotation of the last link.
         last = poses.frames[:, poses.q.shape[1] - 1, :3, :3]
         upright = Rotation.from_matrix(last.transpose(0, 2, 1)).as_quat()
         configuration = np.hstack([poses.q, upright, *([] if placed is None else [placed])])
@@ -148,7 +141,6 @@ class Collisions:
 
 
 def _pool(model: Any, geometry: Any, pairs: Sequence[Pair]) -> Any:
-    """Pairs of a geometry model, to be tested for many configurations at once in C++."""
     import pinocchio as pin
 
     geometry = geometry.copy()
@@ -161,7 +153,6 @@ def _pool(model: Any, geometry: Any, pairs: Sequence[Pair]) -> Any:
 def hits_by_pair(
     kinematics: Kinematics, pairs: Sequence[Pair], poses: Poses, extra: float = 0.0
 ) -> dict[str, BoolArray]:
-    """ "link3 and wall" → (N,): that pair is too near."""
     return {
         " and ".join(pair.names): Collisions(kinematics, [pair]).hits(poses, extra)
         for pair in pairs
@@ -169,7 +160,6 @@ def hits_by_pair(
 
 
 def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
-    """The chain, its hanging frame and `free` bodies without a carrier as a pinocchio model."""
     import pinocchio as pin
 
     model, parent = pin.Model(), 0
@@ -190,7 +180,6 @@ def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
 
 
 def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> Any:
-    """A pinocchio geometry model with each of the bodies and half-spaces once, without pairs."""
     import coal
     import pinocchio as pin
 
@@ -224,7 +213,6 @@ SHORTEST = 1e-3  # m: nothing fits into a shorter beam
 
 
 def marker_positions(poses: Poses, markers: Sequence[Array]) -> Array:
-    """Markers (m, 3) of the flange frame in the data's frame (N, m, 3)."""
     T = poses.flange
     return np.asarray(np.einsum("nij,mj->nmi", T[:, :3, :3], np.array(markers))) + T[:, None, :3, 3]
 
@@ -232,7 +220,6 @@ def marker_positions(poses: Poses, markers: Sequence[Array]) -> Array:
 def incidence(
     poses: Poses, markers: Sequence[Array], normals: Sequence[Array], eye: Array
 ) -> Array:
-    """Angle (N, m) in rad between each reflector's axis (flange frame) and its line to the eye."""
     to_eye = eye - marker_positions(poses, markers)
     axes = np.einsum("nij,mj->nmi", poses.flange[:, :3, :3], np.array(normals))
     across = np.linalg.norm(np.cross(axes, to_eye), axis=2)
@@ -242,11 +229,10 @@ def incidence(
 class Sight:
     """Beams from the tracker to the markers, tested as capsules against bodies.
 
-    The beam to a marker at distance d is the capsule of `radius` from the tracker to the point
-    4 radii (at least 1 mm) before the marker, so that the body under a reflector does not hide
-    it.  coal's capsules have a fixed length, so two of length l = 2^k ≤ d' < 2 l stand for one of
-    length d': one from the tracker, one up to its end; their union is exactly that beam.
-    A body that contains the tracker's position is the instrument itself and hides nothing.
+    A beam is the capsule of `radius` from the tracker to the point END radii before the marker.
+    coal's capsules have a fixed length, so two of length l = 2^k ≤ d' < 2 l stand for one of length
+    d', one from the tracker, one up to its end; their union is exactly that beam.  A body that
+    contains the tracker's position is the instrument itself and hides nothing.
     """
 
     def __init__(
@@ -261,7 +247,6 @@ class Sight:
         self._by_length: dict[int, Collisions] = {}
 
     def blocked(self, poses: Poses, marker: Array) -> BoolArray:
-        """(N,): something lies between the tracker and a marker (3,) of the flange frame."""
         line = marker_positions(poses, [marker])[:, 0] - self._eye
         distance = np.linalg.norm(line, axis=1)
         length = distance - max(END * self._radius, SHORTEST)
@@ -292,31 +277,24 @@ class Sight:
 
 
 def rope_angle(poses: Poses, axis: Array) -> Array:
-    """Angle (N,) in rad between the vertical and `axis` (3,), the direction in the flange frame
-    in which the rope leaves the tool."""
+    """Angle (N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves it."""
     turned = poses.flange[:, :3, :3] @ (np.asarray(axis) / np.linalg.norm(axis))
     return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
 
 
 class StaticTorque:
-    """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest.
-
-    V is the potential of the model's own loads at the rigid pose: the force at the load point,
-    the links' weights where `link_gravity` is on, the gravity compensator where the cell has one
-    among its effects, at its nominal values.
-    """
+    """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest, V the potential
+    of force, link weights and gravity compensator at the rigid pose and nominal values."""
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
         kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
         model = replace(cell.model, effects=kept, observe="position")
         tool = replace(cell.tool, markers={"tool": np.zeros(3)})
         symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
-        arm = symbolic.arm
-        nominal = [p.nominal for p in symbolic.parameters]
+        arm, nominal = symbolic.arm, ca.DM([p.nominal for p in symbolic.parameters])
         torque = ca.gradient(arm.potential, arm.q_commanded)
-        torque = ca.substitute(torque, symbolic.p, ca.DM(nominal))
-        inputs = [arm.inputs["q"], arm.inputs["force"]]
-        self._compiled = BatchFunction(inputs, [torque])
+        torque = ca.substitute(torque, symbolic.p, nominal)
+        self._compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"]], [torque])
 
     def __call__(self, poses: Poses) -> Array:
         return self._compiled(poses.q, poses.force)[0][..., 0]
@@ -344,8 +322,7 @@ class MotionBound:
     def __init__(
         self, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
     ) -> None:
-        chain = kinematics.chain
-        n = chain.n_joints
+        chain, n = kinematics.chain, kinematics.chain.n_joints
         # Two directions across each revolute axis, in the joint's frame.
         self._across = [
             null_space(joint.axis[None]).T if joint.kind == "revolute" else None
@@ -365,12 +342,9 @@ class MotionBound:
         for k, pair in enumerate(pairs):
             other = pair.other.carrier if isinstance(pair.other, Body) else WORLD
             inner, outer = sorted((pair.body.carrier, other))
-            if HANGING in (inner, outer):
-                at[0, :, k] = n, 0
-                if outer != WORLD:
-                    at[1, :, k] = outer, 0
-            else:
-                at[0, :, k] = outer, inner + 1
+            at[0, :, k] = (n, 0) if inner == HANGING else (outer, inner + 1)
+            if inner == HANGING and outer != WORLD:
+                at[1, :, k] = outer, 0
         self._at = at
 
     def __call__(self, poses: Poses, half: Array) -> Array:
@@ -397,14 +371,11 @@ class MotionBound:
 
 def _reach(bodies: Sequence[Body]) -> tuple[Array, Array]:
     """Points (k, 3) on a joint and what any point of its bodies may be further out (k,)."""
-    points, radii = [], []
-    for body in bodies:
-        own, radius = few_points(body.solid)
-        points.append(own)
-        radii.append(np.full(len(own), radius if body.solid.shape == "cylinder" else 0.0))
-    if not points:  # its origin, which bounds nothing that is asked for
+    if not bodies:  # its origin, which bounds nothing that is asked for
         return np.zeros((1, 3)), np.zeros(1)
-    return np.concatenate(points), np.concatenate(radii)
+    found = [(b.solid.shape, *few_points(b.solid)) for b in bodies]
+    radii = [np.full(len(own), (shape == "cylinder") * radius) for shape, own, radius in found]
+    return np.concatenate([own for _, own, _ in found]), np.concatenate(radii)
 
 
 # Are joint interpolations free of collision?  Certified, not sampled.
@@ -422,18 +393,15 @@ class Paths:
 
     An interval of t in which the distance of a pair changes by at most s from that at its middle
     (`MotionBound`) is free if at the middle every pair keeps its margin + s; else it is halved
-    (adaptive bisection: Schwarzer, Saha & Latombe 2005).  A move is free only if all its intervals
-    are, so "free" holds for every t and not for samples of it; it is refused where a middle breaks
-    a margin or an interval with s ≤ 25 µm cannot be certified.  The load is taken to hang still.
+    (adaptive bisection: Schwarzer, Saha & Latombe 2005).  So "free" holds for every t and not for
+    samples of it; a move is refused where a middle breaks a margin or an interval with
+    s ≤ RESOLUTION cannot be certified.  The load is taken to hang still.
     """
 
     def __init__(
-        self,
-        kinematics: Kinematics,
-        bodies: Sequence[Body],
-        pairs: Sequence[Pair],
+        self, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair],
         load: HangingLoad | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._kinematics, self._load = kinematics, load
         self._collisions = Collisions(kinematics, pairs)
         self._bound = MotionBound(kinematics, bodies, pairs)

@@ -145,11 +145,9 @@ class CriterionInputs:
         return coefficients
 
     def _given(self, array: Array | None, what: str) -> Array:
-        if array is None:
-            raise InputError(
-                f"criterion {self.criterion} needs {what}: add to [design], or choose another"
-            )
-        return array
+        need = f"criterion {self.criterion} needs {what}: add to [design], or choose another"
+        require(array is not None, need)
+        return np.asarray(array)
 
 
 class ScenarioCriterion(ABC):
@@ -556,16 +554,14 @@ class DeterminantCriterion(MeanCriterion):
         K = self.E @ V @ self.E.T
         return np.asarray(self.volume * np.exp(np.linalg.slogdet(K)[1] / len(self.E)))
 
-    def slope(self, V: Array) -> tuple[float, Array]:
-        K, value = self.E @ V @ self.E.T, float(self.value(V))
-        return value, value / len(K) * self.E.T @ np.linalg.solve(K, self.E)
+    def phi(self, lam: Array) -> Array:
+        return self.volume * power_mean(lam, 0.0)
 
-    def curvature(self, V: Array, X: Array) -> Array | float:
-        K, k, value = self.E @ V @ self.E.T, len(self.E), float(self.value(V))
-        Y = np.linalg.solve(K, self.E @ X @ self.E.T)
-        trace = np.einsum("kii->k", Y)
-        pairs = Y.reshape(len(Y), -1) @ Y.swapaxes(1, 2).reshape(len(Y), -1).T
-        return np.asarray(value / k * (np.outer(trace, trace) / k - pairs))
+    def phi_slope(self, lam: Array) -> Array:
+        return self.volume * mean_slope(lam, 0.0)
+
+    def phi_curvature(self, lam: Array) -> Array:
+        return self.volume * mean_curvature(lam, 0.0)
 
     def turned(self, T: Array) -> ScenarioCriterion:
         """E T = L Q: what L stretches is a factor, so that Q keeps the determinant's digits."""

@@ -47,17 +47,15 @@ ADVICE = {
 
 
 class Rule(ABC):
-    """One thing a pose must respect."""
+    """One thing a pose must respect; its causes: a joint, a marker, a pair of bodies → (N,)."""
 
     name: str
 
     @abstractmethod
-    def broken(self, poses: Poses) -> BoolArray:
-        """(N,): the pose breaks this rule."""
+    def causes(self, poses: Poses) -> dict[str, BoolArray]: ...
 
-    @abstractmethod
-    def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        """By what: a joint, a marker, a pair of bodies → (N,)."""
+    def broken(self, poses: Poses) -> BoolArray:
+        return np.any(list(self.causes(poses).values()), axis=0)
 
     def remedy(self, poses: Poses) -> str:
         """What to relax for poses that break this rule and no other."""
@@ -86,10 +84,6 @@ class Bound(Rule):
     def _outside(self, poses: Poses) -> tuple[Array, BoolArray, BoolArray]:
         value = self.quantity(poses)
         return value, value < self.lower - SAME, value > self.upper + SAME
-
-    def broken(self, poses: Poses) -> BoolArray:
-        _, below, above = self._outside(poses)
-        return np.asarray((below | above).any(axis=1))
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         _, below, above = self._outside(poses)
@@ -120,12 +114,9 @@ class Struck(Rule):
     def __init__(self, struck: Array) -> None:
         self._struck = struck
 
-    def broken(self, poses: Poses) -> BoolArray:
-        off = [np.abs(poses.q - q).max(axis=1) for q in self._struck]
-        return np.asarray(np.min(off, axis=0) < NEARBY)
-
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        return {"a pose struck out": self.broken(poses)}
+        off = [np.abs(poses.q - q).max(axis=1) for q in self._struck]
+        return {"a pose struck out": np.asarray(np.min(off, axis=0) < NEARBY)}
 
 
 # Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
@@ -163,13 +154,9 @@ class LineOfSight(Rule):
     name = "line_of_sight"
 
     def __init__(
-        self,
-        kinematics: Kinematics,
-        bodies: Sequence[Body],
-        eye: Array,
-        radius: float,
+        self, kinematics: Kinematics, bodies: Sequence[Body], eye: Array, radius: float,
         markers: Mapping[str, Array],
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._sight = Sight(kinematics, bodies, eye, radius)
         self._markers = dict(markers)
         self._one = lambda body: Sight(kinematics, [body], eye, radius)
@@ -185,12 +172,11 @@ class LineOfSight(Rule):
         return self._sight.blocked(poses, self._markers[marker])
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        found = {}
-        for body in self._sight.bodies:
-            sight = self._one(body)
-            for name, marker in self._markers.items():
-                found[f"{name} behind {body.name}"] = sight.blocked(poses, marker)
-        return found
+        return {
+            f"{name} behind {body.name}": self._one(body).blocked(poses, marker)
+            for body in self._sight.bodies
+            for name, marker in self._markers.items()
+        }
 
 
 class EnoughMarkers(Rule):
@@ -224,13 +210,9 @@ class EnoughMarkers(Rule):
         return dict(zip(self._markers, ~self.seen(poses).T, strict=True))
 
 
-# What the rules say of a batch of candidates.
-
-
 @dataclass(frozen=True)
 class PoseFeasibility:
-    """`broken` (N, R): candidate i breaks rule r, whatever the others; `rules` (R) their names
-    in the order of checking; `q` (N, n) and `force` (N, 3) the candidates themselves."""
+    """What the `rules` (R) say of candidates `q` (N, n) under `force` (N, 3): `broken` (N, R)."""
 
     rules: tuple[str, ...]
     broken: BoolArray
@@ -254,7 +236,6 @@ class PoseFeasibility:
 def rule_book(
     cell: Cell, chain: Chain, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
 ) -> tuple[Rule, ...]:
-    """All rules of the cell.  Raises InputError where they do not fit the robot."""
     bounds = tuple(_visibility(cell))
     sight: tuple[Rule, ...] = ()
     stated, markers, least = cell.workspace.visibility, cell.tool.markers, None
@@ -278,10 +259,13 @@ def rule_book(
 
 
 def _joints(cell: Cell, chain: Chain) -> Rule:
-    lower, upper = joint_limits(cell, chain)
-    labels = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
+    (lower, upper), labels = joint_limits(cell, chain), _labels(chain)
     units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
     return Bound("joint_limits", lambda p: p.q, lower, upper, labels, "a limit", units)
+
+
+def _labels(chain: Chain) -> tuple[str, ...]:
+    return tuple(f"joint{i + 1}" for i in range(chain.n_joints))
 
 
 def _visibility(cell: Cell) -> Iterator[Rule]:
@@ -331,9 +315,8 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
                 f"but robot '{chain.name}' has {chain.n_joints} joints"
             )
         torque = StaticTorque(cell, chain)
-        labels = tuple(f"joint{i + 1}" for i in range(len(bound)))
         yield Bound(
-            "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, labels,
+            "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, _labels(chain),
             "a torque_limits_Nm", ("N m",),
         )  # fmt: skip
 
@@ -344,11 +327,8 @@ SAMPLE = 2000  # candidates whose causes are looked at
 
 
 def advice(verdict: PoseFeasibility, rules: Sequence[Rule], kinematics: Kinematics) -> str:
-    """The rule, or the smallest set of rules, that stops most candidates by itself.
-
-    Among the sets of rules that candidates break, the smallest, and of these the one broken most
-    often: dropping it frees as many candidates, and no smaller set frees any.
-    """
+    """The smallest set of rules that stops candidates by itself, and of these the one that stops
+    most: dropping it frees as many, and no smaller set frees any."""
     sets, which, counts = np.unique(verdict.broken, axis=0, return_inverse=True, return_counts=True)
     which = which.ravel()
     size = sets.sum(axis=1)
@@ -367,20 +347,13 @@ def advice(verdict: PoseFeasibility, rules: Sequence[Rule], kinematics: Kinemati
     return text + "; ".join(rule.remedy(poses) for rule in chosen)
 
 
-# May the arm stand there, and may it go there?  All rules of the cell in one place.
-
 LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
 MOST_TRIED = 300  # random poses in which a pair must once keep apart to be believed
 
 
 class Feasibility:
-    """The rules of a cell for the nominal, rigid arm.
-
-    `bodies` and `pairs`: what there is and what must keep apart; `rules` in the order of
-    checking, cheap ones first; `struck` (m, n): poses near which none may be.  Pickles by what it
-    is made of, so that processes can share it.
-    Raises InputError for a workspace that does not fit the robot.
-    """
+    """The rules of a cell for the nominal, rigid arm, in the order of checking; `struck` (m, n):
+    poses near which none may be.  Pickles by what it is made of, so that processes can share it."""
 
     def __init__(self, cell: Cell, chain: Chain, struck: Array | None = None) -> None:
         self.cell, self.chain, self._struck = cell, chain, struck
@@ -395,12 +368,8 @@ class Feasibility:
         return Feasibility, (self.cell, self.chain, self._struck)
 
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
-        """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N; not `every`:
-        a pose that broke a rule is not looked at again.
-
-        The load hangs wherever the force is not zero.  Raises InputError for joint values that
-        are not finite or of another robot.
-        """
+        """Every rule on every pose q (N, n) under a force (3,) or (N, 3) N; not `every`: a pose that
+        broke a rule is not looked at again.  The load hangs wherever the force is not zero."""
         poses = self._poses(q, force)
         broken = np.zeros((len(poses), len(self.rules)), dtype=bool)
         left = np.arange(len(poses))
@@ -428,7 +397,6 @@ class Feasibility:
         return verdict
 
     def feasible(self, q: Array, forces: Array) -> BoolArray:
-        """(N,): poses q (N, n) break no rule under any of `forces` (k, 3) or (3,) N."""
         return self.under(q, np.atleast_2d(forces)).ok
 
     @property
@@ -436,8 +404,7 @@ class Feasibility:
         return any(isinstance(rule, EnoughMarkers) for rule in self.rules)
 
     def seen(self, q: Array, force: Array) -> BoolArray:
-        """(N, markers): which markers the tracker sees of poses q (N, n) that are feasible under a
-        force (3,) or (N, 3) N."""
+        """(N, markers): which markers the tracker sees of poses that are feasible."""
         poses = self._poses(q, force)
         for rule in self.rules:
             if isinstance(rule, EnoughMarkers):
@@ -466,11 +433,8 @@ class Feasibility:
         )
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
-        """(M,) for moves q_from → q_to (M, n); `loaded` for all or per move (M,).
-
-        Keep-out, obstacles, self-collision, height and rope angle of the load hold all the way;
-        visibility and torque concern poses at rest.  See `Paths` for what "free" guarantees.
-        """
+        """(M,) for moves q_from → q_to (M, n), as `Paths` guarantees it; visibility and torque
+        concern poses at rest."""
         start, end = self._poses(q_from, LOADED).q, self._poses(q_to, LOADED).q
         start, end = np.broadcast_arrays(start, end)
         return self._paths.free(start, end, np.broadcast_to(loaded, len(start)))
