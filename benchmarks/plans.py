@@ -1,8 +1,11 @@
 """Measurement plans: error, bound, CPU, of each effort, and how they grow.
 
     python benchmarks/plans.py [--beside SRC] [--efforts quick normal] [--only CELL …] [--growth]
+                               [--rounding]
 
 `--beside`: the source folder of another checkout, whose quick plans are made of the same cells.
+`--rounding`: normal plans of the first of the cells, of its number of poses and of three times as
+many: what of the distance to the bound goes with whole poses in place of weights.
 """
 
 from __future__ import annotations
@@ -115,10 +118,18 @@ def main() -> None:
     parser.add_argument("--efforts", nargs="+", default=["quick", "normal"])
     parser.add_argument("--only", nargs="+", default=list(CELLS), choices=CELLS, metavar="CELL")
     parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--rounding", action="store_true")
     chosen = parser.parse_args()
     beside: dict[str, str] = {"PYTHONPATH": str(chosen.beside)} if chosen.beside else {}
     lower, ratios, shares = [], [], []
     with tempfile.TemporaryDirectory() as name:
+        if chosen.rounding:
+            arm, rules, poses, more = CELLS[chosen.only[0]]
+            cell = cell_file(Path(name), arm, rules)
+            plans = {n: planned(cell, n, "normal", *more) for n in (poses, 3 * poses)}
+            heads = ["poses", "parameters", "ρ₀ µm", "CPU s", "of pool", "of continuum"]
+            rows = [[n, len(plan["predicted"]), *figures(plan)] for n, plan in plans.items()]
+            return table(f"Whole poses or weights: {chosen.only[0]}, normal", heads, rows)
         heads = ["cell", *(f"{e}: {what}" for e in chosen.efforts for what in
                            ("ρ₀ µm", "CPU s", "of pool", "of continuum"))]  # fmt: skip
         rows = []

@@ -117,7 +117,7 @@ def planned(name: str, effort: Effort = "quick", seed: int = 0) -> tuple[Plan, S
         plan = design(cell, DesignOptions(effort, seed))
     setup, e = observed[0], plan.everywhere
     if e is not None and e.share:
-        setup = setup.sharing(e.share)
+        setup = replace(setup, share=e.share)
     return plan, setup, Feasibility(plan.model.cell, plan.model.chain)
 
 

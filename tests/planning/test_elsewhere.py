@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.cells import DOWN, kr270_chain, random_poses
@@ -54,7 +56,7 @@ def test_the_share_is_the_largest_that_the_cap_allows_and_no_plan_beats_the_boun
 
     def price(share: float) -> float:
         """How much more error at the test poses the relaxed optimum leaves."""
-        problem = setup.sharing(share).problem(pool, six)
+        problem = replace(setup, share=share).problem(pool, six)
         turned, _ = balanced(problem)
         relaxed = relax(turned)
         assert relaxed.bound <= exact_plan(turned, relaxed)[1]

@@ -112,9 +112,7 @@ def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
 
 
 @lru_cache(maxsize=256)
-def _mesh_hull(
-    path: Path, scale: tuple[float, ...], name: str
-) -> tuple[Array, NDArray[np.int64]]:
+def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, NDArray[np.int64]]:
     import coal
     from scipy.spatial import QhullError
 
@@ -370,10 +368,11 @@ class Pair:
 
 
 def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair, ...]:
-    """Every moving body against every obstacle (`clearance`) and every half-space (no margin), links
-    and tool against the mounting plane, and the arm's bodies, carried bodies, rope and load among
-    themselves (`self_clearance`), except bodies of the same carrier, neighbouring links, links that
-    joints hold together whatever the pose, the rope with what holds it, and `ignored_pairs`."""
+    """Every moving body against every obstacle (`clearance`) and every half-space (no margin),
+    links and tool against the mounting plane, and the arm's bodies, carried bodies, rope and load
+    among themselves (`self_clearance`), except bodies of the same carrier, neighbouring links,
+    links that joints hold together whatever the pose, the rope with what holds it, and
+    `ignored_pairs`."""
     workspace = cell.workspace
     ignored = _ignored(cell, bodies)
     moving = [body for body in bodies if body.carrier != WORLD]

@@ -25,10 +25,8 @@ from elastocal.units import Array, IntArray, Progress
 
 @dataclass(frozen=True)
 class JointSpace:
-    """`lower`, `upper` (n,) in rad or m, both finite; joint `held` (0-based) only takes `levels`.
-
-    Without a held joint there is one group of poses and no level.
-    """
+    """`lower`, `upper` (n,) in rad or m, both finite; joint `held` (0-based) only takes `levels`,
+    each a group of poses."""
 
     lower: Array
     upper: Array
@@ -40,7 +38,6 @@ class JointSpace:
         return max(len(self.levels), 1)
 
     def bounds(self, group: int) -> tuple[Array, Array]:
-        """Bounds (n,) of the poses of a group; equal for the held joint."""
         lower, upper = self.lower.copy(), self.upper.copy()
         if self.held is not None:
             lower[self.held] = upper[self.held] = self.levels[group]
@@ -56,12 +53,6 @@ class JointSpace:
 
 
 def joint_space(cell: Cell, chain: Chain) -> JointSpace:
-    """The robot's limits, narrowed by [limits], with the levels of [design.levels].
-
-    A joint without a limit turns once, from −π to π, or slides 2 m (`finite_ranges`).  Raises
-    InputError as `joint_limits` does, and where the compliance of a joint is known at levels that
-    the plan does not keep to.
-    """
     lower, upper = finite_ranges(chain, *joint_limits(cell, chain))
     wanted = cell.design.levels
     for joint, levels in cell.model.compliance_levels.items():
@@ -92,11 +83,8 @@ TRIES = 200  # per pose wanted, at most
 
 @dataclass(frozen=True)
 class Candidates:
-    """Feasible poses q (N, n) and their `group` (N,): the level of the held joint.
-
-    `removed_by` counts what was tried in vain by the first rule broken:
-    tried = feasible + Σ removed_by.
-    """
+    """Feasible poses q (N, n) and their `group` (N,): the level of the held joint.  `removed_by`:
+    what was tried in vain by the first rule broken, tried = feasible + Σ removed_by."""
 
     q: Array
     group: IntArray
@@ -122,17 +110,11 @@ def draw(
     jobs: int = 1,
     progress: Progress = lambda message: None,
 ) -> Candidates:
-    """About `n` candidates feasible under all `forces` (L, 3) N, equally many per level of the held
-    joint.
+    """About `n` candidates feasible under all `forces` (L, 3) N, equally many per level.
 
     Owen-scrambled Sobol points (Owen 1998; scipy.stats.qmc) over the joint ranges, one sequence
-    per level, filtered by the cell's rules chunk by chunk until there are enough, or until 200
-    tries per candidate wanted.  Fewer than `n` are returned where fewer were found.  The result
-    depends on `seed` only, not on `jobs`, the number of processes (−1: all cores).
-
-    Raises InputError as `joint_space` does and where n is less than the number of levels,
-    InsufficientDataError where a level (or the whole range) has no feasible pose, with the rule
-    to relax.
+    per level, filtered chunk by chunk until there are enough, or TRIES per candidate wanted.  The
+    result depends on `seed` only, not on `jobs`, the number of processes (−1: all cores).
     """
     space = joint_space(cell, chain)
     groups = space.n_groups
@@ -164,10 +146,7 @@ def brought(
     pins: Pins | None,
 ) -> tuple[Candidates, list[str], str]:  # fmt: skip
     """The poses of a table that the cell allows, but for those that stay anyhow, the name of each,
-    and which are refused.  A pose that stands in several rows is one.
-
-    Raises InsufficientDataError where none is allowed, with the rule to relax.
-    """
+    and which are refused.  A pose that stands in several rows is one."""
     space = joint_space(cell, chain)
     q, first = np.unique(np.round(table.q, 9), axis=0, return_index=True)
     order = np.argsort(first, kind="stable")
@@ -247,7 +226,6 @@ def _fill(chunks: Iterator[Candidates], wanted: int) -> Candidates:
 
 
 def told(chain: Chain, j: int, value: float) -> str:
-    """A value in rad or m of joint j as people read it: "-25.24°"."""
     return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"
 
 
@@ -257,11 +235,8 @@ DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
 
 
 def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
-    """Poses (L,) per level of [design.levels]; (1,) without levels.
-
-    `n_poses` overrides what the cell says; what does not divide evenly goes to the first levels.
-    Raises InputError where levels would be left without a pose, or `per_level` contradicts.
-    """
+    """Poses (L,) per level of [design.levels], (1,) without, `n_poses` in all or as the cell says;
+    what does not divide evenly goes to the first levels."""
     spec = cell.design
     levels = _levels(cell)
     where = f"{cell.path or cell.name}: [design]"
@@ -296,11 +271,8 @@ def check_levels(cell: Cell, name: str, poses: int) -> None:
 
 
 def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
-    """Are there as many candidates per level, `available` (L,), as the plan has poses there?
-
-    A candidate stands in a plan once.  Raises InputError where too few were asked for,
-    InsufficientDataError where too few are feasible.
-    """
+    """Raise where a level has fewer candidates, `available` (L,), than poses: InputError where too
+    few were asked for, InsufficientDataError where too few are feasible."""
     short = np.flatnonzero(available < shares)
     if not len(short):
         return
@@ -336,10 +308,7 @@ class Pins:
     taken: tuple[str, ...]
 
     def placed(self, cell: Cell, chain: Chain, rules: Feasibility) -> IntArray:
-        """The level (k,) of each pose that stays.
-
-        Raises InputError where one is at no level of the cell, or breaks a rule.
-        """
+        """The level (k,) of each pose that stays."""
         group = np.zeros(len(self.q), dtype=np.int64)
         verdict = rules.every(self.q, plan_forces(cell))
         # That it stands near one struck out is the user's choice.
@@ -363,11 +332,7 @@ def read_pins(
 ) -> tuple[Cell, Pins]:
     """What stays and what is struck, as in "plan.csv:3,7" (all stay, where none is named), of which
     plan all others stay; and the cell, which asks for as many poses as the plan had of which poses
-    are struck, unless it is `sized`.
-
-    Raises InputError for files that cannot be read, a name that the plan lacks or that stays twice,
-    and where nothing is named to strike.
-    """
+    are struck, unless it is `sized`."""
     kept: dict[str, Array] = {}
     struck: list[Array] = []
     taken: dict[str, None] = {}

@@ -66,7 +66,6 @@ class Boxes:
         return cls(tuple(boxes), corners[:, 0], corners[:, 1])
 
     def places(self, cell: Cell) -> Array:
-        """Where the cell has them (k, 3)."""
         known = cell.tool.markers | {
             LOAD_POINT: cell.tool.load_point,
             TRACKER: cell.tracker.position,
@@ -119,8 +118,7 @@ class Choice:
     progress: Progress
 
     def best(self) -> Chosen:
-        """The best places and loads found.  Raises InputError where they cannot be compared,
-        InsufficientDataError where the cell allows no pose for any of them."""
+        """The best places and loads found."""
         cell = self.work.cell
         where, freedom = cell.path or cell.name, cell.design.choose
         assert freedom is not None
@@ -298,10 +296,7 @@ TRIES = 3  # plans whose moves took longer than was thought
 def within(
     choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes: float
 ) -> Plan:  # fmt: skip
-    """The plan of least error that takes no longer than `minutes`, with its alternatives.
-
-    Raises InsufficientDataError where nothing that determines the parameters fits.
-    """
+    """The plan of least error that takes no longer than `minutes`, with its alternatives."""
     asked = minutes
     for left in reversed(range(TRIES)):
         sizes, best, poses = _sizes(choice, cell, asked)
@@ -329,8 +324,7 @@ class _Fit(NamedTuple):
 def _sizes(
     choice: Choice, cell: Cell, minutes: float
 ) -> tuple[tuple[TimedSize, ...], TimedSize, int]:
-    """What fits, by numbers of repeats, the best of them, and the number of poses in all load
-    states that has as many stops."""
+    """What fits, by numbers of repeats, the best, and how many poses have as many stops as it."""
     spec, drawn, found = cell.design, choice.draw(cell), list[_Fit]()
     # Where a reading takes no time nothing says how many of them there may be.
     for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):
@@ -438,11 +432,7 @@ def single_ways(information: PoseInformation) -> IntArray:
 def chosen_states(
     setup: Setup, q: Array, group: IntArray, shares: IntArray, progress: Progress
 ) -> tuple[IntArray, LoadStates]:
-    """The ways (K, L) in which candidates q (N, n) are best read, and why.
-
-    Raises InputError where readings of a pose in several load states share what the choice takes
-    for independent.
-    """
+    """The ways (K, L) in which candidates q (N, n) are best read, and why."""
     information, cell = setup.information, setup.information.model.cell
     require(
         not cell.noise.configuration or cell.model.observe == "deflection",
@@ -458,7 +448,6 @@ def chosen_states(
     few = np.arange(0, len(q), max(len(q) // SOME, 1))
 
     def relaxed(ways: IntArray) -> tuple[float, Array]:
-        """Φ of the relaxed optimum and the weight of each way."""
         own = replace(setup, ways=ways)
         problem, _ = balanced(own.problem(own.pool(q[few], group[few]), shares))
         weights = prospects(problem, GAIN / 3).weights

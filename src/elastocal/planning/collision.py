@@ -62,8 +62,8 @@ class Poses:
 
 
 def arm_frames(chain: Chain, T_data_base: Array, q: ca.SX) -> tuple[list[ca.SX], ca.SX]:
-    """T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i) after each joint's motion, and the
-    flange's frame."""
+    """T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i) after each joint's motion, and
+    the flange's frame."""
     T, frames = rigid.constant(T_data_base), []
     for i, joint in enumerate(chain.joints):
         T = T @ rigid.constant(joint.placement) @ rigid.joint_motion(joint.kind, joint.axis, q[i])
@@ -277,14 +277,16 @@ class Sight:
 
 
 def rope_angle(poses: Poses, axis: Array) -> Array:
-    """Angle (N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves it."""
+    """Angle (N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves
+    it."""
     turned = poses.flange[:, :3, :3] @ (np.asarray(axis) / np.linalg.norm(axis))
     return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
 
 
 class StaticTorque:
-    """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest, V the potential
-    of force, link weights and gravity compensator at the rigid pose and nominal values."""
+    """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest, V the
+    potential of force, link weights and gravity compensator at the rigid pose and nominal
+    values."""
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
         kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)

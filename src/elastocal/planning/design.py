@@ -122,17 +122,9 @@ def design(
     checkpoint: Checkpoint | None = None,
     progress: Progress = lambda message: None,
 ) -> Plan:
-    """The measurement plan that [design] of the cell asks for, with its certificates.
-
-    Candidates from Sobol points that every rule of [workspace] allows; their information from the
-    symbolic model; convex relaxation (the bound), exchange, polish; order of execution.  The plan
-    depends on the cell, the options and the seed, not on `options.jobs`, and not on whether the
-    work was interrupted and taken up again from `checkpoint`.
-
-    Raises InputError where cell and options contradict themselves or each other;
-    InsufficientDataError where no pose is feasible, or a parameter that the criterion needs cannot
-    be seen.
-    """
+    """The measurement plan that [design] of the cell asks for, with its certificates.  It depends
+    on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
+    interrupted and taken up again from `checkpoint`."""
     # Products of matrices of a few dozen rows: more threads of BLAS wait for each other.
     with threadpool_limits(limits=1, user_api="blas"):
         return _planned(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress)
@@ -202,8 +194,7 @@ class _Design:
         return _without(whole, tuple(functions), options)
 
     def _without_conditions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
-        """The model without effects of time, temperature or the approach, none of which a pose
-        has before it stands in an order."""
+        """Without effects of what a pose has only once it stands in an order."""
         whole, self.conditions = self.model, None
         effects = dict.fromkeys(c.name for c in whole.cell.model.effects)
         needs = {name: OPEN & set(effect_of(name).needed(whole.cell)) for name in effects}
@@ -272,7 +263,7 @@ class _Design:
             state = self.checkpoint.finished(
                 "share", lambda: {"share": share_within(search, pool, shares, cap, progress)}
             )
-            setup = setup.sharing(float(state["share"]))
+            setup = replace(setup, share=float(state["share"]))
         search = setup.having(pinned)
         searches = Searches(search, self.space, self.feasibility)
         effort = EFFORTS[options.effort]
@@ -362,7 +353,6 @@ class _Design:
         }
 
     def _curve(self, setup: Setup, pool: FeasiblePool) -> tuple[PlanSize, ...]:
-        """The criterion against the numbers of poses that are asked for."""
         if not self.options.curve:
             return ()
 
@@ -383,10 +373,8 @@ class _Design:
         self, setup: Setup, pool: FeasiblePool,
         sought: Callable[[IntArray, Checkpoint], tuple[Search, Selection]],
     ) -> tuple[Search, Selection, tuple[PlanSize, ...]]:  # fmt: skip
-        """The plan of the fewest poses that meets the target, and the sizes that were tried.
-
-        The bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next.
-        """
+        """The plan of the fewest poses that meets the target, and the sizes that were tried: the
+        bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
         wanted, figure = self.cell.design.target, setup.criterion.figure
         assert wanted is not None
         target, tried = self._target(setup, wanted), dict[int, PlanSize]()
@@ -553,8 +541,6 @@ def _check_home(cell: Cell, feasibility: Feasibility) -> None:
 
 
 def _check_criterion(model: Model) -> None:
-    """The criterion is known; `[design] combination` is there where it is needed, and names
-    parameters."""
     cell = model.cell
     where, asked = cell.path or cell.name, cell.design.criterion
     needs = criterion_named(asked, f"{where}: key design.criterion").needs

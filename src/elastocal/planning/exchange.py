@@ -9,7 +9,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -53,7 +52,7 @@ def exchange(
         k = int(places[0])
         places = [*places[1:], k]
         V = inverse(problem.information(np.delete(plan, k)))
-        free = _free(problem, plan, problem.group[plan[k]])
+        free = np.setdiff1d(np.flatnonzero(problem.group == problem.group[plan[k]]), plan)
         phi, C = criterion.slope(V)
         d = problem.prices(V @ C @ V)[free]
         upper = (1 + d / phi) / phi if criterion.certifiable else np.full(len(d), np.inf)
@@ -76,12 +75,6 @@ def exchange(
         if found < value * (1 - LEAST):
             plan, value, vain = new, found, 0
     return np.sort(plan), value
-
-
-def _free(problem: DesignProblem, plan: IntArray, group: Any) -> IntArray:
-    free = problem.group == group
-    free[plan] = False
-    return np.flatnonzero(free)
 
 
 def with_poses(V: Array, B: Array) -> Array:
@@ -109,15 +102,13 @@ def random_plan(problem: DesignProblem, rng: np.random.Generator) -> IntArray:
 
 
 def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
-    """M (n, p, p) of plans drawn uniformly from the candidates of `problem`, with its shares."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
     return np.stack([problem.information(random_plan(problem, rng)) for _ in range(n)])
 
 
 def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
     """A plan (n,), sorted, of the problem's shares from one of others: of each group those of the
-    plan first, and by price.  Where no share is smaller than before it is therefore never worse.
-    """
+    plan first, and by price."""
     V = inverse(problem.information(plan))
     price = problem.prices(V @ problem.criterion.slope(V)[1] @ V)
     price[plan] += price.max()
@@ -125,16 +116,9 @@ def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
 
 
 def values_without(problem: DesignProblem, chosen: IntArray) -> Array:
-    """Φ (n,) of the plan `chosen` (n,) without its k-th pose; inf where nothing replaces it.
-
-    By sums of what comes before and after k: no subtraction, so that a pose that alone determines a
-    parameter leaves an exactly singular M.
-    """
-    each = problem.matrices(chosen)
-    before, after = np.zeros_like(each), np.zeros_like(each)
-    before[1:] = np.cumsum(each[:-1], axis=0)
-    after[:-1] = np.cumsum(each[:0:-1], axis=0)[::-1]
-    return problem.criterion.of_information(problem.prior + before + after)
+    """Φ (n,) of the plan `chosen` (n,) without its k-th pose; inf where nothing replaces it."""
+    rest = [problem.information(np.delete(chosen, k)) for k in range(len(chosen))]
+    return problem.criterion.of_information(np.stack(rest))
 
 
 # The best plan of several starts.
@@ -153,12 +137,9 @@ def exact_plan(
     problem: DesignProblem, relaxed: Relaxed, *, starts: int = 2, seed: int = 0,
     warm: IntArray | None = None,
 ) -> tuple[IntArray, float]:  # fmt: skip
-    """The plan (n,) of least Φ found from `starts` starts, and Φ, of a `balanced` problem.
-
-    The first start is `warm`, a plan that may have other shares, or the rounded relaxation; others
-    are roundings drawn at random.  Each is improved by exchange with the most promising candidates,
-    the best at last with all.
-    """
+    """The plan (n,) of least Φ found from `starts` starts, and Φ: `warm`, a plan that may have
+    other shares, or the rounded relaxation, and roundings drawn at random.  Each is improved by
+    exchange with the most promising candidates, the best at last with all."""
     rng, weights = np.random.default_rng(seed), relaxed.weights
     begins = [rounded(problem, weights) if warm is None else fitted(problem, warm)]
     begins += [rounded(problem, weights, rng) for _ in range(starts - 1)]
@@ -181,12 +162,8 @@ def sized_plans(
     problem_of: Callable[[int], DesignProblem], numbers: Iterable[int], seed: int,
     progress: Progress,
 ) -> dict[int, tuple[float, float]]:  # fmt: skip
-    """Φ of the best plan found by number of poses, and the bound on all such; NaN without one.
-
-    `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Each plan is
-    begun from the next smaller one: where no group's share falls with n, Φ does not rise.  Raises
-    InsufficientDataError where no plan of one of `numbers` determines everything.
-    """
+    """Φ of the best plan found by number of poses, and the bound on all such, NaN without one; each
+    begun from the next smaller one, so that Φ does not rise where no group's share falls with n."""
     found: dict[int, tuple[float, float]] = {}
     chosen, weights = None, None
     for n in sorted(numbers):
@@ -207,15 +184,13 @@ def first_allowed(
 ) -> int:
     """The least n in [low, high] for which the bound, which falls with n, allows Φ ≤ `target`;
     high + 1 where there is none."""
-
-    def allows(n: int) -> bool:
-        return prospects(balanced(problem_of(n))[0], 1e-3).bound <= target
-
-    return low + bisect_left(range(low, high + 1), True, key=allows)
+    return low + bisect_left(
+        range(low, high + 1), True,
+        key=lambda n: prospects(balanced(problem_of(n))[0], 1e-3).bound <= target,
+    )  # fmt: skip
 
 
 def check_determined(problem: DesignProblem, value: float) -> None:
-    """Raise InsufficientDataError where the best plan found leaves parameters open."""
     if not np.isfinite(value):
         raise InsufficientDataError(
             f"no plan of {problem.n_poses} poses that determines all "

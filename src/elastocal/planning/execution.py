@@ -41,9 +41,8 @@ class Alias:
 
     `share` (N, L, m, 3): the error (m,) that a shift (3,) m of the readings of pose i in load
     state l leaves: R M⁻¹ B_iᵀ Σ_i⁻¹ D_il, D_il how readings enter the observations, |R x| the rms
-    error at the test poses in m where `at_test_poses`, else x in its own standard deviations.
-    `noise`: what the readings' noise leaves, in the same terms.  `whitened` (N, L, r, 3): the
-    Σ_i^(-1/2) D_il, beside the `blocks` (N, r, p) of the plan's information.
+    error at the test poses in m where `at_test_poses`, else x in its own standard deviations, as
+    `noise` is.  `whitened` (N, L, r, 3): Σ_i^(-1/2) D_il; `blocks` (N, r, p) of the plan.
     """
 
     share: Array
@@ -57,9 +56,8 @@ class Alias:
         cls, information: PoseInformation, q: Array, blocks: Array, M: Array, R: Array | None,
         readings: IntArray | None = None,
     ) -> Alias | None:  # fmt: skip
-        """Of a plan of poses q (N, n) with `blocks` (N, r, p), read as `readings` (N, L), and all
-        that is known M (p, p), |R x| the rms error at the test poses; None where readings are
-        distances, which a shift changes by no more than its part along the line of sight."""
+        """Of a plan of poses q (N, n), read as `readings` (N, L), and all that is known M (p, p);
+        None where readings are distances, which a shift hardly changes."""
         observed, factor = information.noise(q, readings)
         if observed.kind == "distance":
             return None
@@ -112,13 +110,12 @@ class Drifting:
 
 
 def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> list[int]:
-    """Load states in the order in which they come, each entry one block of visits.
+    """The `used` load states in the order in which they come, each entry one block of visits.
 
-    `loaded` (L,): which states have a load; `used`: those that are visited.  At most `changes`
-    loads are hung, exchanged or taken off, the arm beginning and ending without; None: as few as
-    the states allow.  Without load the arm is measured in every gap, first and last of all, so
-    that neither the loads nor their absence fall to one part of the time.  Raises InputError
-    where there are fewer changes than loads need.
+    `loaded` (L,): which states have a load.  At most `changes` loads are hung, exchanged or taken
+    off, the arm beginning and ending without; None: as few as the states allow.  Without load the
+    arm is measured in every gap, first and last of all, so that neither the loads nor their absence
+    fall to one part of the time.
     """
     free = [state for state in used if not loaded[state]]
     heavy = [state for state in used if loaded[state]]
@@ -164,12 +161,10 @@ HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that 
 
 @dataclass(frozen=True)
 class VisitTimes:
-    """When each visit of an order is read, and what a drift then does.
-
-    `change` (V + 1, V + 1) s where a move changes the load, `visit` s of reading at a node; `share`
-    (V, m·3) of each visit, None where no drift counts.  Of travel `longest` s are allowed and
-    `usual` s usual; a bias of `enough` per m of drift is as good as none.
-    """
+    """When each visit of an order is read, and what a drift then does: `change` (V + 1, V + 1) s of
+    a change of load, `visit` s of reading at a node, `share` (V, m·3) of each visit, None where no
+    drift counts.  Of travel `longest` s are allowed and `usual` s usual; a bias of `enough` per m
+    of drift is as good as none."""
 
     moves: Moves
     travel: Array
@@ -182,7 +177,6 @@ class VisitTimes:
 
     @classmethod
     def of(cls, moves: Moves, motion: Motion, begun: list[int]) -> VisitTimes:
-        """Of orders about as long as the one `begun`."""
         carried = np.array([moves.carries(node) for node in range(len(moves.pose) + 1)])
         change = np.where(carried[:, None] != carried[None], motion.load_change, 0.0)
         visit = motion.dwell * (1 if moves.signs is None else 2)
@@ -205,7 +199,6 @@ class VisitTimes:
         return replace(self, travel=self.moves.travel())
 
     def possible(self, tour: list[int]) -> bool:
-        """Has every move a way, within the time allowed?"""
         return self.driving(tour) <= self.longest
 
     def driving(self, tour: list[int]) -> float:
@@ -309,11 +302,10 @@ def against_drift(
     plain: VisitTimes, motion: Motion, tour: list[int], alias: Alias | None, seed: int,
     progress: Progress,
 ) -> tuple[list[int], VisitTimes, Drifting | None]:  # fmt: skip
-    """The visits of the shortest `tour` in the order that a drift harms least, with the clock that
-    they are nodes of, and what the drift does to it; the shortest tour itself where no other is
-    better.  Where there is time for it, all poses are read twice without load; where no
-    extra time is stated, if (ρ² + b²) t falls, of the error at the test poses ρ, the drift's
-    part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
+    """The visits of the shortest `tour` in the order that a drift harms least, the clock that they
+    are nodes of, and what the drift does.  Where there is time for it, all poses are read twice
+    without load; where no extra time is stated, if (ρ² + b²) t falls, of the error at the test
+    poses ρ, the drift's part of it b and the time t: if more readings would give less."""
     moves = plain.moves
     used = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
@@ -386,21 +378,17 @@ def with_references(
     tour: list[int], moves: Moves, travel: Array, every: int, paired: bool
 ) -> list[tuple[int, int]]:
     """The tour's nodes, 0 behind each, with one pose of each load state visited again before the
-    first, after `every` visits, and at the end, under the load that hangs there, its number
-    behind it.
-
-    The pose is the one with the least way to the others, the same for all load states where one
-    is visited in all.  Where readings are `paired`, loaded with unloaded, it is visited loaded no
-    more often than without load.
+    first, after `every` visits, and at the end, under the load that hangs there, its number behind.
+    It is the one with the least way to the others, for all load states where one is visited in
+    all.  Where readings are `paired`, it is visited loaded no more often than without load.
     """
     mean = travel[1:, 1:].mean(axis=0)
     states = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     common = set.intersection(*(set(moves.pose[moves.load == s].tolist()) for s in states))
+    candidates = np.ones(len(moves.pose), dtype=bool)
     if common:
         best = min(sorted(common), key=lambda k: float(mean[moves.pose == k].sum()))
         candidates = moves.pose == best
-    else:
-        candidates = np.ones(len(moves.pose), dtype=bool)
     chosen = {
         s: 1 + min(np.flatnonzero(candidates & (moves.load == s)).tolist(), key=lambda v: mean[v])
         for s in states
@@ -432,12 +420,10 @@ class Stop:
     """One reading: pose `pose` at joints `q` (n,) in load state `load` (0-based both).
 
     The arm moves straight through `via` (k, n), where nothing is measured, and then to `q`, in
-    `travel` s.  `change_after`: the load is changed once that many of these k + 1 moves are done;
-    None: it stays.  `approach` (n,): +1 or −1, the direction of each joint's last motion, and
-    `side` 0 or 1 where the pose is approached from both sides.  `again`: how often it has been
-    visited for reference, this time included; 0 for the plan's own reading.  `part`: how often it
-    was visited for it before, with an equal part of the readings each time.  `time` s from the
-    beginning to its readings, where that is asked for.
+    `travel` s; the load is changed once `change_after` of these k + 1 moves are done.  `approach`
+    (n,): ±1, the direction of each joint's last motion, `side` 0 or 1 where the pose is approached
+    from both sides.  `again`: how often it has been visited for reference, this time included;
+    `part`: how often it was read before, with an equal part of the readings each time.
     """
 
     pose: int
@@ -461,11 +447,8 @@ class Stop:
 @dataclass(frozen=True)
 class Execution:
     """The stops in order, and the way home, through `home_via` (k, n), where there is a home.
-
-    `travel` s in all.  `checked` moves were tried, `blocked` of them in the way of something.
-     `take_off`: the load hangs on the arm after the last stop.  `drift`: what a
-    steady drift would do to the plan's result in this order; None where that was not asked.
-    """
+    `checked` moves were tried, `blocked` of them in the way of something.  `take_off`: the load
+    hangs on the arm after the last stop.  `drift`: what a steady drift does in this order."""
 
     stops: tuple[Stop, ...]
     home_via: Array
@@ -482,7 +465,6 @@ class Execution:
 
     @property
     def one_sided(self) -> tuple[int, ...]:
-        """Poses that were to be approached from both sides but can be from one only."""
         sides = Counter((stop.pose, stop.load) for stop in self.stops if not stop.again)
         few = {pose for (pose, _), n in sides.items() if self.motion.both_directions and n < 2}
         return tuple(sorted(few))
@@ -551,15 +533,11 @@ def _time(moves: Moves, way: list[int]) -> float:
 
 def nearest_first(cost: Array) -> list[int]:
     """From the beginning, node 0, always on to the nearest node not yet visited."""
-    left = cost.copy()
-    left[:, 0] = np.inf
-    tour, here = [], 0
+    left, tour = cost.copy(), [0]
     for _ in range(len(cost) - 1):
-        nearest = int(np.argmin(left[here]))
-        left[:, nearest] = np.inf
-        tour.append(nearest)
-        here = nearest
-    return tour
+        left[:, tour[-1]] = np.inf
+        tour.append(int(np.argmin(left[tour[-1]])))
+    return tour[1:]
 
 
 # The shortest execution of a plan: every pose in its load states, by collision-free moves.
@@ -583,25 +561,17 @@ def schedule(
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
 
     Every pose is visited under each of `loads` (L, 3) N (None: once, without load) in which it is
-    `read` (N, L) (None: in all).  Load states
-    are done one after the other with as few changes as possible, unloaded first where that costs
-    nothing.  A move is straight in joint space; where that is blocked, it goes through other poses,
-    home, or points `via` (k, n), which are not measured.  With `motion.both_directions` each pose
-    is measured twice, the joints coming from below and from above, inside `limits` (lower, upper);
-    once where one side is blocked (`Execution.one_sided`).
+    `read` (N, L) (None: in all), one load state after the other.  A move is straight in joint
+    space; where that is blocked, it goes through other poses, home, or points `via` (k, n).  With
+    `motion.both_directions` each pose is measured twice, inside `limits` (lower, upper).
 
     Solve, check the moves of the solution, forbid the blocked ones, and again: at the end all
     moves are checked, and the tour is one that the search holds best at costs that are
     nowhere above the true ones.  The same seed gives the same order.
 
-    With an `alias` the order found is one in which a drift does little to what the plan is for, as
-    far as `motion.extra_time` and `motion.load_changes` allow.  After `motion.reference_every`
-    visits one pose is visited again; where readings are `paired`, loaded with unloaded, no more
-    often loaded.
-
-    Raises InsufficientDataError that names a pose which no free move reaches, or which cannot
-    be approached as asked, and what is in the way if `blockers` can tell; InputError for
-    arguments that do not fit together.
+    With an `alias` the order is one in which a drift does little to what the plan is for, as far as
+    `motion.extra_time` and `motion.load_changes` allow.  Raises Unreachable for a pose which no
+    free move reaches, with what is in the way if `blockers` can tell.
     """
     forces = np.zeros((1, 3)) if loads is None else loads
     moves = Moves.of(q, motion, checker, forces, limits, via, read, blockers)

@@ -368,8 +368,8 @@ class Feasibility:
         return Feasibility, (self.cell, self.chain, self._struck)
 
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
-        """Every rule on every pose q (N, n) under a force (3,) or (N, 3) N; not `every`: a pose that
-        broke a rule is not looked at again.  The load hangs wherever the force is not zero."""
+        """Every rule on every pose q (N, n) under a force (3,) or (N, 3) N; not `every`: a pose
+        that broke a rule is not looked at again.  The load hangs wherever the force is not zero."""
         poses = self._poses(q, force)
         broken = np.zeros((len(poses), len(self.rules)), dtype=bool)
         left = np.arange(len(poses))

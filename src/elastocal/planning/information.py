@@ -45,11 +45,8 @@ NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
 
 def plan_forces(cell: Cell) -> Array:
-    """The forces (L, 3) N under each of which every pose of the cell's plan is read.
-
-    Without `[design] loads_N` poses are read unloaded; where deflections are observed the unloaded
-    state, which they are subtracted from, comes first.  Raises InputError for these without a load.
-    """
+    """The load states (L, 3) N of the plan's poses: unloaded where no load is stated; where
+    deflections are observed the unloaded state, which they are subtracted from, comes first."""
     loads = cell.design.loads
     forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
     if cell.model.observe != "deflection":
@@ -67,8 +64,8 @@ def readings_at(
     q: Array, pose: IntArray, force: Array, marker: IntArray, marker_names: tuple[str, ...],
     source: str = "plan",
 ) -> Measurements:  # fmt: skip
-    """Table rows, not measured yet: of which `pose` (n,) of q (N, joints), under which `force`
-    (n, 3), of which `marker` (n,)."""
+    """Table rows, not measured yet, of `pose` (n,) of q (N, joints), `force` (n, 3), `marker`
+    (n,)."""
     return Measurements(
         source=source,
         row=pose + 2,
@@ -83,7 +80,6 @@ def readings_at(
 
 
 def rows_of(q: Array, forces: Array, names: tuple[str, ...]) -> Measurements:
-    """For each of the poses q (N, n), each of the forces (L, 3), each marker a row."""
     pose = np.repeat(np.arange(len(q)), len(forces) * len(names))
     force = np.tile(np.repeat(forces, len(names), axis=0), (len(q), 1))
     return readings_at(q, pose, force, np.resize(np.arange(len(names)), len(pose)), names)
@@ -217,11 +213,10 @@ class PoseInformation:
 
     def blocks(self, q: Array, readings: IntArray | None = None) -> Array:
         """Whitened, scaled B (N, r, p) of poses q (N, n), with `readings` (N, L) in each load state
-        or, None, `[design] repeats` in all; what is not read shows nothing.
+        or, None, `[design] repeats` in all.
 
         r counts the components of all markers and load states of a pose; W_i B_i with
-        W_iᵀ W_i = Σ_i⁻¹ gives a pose's information B_iᵀ Σ_i⁻¹ B_i.  Raises ElastocalError where
-        a pose has no static equilibrium.
+        W_iᵀ W_i = Σ_i⁻¹ gives a pose's information B_iᵀ Σ_i⁻¹ B_i.
         """
         per_pose = len(self.model.cell.tool.markers) * len(self.forces)
         size = max(CHUNK_NUMBERS // (per_pose * 6 * max(len(self.columns), 20)), 1)
@@ -235,7 +230,6 @@ class PoseInformation:
         return np.concatenate(found)
 
     def rows(self, q: Array) -> Measurements:
-        """The table of these poses as the arm would be read, without noise."""
         table = rows_of(q, self.forces, tuple(self.model.cell.tool.markers))
         table = simulate(self.model, table, self.x, 0, noise=False)
         return marker_sigmas(self.model.cell, table)
@@ -275,11 +269,8 @@ SAMPLE = 2000  # poses that show what is visible: more would not change a rank
 @dataclass(frozen=True)
 class Estimable:
     """`reduction` over all parameters (kept, dropped, mixing), `sizes` (parameters,) and
-    `structure`: the reduction that any number of poses would come to.
-
-    Identification holds parameters that N poses show only below their noise; a plan of N poses
-    must promise what identification then does.  Such are in `structure.kept` alone.
-    """
+    `structure`: the reduction that any number of poses would come to.  What N poses show only below
+    their noise identification holds: it is in `structure.kept` alone."""
 
     reduction: Reduction
     sizes: Array
@@ -299,12 +290,9 @@ def minimal_set(
     stated: BoolArray,
 ) -> Estimable:
     """A minimal complete set of the `free` parameters, as identification chooses it, from readings
-    with B (rows, parameters), whitened and scaled by `sizes`.
-
-    `prior` (parameters, parameters): information known before, scaled alike; parameters with a
-    `stated` prior (parameters,) are kept whatever the readings show of them.  Raises
-    InsufficientDataError where no reading shows anything.
-    """
+    with B (rows, parameters), whitened and scaled by `sizes` as the `prior` (parameters,
+    parameters) is; parameters with a `stated` prior (parameters,) are kept whatever the readings
+    show."""
     B, known = B[:, free], prior[np.ix_(free, free)]
     if known.any():
         values, vectors = linalg.eigh(known)
@@ -330,12 +318,8 @@ def _reduced(model: Model, B: Array, free: IntArray, sizes: Array, threshold: fl
 
 
 def interest_of(model: Model, found: Estimable) -> IntArray:
-    """Indices into the kept parameters that D, A, E and the indices O count.
-
-    `[design] interest` names parameters, places or effects; by default all but base and markers.
-    Raises InputError for an unknown name, InsufficientDataError where a named parameter cannot be
-    seen in any feasible pose.
-    """
+    """Indices into the kept parameters that D, A, E and the indices O count: those of `[design]
+    interest`, by default all but base and markers."""
     wanted = model.cell.design.interest
     kept = [model.parameters[c] for c in found.columns]
     where = f"{model.cell.path or model.cell.name}: [design] interest"
@@ -385,11 +369,14 @@ def why(model: Model, found: Estimable, index: int) -> str:
 
 def sample_of(model: Model, q: Array) -> IntArray:
     """Some of the poses q (N, n), as many at each level."""
-    cell = model.cell
-    held = [joint_index(name) for name in cell.design.levels]
-    kinds, kind = np.unique(q[:, held], axis=0, return_inverse=True)
-    each = -(-SAMPLE // len(kinds))
-    members = [np.flatnonzero(kind.ravel() == k) for k in range(len(kinds))]
+    held = [joint_index(name) for name in model.cell.design.levels]
+    kind = np.unique(q[:, held], axis=0, return_inverse=True)[1].ravel()
+    return evenly(kind, -(-SAMPLE // (int(kind.max()) + 1)))
+
+
+def evenly(group: IntArray, each: int) -> IntArray:
+    """Indices of about `each` of the members of every group, evenly spread."""
+    members = [np.flatnonzero(group == g) for g in np.unique(group)]
     return np.sort(np.concatenate([own[:: -(-len(own) // each)] for own in members]))
 
 
@@ -411,11 +398,8 @@ IDENTIFIED = "the arm as identified from the measurements done"
 
 
 def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
-    """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies.
-
-    Where it does not suffice to identify the arm, B is taken at the nominal one.  The noise is
-    the stated one, as for the poses to come.
-    """
+    """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies, or at the
+    nominal arm where it does not suffice; the noise is the stated one, as for the poses to come."""
     if table.sigma is None:
         table = marker_sigmas(model.cell, table)
     try:

@@ -25,32 +25,23 @@ PER_EDGE = 1e-9
 
 
 class PathChecker(Protocol):
-    """Says whether the arm may move straight in joint space from one joint vector to another."""
+    """Are all configurations from q_from to q_to (M, n), ends included, allowed (M,)?  The answer
+    for the way back is the same."""
 
-    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
-        """(M,): are all configurations from q_from to q_to (M, n), ends included, allowed, with the
-        hanging load where `loaded`?  The answer for the way back is the same."""
-        ...
+    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray: ...
 
 
 def travel_times(points: Array, speed: Array | None) -> Array:
-    """Times (m, m) in s of synchronised joint moves between `points` (m, n).
-
-    t_ij = max_k |q_ik − q_jk| / v_k with `speed` v (n,) in rad/s or m/s, 1 where it is None.
-    Being a metric, no way through other points is faster than the straight one.
-    """
+    """Times (m, m) in s of synchronised joint moves between `points` (m, n):
+    t_ij = max_k |q_ik − q_jk| / v_k with `speed` v (n,) in rad/s or m/s, 1 where it is None."""
     q = points if speed is None else points / speed
     return np.asarray(np.abs(q[:, None] - q[None]).max(axis=2))
 
 
 class Roadmap:
-    """Joint vectors `points` (m, n) and the straight moves between them, with or without load.
-
-    A move counts as free until it is checked; a blocked one is replaced by the fastest way
-    through other points.  So costs never exceed the true ones, and a tour that is optimal at
-    these costs and whose moves have all been checked is optimal (lazy shortest paths: Bohlin
-    and Kavraki 2000).
-    """
+    """Joint vectors `points` (m, n) and the straight moves between them, with or without load.  A
+    move counts as free until it is checked; a blocked one is replaced by the fastest way through
+    other points.  So costs never exceed the true ones (Bohlin and Kavraki 2000)."""
 
     def __init__(self, points: Array, times: Array, loaded: bool, checker: PathChecker) -> None:
         self.points, self.loaded, self.checker = points, loaded, checker
@@ -174,15 +165,12 @@ def _carrying(roadmap: Roadmap) -> str:
 
 @dataclass(frozen=True)
 class Moves:
-    """Home, poses, points of approach and via points in one list, and the visits among them.
+    """Home, poses, points of approach and via points in one list, `points` (m, n), with `times` (m,
+    m) between them, the roadmaps `maps` without and with load, and V visits among them.
 
-    `points` (m, n), and `times` (m, m) between them; `maps`: the roadmaps without and with load;
-    `home`: its point or None; `signs` (N, 2, n) where poses are approached from both sides;
-    `loaded` (L,): which load states have a load.
-
-    V visits, each of `pose` (V,) in the load state `load` (V,), left from `leave` (V,), where the
-    pose is.  `sides` (V, 2) are the points from which it is approached, and which of them are
-    `free` (V, 2); without approaches the pose itself.
+    Each visit is of `pose` (V,) in the load state `load` (V,), left from `leave` (V,), where the
+    pose is.  `sides` (V, 2) are the points from which it is approached, with `signs` (N, 2, n), and
+    which of them are `free` (V, 2); without approaches the pose itself.
     """
 
     points: Array
@@ -200,16 +188,10 @@ class Moves:
 
     @classmethod
     def of(
-        cls,
-        q: Array,
-        motion: Motion,
-        checker: PathChecker,
-        forces: Array,
-        limits: tuple[Array, Array] | None,
-        via: Array | None,
-        read: BoolArray | None = None,
-        blockers: BlockersOf | None = None,
-    ) -> Moves:
+        cls, q: Array, motion: Motion, checker: PathChecker, forces: Array,
+        limits: tuple[Array, Array] | None, via: Array | None,
+        read: BoolArray | None = None, blockers: BlockersOf | None = None,
+    ) -> Moves:  # fmt: skip
         n_poses, n = q.shape
         read = np.ones((n_poses, len(forces)), dtype=bool) if read is None else read
         pose, load = np.nonzero(read)
@@ -300,11 +282,8 @@ class Moves:
         return found
 
     def way(self, u: int, v: int) -> tuple[Roadmap, list[int]]:
-        """The roadmap and the points from node u to the entry of node v, both included.
-
-        Only the last point where u is the beginning and there is no home; none where v is the
-        end; the ends alone where no way is known.
-        """
+        """The roadmap and the points from node u to the entry of node v, both included, as far as
+        beginning and end are anywhere; the ends alone where no way is known."""
         roadmap = self.maps[int(self.carries(u) >= 0 and self.carries(v) >= 0)]
         goal = self.home if v == 0 else int(self.entry[v - 1])
         start = self.home if u == 0 else int(self.leave[u - 1])
@@ -399,13 +378,9 @@ class Moves:
 
 
 def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:
-    """Directions (N, 2, n) of the last motion of each joint: first upwards (+1), then down (−1), so
-    that backlash and hysteresis show.
-
-    The arm starts that motion at q − sign · overshoot, for poses `q` (N, n), in rad or m.  A
-    joint that would leave its limits [lower, upper] (n,) there comes from its other side both
-    times.  Raises InputError where neither side has room.
-    """
+    """Directions (N, 2, n) of the last motion of each joint, from q − sign · overshoot: first
+    upwards (+1), then down (−1), so that backlash and hysteresis show; both times from the same
+    side where the other is beyond the limits [lower, upper] (n,)."""
     below, above = q - overshoot >= lower, q + overshoot <= upper
     if not (below | above).all():
         i, j = (int(v) for v in np.argwhere(~(below | above))[0])

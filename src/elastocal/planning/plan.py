@@ -30,10 +30,8 @@ COMBINED = 0.01  # share of a typical deviation that counts as being part of a c
 
 @dataclass(frozen=True)
 class Predicted:
-    """Standard deviation and half width of the 95 % interval of a parameter, in its unit.
-
-    `combined_with`: what the readings cannot tell from it; the interval is that of the sum.
-    """
+    """Standard deviation and half width of the 95 % interval of a parameter, in its unit, or of its
+    sum with what the readings cannot tell from it, `combined_with`."""
 
     name: str
     unit: str
@@ -44,21 +42,16 @@ class Predicted:
 
 @dataclass(frozen=True)
 class Reason:
-    """What a plan loses without one pose: `loss` of the criterion, as a factor (inf: everything).
-
-    `serves`: the parameters that lose most and by what factor their standard deviation grows.
-    """
+    """What a plan loses without one pose: `loss` of the criterion, as a factor (inf: everything),
+    and what it `serves`: by what factor the standard deviations grow of those that lose most."""
 
     loss: float
     serves: tuple[tuple[str, float], ...]
 
 
 def predicted(model: Model, found: Estimable, M: Array, n_numbers: int) -> tuple[Predicted, ...]:
-    """Intervals of the kept parameters from the information M (p, p), scaled by their sizes.
-
-    cov(X̂) = M⁻¹ (eq. 13 of Klimchik et al. 2013); the half width is that of Student's t with
-    `n_numbers` − p degrees of freedom, as identification will estimate the noise.
-    """
+    """Intervals of the kept parameters from M (p, p), scaled by their sizes: cov(X̂) = M⁻¹ (eq. 13
+    of Klimchik et al. 2013), Student's t with `n_numbers` − p degrees of freedom."""
     r, sizes = found.reduction, found.sizes
     std = np.sqrt(np.diag(inverse(M))) * sizes[r.kept]
     quantile = float(special.stdtrit(max(n_numbers - len(r.kept), 1), 0.975))
@@ -82,8 +75,7 @@ def reasons(
 
     `values` (N,): the criterion of the plan without that pose; `value`: with all.
     """
-    M = prior + np.einsum("nri,nrj->ij", blocks, blocks)
-    V = inverse(M)
+    V = inverse(prior + np.einsum("nri,nrj->ij", blocks, blocks))
     names = [model.names[c] for c in found.columns]
     told = []
     for B, without in zip(blocks, values, strict=True):
@@ -119,19 +111,15 @@ def plan_table(
     carried: Array | None = None,
     counts: IntArray | None = None,
 ) -> tuple[Measurements, dict[str, list[str]]]:
-    """An execution as the table that is read of its plan, and its columns beside:
-    level, order and notes.  Sorted by pose, then side of approach, then load state.
+    """An execution as the table that is read of its plan, sorted by pose, side of approach and load
+    state, and its columns beside: level, order and notes.
 
-    With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
-    row per pose and side, to be measured in every load state.  `order` is the first of its stops,
-    as the list of stops counts them, note_order_2 the second, …; so is it of what is read in two
-    parts.  note_load, note_load_2, … then say what hangs at each of these places, where
-    any of the load states `carried` (L, 3) N is one.  `configurations` and `level`: one per pose.
+    With `forces` (L, 3) N one row per reading, under its force; without, one per pose and side, to
+    be measured in every load state.  `order` is the first of its stops, note_order_2 the second, …;
+    note_load, note_load_2, … what of the load states `carried` (L, 3) N hangs there.
     A pose that is approached from both sides is two configurations, 7+ (joints moving up to it)
-    and 7-: the difference between them is what such a plan is for, not noise of repeats.  With
-    `seen`, which markers are read of each pose in each load state (N, L), there is a row for each.
-    With `counts` (N, L), where not all poses are read in all load states, note_load and
-    note_readings say what hangs and how often each marker is read.
+    and 7-.  With `seen`, which markers are read of each pose in each load state (N, L), there is a
+    row for each; with `counts` (N, L) note_readings says how often each is read.
     """
     rows = _visits(execution.stops, by_load=forces is not None)
     sides = ("", "")
@@ -188,7 +176,6 @@ def _visits(stops: Sequence[Stop], by_load: bool) -> list[Visit]:
 def _notes(
     rows: list[Visit], loads: bool, carried: Array | None, counts: IntArray | None
 ) -> dict[str, list[str]]:
-    """The places in the order behind the first, and with `loads` what hangs at each."""
     most = range(max(len(row) for row in rows))
     notes = {
         f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
@@ -210,7 +197,6 @@ def _notes(
 
 
 def load_name(force: Array) -> str:
-    """A load state for people: "unloaded", or its force."""
     if not np.any(force):
         return "unloaded"
     return " ".join(f"{value + 0.0:g}" for value in force) + " N"
@@ -220,10 +206,7 @@ def write_plan(
     path: str | Path, table: Measurements, more: Mapping[str, Sequence[str]], forces: bool = True
 ) -> None:
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm; with the forces of the
-    rows or not, and `more` columns.
-
-    `Model.read_plan` reads it back to 1e-11 rad.  Raises InputError for an unwritable place.
-    """
+    rows or not, and `more` columns."""
     known = families(table.joint_kinds)
     names = [table.configuration_labels[k] for k in table.configuration]
     columns: dict[str, Sequence[str]] = {"configuration": names}
@@ -250,11 +233,7 @@ def in_unit(values: Array, kind: str) -> Array:
 
 
 def write_plan_json(path: str | Path, summary: Mapping[str, Any]) -> None:
-    """Write plan.json of schema elastocal/plan/1, whole or not at all.
-
-    numpy numbers and arrays become plain ones; numbers that are not finite become null, as JSON
-    has none.  Raises InputError where the place cannot be written.
-    """
+    """Write plan.json of schema elastocal/plan/1, whole or not at all."""
     atomic_write_text(path, json_text({"schema": SCHEMA, **summary}) + "\n")
 
 
@@ -272,12 +251,11 @@ class CandidateCounts:
 
 @dataclass(frozen=True)
 class Certificate:
-    """How far the plan is from the best, as shares of the criterion (1: cannot be better).
+    """How far the plan is from the best, as shares of the criterion; None without a bound.
 
     `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a Φ
     below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched` poses
-    and `ascents` local searches.  None where the criterion has no bound.  `starts`: Φ at which each
-    start of the search ended.
+    and `ascents` local searches.  `starts`: Φ at which each start of the search ended.
     """
 
     pool: int
@@ -298,12 +276,9 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Chance:
-    """The same number of random feasible poses: criteria of `n` such plans in the plan's unit.
-
-    `determined` of them determine every parameter; `median`, `best` and `worst` are None where that
-    plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion has no
-    bound: without prior knowledge random plans need 1/efficiency times as many readings.
-    """
+    """The same number of random feasible poses: criteria of `n` such plans in the plan's unit, of
+    which `determined` determine every parameter.  `efficiency` is the plan's Φ over the median's:
+    without prior knowledge random plans need 1/efficiency times as many readings."""
 
     n: int
     determined: int
@@ -369,12 +344,9 @@ DRAWS = 2000  # of what the arm may be
 
 @dataclass(frozen=True)
 class Gain:
-    """What a plan adds to measurements done: rms position error in m at the test poses.
-
-    `model_before` and `model_after` are its expectation by the parameters alone, `before` and
-    `after` with what the model lacks, as far as measurements show it; inf where they leave
-    parameters open.  `sure`: with 95 % the present error is smaller.
-    """
+    """What a plan adds to measurements done: rms position error in m at the test poses, expected
+    by the parameters alone, `model_before` and `model_after`, and with what the model lacks; inf
+    where they leave parameters open.  `sure`: with 95 % the present error is smaller."""
 
     before: float
     after: float
@@ -471,7 +443,6 @@ class LoadStates:
     chosen: float | None = None
 
     def to_json(self, forces: Array, readings: IntArray, unit: str) -> dict[str, Any]:
-        """With the numbers of poses of a plan that reads them as `readings` (N, L) say."""
         counts = np.count_nonzero(readings, axis=0).tolist()
         stops = zip(forces.tolist(), counts, strict=True)
         return {

@@ -126,7 +126,6 @@ class JointSearch:
         return best
 
     def blocks(self, q: Array) -> Array:
-        """Blocks (k, r, p) of poses q (k, n), by the symbolic model."""
         found = np.empty((*self.whitener.shape[:2], len(self.T)))
         for own, B, _ in self.maps:
             raw = B(q[own].T, np.tile(self.info.x[:, None], len(own))).full()
@@ -150,11 +149,8 @@ class JointSearch:
 def polish(
     problem: DesignProblem, searches: Searches, T: Array, plan: FeasiblePool, fine: bool = False
 ) -> Array:
-    """The plan's poses (k, n) moved to a local optimum of Φ; where none is better, as they are.
-
-    `problem` is that of the parameters z, y = T z.  No rule is broken that the plan's poses keep.
-    `fine`: until nothing is gained any more.
-    """
+    """The plan's poses (k, n) moved to a local optimum of Φ, `problem` being that of the parameters
+    z, y = T z; `fine`: until nothing is gained any more."""
     criterion = problem.criterion
     smooth = criterion.softened(ORDER)
 
@@ -221,12 +217,9 @@ EXCESS = 1e-6  # over the pool's largest d, relative, that counts as one
 
 @dataclass(frozen=True)
 class Continuum:
-    """`bound` on Φ from the largest d found on the continuum: an estimate from above, as a larger d
-    may have been missed, and then no plan is held to it.
-
-    `found`: feasible poses whose d exceeds all of the pool's; they belong in the pool.  Effort:
-    `searched` new points and `ascents` local searches.
-    """
+    """`bound` on Φ from the largest d found on the continuum: an estimate, as a larger d may have
+    been missed.  `found`: feasible poses whose d exceeds all of the pool's, by `searched` new
+    points and `ascents` local searches."""
 
     bound: float
     found: FeasiblePool
@@ -238,11 +231,8 @@ def estimate(
     problem: DesignProblem, tangent: TangentBound, searches: Searches, T: Array,
     pool: FeasiblePool, seed: int = 0, progress: Progress = lambda message: None,
 ) -> Continuum:  # fmt: skip
-    """The largest d on the continuum per group, for the tangent (Φ, G) of the pool's optimum.
-
-    `problem` is that of the `pool`, of the parameters z, y = T z.  Every maximum is evaluated
-    exactly and passed by the cell's rules.
-    """
+    """The largest d on the continuum per group, for the tangent (Φ, G) of the optimum of the `pool`
+    with its `problem`; every maximum is evaluated exactly and passed by the cell's rules."""
 
     def price(lot: FeasiblePool) -> Array:
         return block_prices(lot.blocks @ T, tangent.G)

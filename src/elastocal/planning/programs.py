@@ -26,8 +26,8 @@ from elastocal.units import Array
 
 
 def plain(text: str) -> str:
-    """One line of printable ASCII without quotation marks, so that it can stand in a comment or
-    a string of any controller; other characters become ?, quotation marks apostrophes."""
+    """One line of printable ASCII without quotation marks, for comments and strings of
+    controllers."""
     line = " ".join(text.split()).replace('"', "'").replace("\\", "/")[:LONGEST]
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in line)
 
@@ -55,10 +55,7 @@ Step = (
 def steps_of(
     execution: Execution, configurations: Sequence[str], forces: Array | None = None
 ) -> Iterator[Step]:
-    """Every step in order, beginning and ending at home where there is one.
-
-    `configurations`: a name per pose; `forces` (L, 3) N per load state, None: no load at all.
-    """
+    """Every step in order, beginning and ending at home where there is one."""
     loads = ["no load"] if forces is None else [load_name(force) for force in forces]
     loaded = [False] if forces is None else [bool(np.any(force)) for force in forces]
     home = execution.motion.home
@@ -107,8 +104,7 @@ RESERVED = frozenset(
 
 
 def program_name(text: str, most: int = 24) -> str:
-    """`text` reduced to a name that KRL and URScript allow: letters, digits and underscores,
-    a letter first, at most `most` of them, and none of their own words."""
+    """`text` reduced to a name that KRL and URScript allow, none of their own words."""
     ascii_only = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_]+", "_", ascii_only).strip("_")
     name = (name if name[:1].isalpha() else f"p_{name}")[:most].rstrip("_")
@@ -116,8 +112,6 @@ def program_name(text: str, most: int = 24) -> str:
 
 
 def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
-    """Raise InputError where a joint value lies outside the limits (n,) rad, or a stop would last
-    for more than a day."""
     for k, step in enumerate(steps):
         if step[0] == "measure":
             require(0 <= step[1] <= LONGEST_STOP, f"a stop of {step[1]:g} s; give 0 to 86400 s")
@@ -133,7 +127,6 @@ def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
 
 
 def limits_text(lower: Array, upper: Array) -> str:
-    """The limits that every joint value was checked against, in degrees."""
     shown = []
     for i, (low, high) in enumerate(zip(lower, upper, strict=True), 1):
         told = [f"from {math.degrees(low):.4g}"] if math.isfinite(low) else []
@@ -166,10 +159,7 @@ _URSCRIPT_LINES = {
 
 def program_steps(text: str) -> list[tuple[str, Array]]:
     """The steps of a program that was written here: ("move", joints (6,) rad), ("load", empty) or
-    ("measure", seconds (1,)), in their order.
-
-    Raises ElastocalError, with the line, where a line is of no kind that is written here.
-    """
+    ("measure", seconds (1,)), in their order."""
     krl = text.startswith("&ACCESS")
     kinds = _KRL_LINES if krl else _URSCRIPT_LINES
     steps = []
@@ -220,22 +210,13 @@ FIRST = "The first move begins wherever the arm stands; only the moves after it 
 
 
 def robot_program(
-    suffix: str,
-    execution: Execution,
-    chain: Chain,
-    configurations: Sequence[str],
-    forces: Array | None = None,
-    *,
-    name: str = "elastocal_plan",
+    suffix: str, execution: Execution, chain: Chain, configurations: Sequence[str],
+    forces: Array | None = None, *, name: str = "elastocal_plan",
     limits: tuple[Array, Array] | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """The text of NAME.src (KRL) or NAME.script (URScript): moves, stops in which the tracker
-    measures, and halts for the load; joint values in the order of the chain.
-
-    `name` is reduced to one that the language allows.  Raises InputError for an arm of other joints
-    than six revolute ones and for joint values outside `limits` (lower, upper; rad; by default the
-    robot's); ElastocalError where the text, read back, is not the plan.
-    """
+    measures, and halts for the load; joint values inside `limits` (lower, upper; rad; by default
+    the robot's), in the order of the chain.  Read back, it is the plan, or an ElastocalError."""
     language, write = LANGUAGES[suffix.lower()]
     check_six_axes(chain, language)
     lower, upper = limits or (

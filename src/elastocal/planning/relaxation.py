@@ -64,7 +64,7 @@ class DesignProblem:
         return np.asarray(B.swapaxes(-1, -2) @ B)
 
     def prices(self, G: Array) -> Array:
-        """d (N,): d_i = tr(B_i G B_iᵀ) = −∂Φ/∂w_i for G (p, p)."""
+        """d_i = tr(B_i G B_iᵀ) = −∂Φ/∂w_i (N,) for G (p, p)."""
         rows, columns, factor = triangle(len(G))
         return np.asarray(self.packed @ (G[rows, columns] * factor))
 
@@ -89,7 +89,6 @@ class DesignProblem:
         return np.asarray((self.shares / np.maximum(size, 1))[self.group])
 
     def value(self, chosen: IntArray) -> float:
-        """Φ of a plan; inf where it leaves parameters open."""
         return float(self.criterion.of_information(self.information(chosen)))
 
     def restricted(self, kept: IntArray) -> DesignProblem:
@@ -114,11 +113,8 @@ def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
 
 
 def balancing(problem: DesignProblem) -> Array:
-    """T (p, p): parameters z, y = T z, whose information at even weights is 1.
-
-    Where base, markers and geometry are identified together, information is conditioned so badly
-    that an update of Φ by one pose would keep no digits otherwise.  Raises InsufficientDataError
-    where all candidates together leave something open, as then every plan does.
+    """T (p, p): parameters z, y = T z, whose information at even weights is 1.  Where base, markers
+    and geometry are identified together, an update of Φ by one pose would keep no digits otherwise.
     """
     M = problem.information(np.arange(len(problem.blocks)), problem.even())
     size = np.sqrt(np.maximum(np.diagonal(M), 0.0))
@@ -149,13 +145,11 @@ def in_terms(problem: DesignProblem, T: Array, ridge: float = 0.0) -> DesignProb
 
 
 def balanced(problem: DesignProblem) -> tuple[DesignProblem, Array]:
-    """The problem of balanced parameters, in which all searches work, and T (p, p)."""
     T = balancing(problem)
     return in_terms(problem, T, RIDGE), T
 
 
 def check_enough(problem: DesignProblem) -> None:
-    """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
     _, r, p = problem.blocks.shape
     n = problem.n_poses
     # How many combinations of parameters the prior determines.
@@ -177,7 +171,6 @@ def largest_sum(d: Array, group: IntArray, shares: IntArray) -> float:
 
 
 def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> float:
-    """No plan has a smaller Φ: by the tangent at any point and its prices `d` (N,)."""
     reach = largest_sum(d, problem.group, problem.shares)
     return tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
 
@@ -200,11 +193,8 @@ NEGLIGIBLE = 1e-3  # of the largest weight, below which a candidate leaves the s
 
 @dataclass(frozen=True)
 class Relaxed:
-    """Optimal weights (N,) of the relaxation, Φ = `value` there, and what is proved.
-
-    `bound`: no plan with these candidates and shares has a smaller Φ.  `tangent`: the (Φ, G) behind
-    the bound, for prices off the pool.
-    """
+    """Optimal weights (N,) of the relaxation, Φ = `value` there, and the `bound` below which no
+    plan with these candidates and shares has a Φ, by the `tangent`."""
 
     weights: Array
     value: float
@@ -220,9 +210,8 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
     """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l].
 
     The problem should be a `balanced` one.  `start` (N,) ≥ 0: weights near the optimum, as those of
-    a smaller pool.  The result's gap may exceed `gap` where rounding forbids more; its bound holds
-    all the same.  Raises InputError for a criterion without a bound.
-    """
+    a smaller pool.  Where rounding forbids the `gap` that is asked for, the bound holds all the
+    same."""
     criterion = problem.criterion
     require(
         criterion.certifiable,
@@ -286,10 +275,8 @@ def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | 
 
 
 def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
-    """Even weights, or `start` with a part of them, times √d_i: where the support lies.
-
-    Silvey, Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379.
-    """
+    """Even weights, or `start` with a part of them, times √d_i: where the support lies (Silvey,
+    Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379)."""
     even = problem.even()
     w = even if start is None else EVEN * even + (1 - EVEN) * start
     V = inverse(problem.at(w))
@@ -298,7 +285,6 @@ def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
 
 
 def best_of(score: Array, group: IntArray, counts: IntArray) -> IntArray:
-    """Of each group as many candidates as `counts` (L,) says, those of largest score (N,)."""
     found = [np.zeros(0, dtype=np.int64)]
     for g in np.flatnonzero(counts):
         own = np.flatnonzero(group == g)
@@ -325,8 +311,7 @@ SHARPEST = 1e6  # order of a power mean beyond which rounding takes it for the m
 def newton(
     problem: DesignProblem, support: IntArray, w: Array, accuracy: float
 ) -> tuple[Array, TangentBound, float]:
-    """Weights (k,) of the `support` whose log Φ is within `accuracy` of the least, the tangent that
-    shows it, and Φ."""
+    """Weights (k,) of the `support` with log Φ within `accuracy` of the least, tangent, and Φ."""
     k, A, group = len(support), problem.matrices(support), problem.group[support]
     flat = A.reshape(k, -1)
     E = (group == np.flatnonzero(problem.shares)[:, None]).astype(float)

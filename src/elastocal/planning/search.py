@@ -73,12 +73,9 @@ EFFORTS = {
 
 @dataclass(frozen=True)
 class Selection:
-    """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
-
-    From index `first` on the pool holds what came from polish and the continuum, at its end, once
-    the plan is `whole`, the `pinned` poses that stay.  `alias`: what a shift of its readings does,
-    once it is in order.
-    """
+    """The plan as indices `chosen` (k,) into the `pool`, which from index `first` on holds what
+    came from polish and the continuum, at its end, once the plan is `whole`, the `pinned` poses
+    that stay; Φ `value`.  `alias`: what a shift of its readings does, once it is in order."""
 
     pool: FeasiblePool
     chosen: IntArray
@@ -90,13 +87,11 @@ class Selection:
 
     @property
     def polished(self) -> int:
-        """Poses of the plan that are not candidates of the first pool."""
         own = self.chosen < len(self.pool) - self.pinned
         return int((own & (self.chosen >= self.first)).sum())
 
     def whole(self, pinned: FeasiblePool | None) -> Selection:
-        """With the poses that stay, in the order of the levels, so that the table reads like
-        Table 2; of a level those that stay come first."""
+        """With the poses that stay, in the order of the levels; of a level these come first."""
         pool, chosen, n = self.pool, np.sort(self.chosen), 0
         if pinned is not None:
             pool, n = pool.joined(pinned), len(pinned)
@@ -105,11 +100,8 @@ class Selection:
         return replace(self, pool=pool, chosen=chosen, pinned=n)
 
     def exchanged(self, pool: FeasiblePool, chosen: IntArray, value: float) -> Selection:
-        """Another plan (k,) of Φ = `value`, from another pool that may hold more poses.
-
-        The bounds hold: those of a pool are those of every part of it, and a plan's own poses,
-        where they are new, are among those that the continuum's bound is about.
-        """
+        """Another plan (k,) of Φ = `value`, from a pool that may hold more poses: the bounds hold,
+        as a plan's own poses, where they are new, are those that the continuum's is about."""
         c = self.certificate
         of_pool, of_continuum = (
             None if share is None else min(share * (self.value / value), 1.0)
@@ -120,12 +112,8 @@ class Selection:
 
 
 class Search:
-    """What a plan is sought with: the setup, whose parameters y = T z are balanced, and the `pool`,
-    which grows by what polish and ascents find.
-
-    `plain`: the setup without the poses that stay, where there are some.  Raises
-    InsufficientDataError where no plan can determine all parameters.
-    """
+    """What a plan is sought with: the setup, whose parameters y = T z are balanced, `plain` without
+    the poses that stay, and the `pool`, which grows by what polish and ascents find."""
 
     def __init__(
         self, setup: Setup, pool: FeasiblePool, searches: Searches, shares: IntArray,
@@ -150,7 +138,6 @@ class Search:
         return self.setup.problem(self.pool, self.shares).value(chosen)
 
     def select(self) -> Selection:
-        """The best plan found and its certificate."""
         first, effort, seed = len(self.pool), self.effort, self.seed
         self.progress(f"relaxation over {first} candidates")
         self.relaxed = prospects(self.problem, CLOSE if effort.starts else FINE)
@@ -218,7 +205,6 @@ class Search:
         return other if self.value(other) < self.value(best) * (1 - SAME) else best
 
     def _relax(self, gap: float = CLOSE) -> None:
-        """The relaxation on a pool that has grown since."""
         were = self.relaxed.weights
         start = np.concatenate([were, np.zeros(len(self.pool) - len(were))])
         self.relaxed = prospects(self.problem, gap, start)
@@ -284,12 +270,9 @@ REPLACED = 10  # times at most
 def ordered(
     search: Search, found: Selection, pinned: FeasiblePool | None = None
 ) -> tuple[Selection, Execution, list[str]]:
-    """The selection in the order of its levels, its execution, and warnings.
-
-    Poses that no chain of free moves reaches are replaced by the best others, unless they are
-    `pinned`, and all poses then polished again, as far as moves reach them there.  Raises
-    InsufficientDataError where that does not end.
-    """
+    """The selection in the order of its levels, its execution, and warnings.  Poses that no chain
+    of free moves reaches are replaced by the best others, unless they are `pinned`, and all then
+    polished again, as far as moves reach them there."""
     order, warnings = _Ordering(search, found, pinned), []
     plan, execution = order.reachable()
     if order.gone:
@@ -302,11 +285,8 @@ def ordered(
 
 
 class _Ordering:
-    """A plan `found` put in order; `gone` poses of it were unreachable so far.
-
-    The `hub` (k, n): home, and poses of the pool, which free moves join; blocked moves may go
-    through them.
-    """
+    """A plan `found` put in order; `gone` poses of it were unreachable so far.  Blocked moves may
+    go through the `hub` (k, n): home, and poses of the pool, which free moves join."""
 
     def __init__(self, search: Search, found: Selection, pinned: FeasiblePool | None) -> None:
         self.search, self.found, self.pinned, self.gone = search, found, pinned, 0
@@ -314,7 +294,6 @@ class _Ordering:
         self.hub = found.pool.q[:: max(len(found.pool) // VIA, 1)]
 
     def reachable(self) -> tuple[Selection, Execution]:
-        """The plan, or that with others in the place of unreachable poses, in an order."""
         for k in range(REPLACED):
             try:
                 return self.put(self.found)
@@ -359,11 +338,9 @@ class _Ordering:
         return plan, execution
 
     def _unwound(self) -> Selection:
-        """The same postures, whole turns nearer to home, or to the middle of the joint ranges.
-
-        Between an arm's posture and the same a turn on, there is often no way: the floor, or the
-        arm itself.  Poses whose information would be another are left as they are.
-        """
+        """The same postures, whole turns nearer to home, or to the middle of the joint ranges: to
+        the same posture a turn on there is often no way.  Poses whose information would be another
+        are left as they are."""
         rules, pool = self.paths.feasibility, self.found.pool
         chain, home = rules.chain, rules.cell.design.motion.home
         lower, upper = finite_ranges(chain, *joint_limits(rules.cell, chain))
@@ -413,7 +390,6 @@ class _Ordering:
         return bool(np.any(self.paths.feasibility.cell.design.loads))
 
     def _joined(self, q: Array) -> Array:
-        """Those of q (N, n) that free moves join, with home where there is one."""
         motion = self.paths.feasibility.cell.design.motion
         points = q if motion.home is None else np.vstack([motion.home, q])
         roadmap = Roadmap(points, travel_times(points, motion.speed), self._loaded, self.paths)

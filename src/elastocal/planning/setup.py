@@ -29,6 +29,7 @@ from elastocal.planning.information import (
     Estimable,
     PoseInformation,
     Sight,
+    evenly,
     interest_of,
     marker_sigmas,
     minimal_set,
@@ -95,13 +96,9 @@ class FeasiblePool:
 @dataclass(frozen=True)
 class Setup:
     """`information` over the kept parameters, `prior` (p, p) scaled, and what the criterion is made
-    of.
-
-    `inputs`: of the test poses alone.  `beyond`: ∂position/∂parameters (T, r, p) at poses all over
-    the joint ranges, and their weights (T,); None where nothing can be said of them.  `share` of
-    the criterion's weight lies on these.  `ways` (K, L): how a pose may be read, as readings in
-    each load state; each candidate is one.
-    """
+    of: `inputs` of the test poses alone, and `beyond`, ∂position/∂parameters (T, r, p) at poses all
+    over the joint ranges and their weights (T,), on which `share` of the criterion's weight lies.
+    `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one."""
 
     information: PoseInformation
     found: Estimable
@@ -134,10 +131,6 @@ class Setup:
         """The same all over the joint ranges."""
         return None if self.beyond is None else _root(*self.beyond)
 
-    def sharing(self, share: float) -> Setup:
-        """With this share of the weight on what lies beside the test poses."""
-        return replace(self, share=share)
-
     def pool(self, q: Array, group: IntArray, readings: IntArray | None = None) -> FeasiblePool:
         """Candidates q (N, n) read as `readings` (N, L) say, or in each of the ways in turn."""
         if readings is None:
@@ -169,23 +162,13 @@ class Setup:
 
 
 def set_up(
-    model: Model,
-    q: Array,
-    n_poses: int,
-    targets: TargetPoses,
-    known: Known,
-    region: TargetPoses | None = None,
-    sight: Sight | None = None,
-    work: Model | None = None,
-) -> Setup:
+    model: Model, q: Array, n_poses: int, targets: TargetPoses, known: Known,
+    region: TargetPoses | None = None, sight: Sight | None = None, work: Model | None = None,
+) -> Setup:  # fmt: skip
     """The parameters that the candidates q (N, n) show, and the criterion on them.
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
-    `[design] elsewhere`.  `sight` as of `PoseInformation`.
-    `work`: the model at the test poses, where its tool is not the one to measure with.
-
-    Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
-    with what it is combined with; InputError for unknown names.
+    `[design] elsewhere`.  `work`: the model at the test poses, where its tool is another one.
     """
     spec = model.cell.design
     x = model.nominal if known.done is None else known.done.x
@@ -224,7 +207,6 @@ def set_up(
 
 
 def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPoses | None) -> Setup:
-    """With what the criterion needs to know of the test poses."""
     information, found = setup.information, setup.found
     model, T = information.model, len(targets.q)
     share = model.cell.design.elsewhere or 0.0
@@ -270,20 +252,16 @@ def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...
 def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Information known before (parameters, parameters), scaled by `sizes`, and of which
     parameters (parameters,) a size is known and asked to be counted."""
-    n = len(sizes)
-    information = np.zeros((n, n))
-    if model.cell.design.prior == "typical":
-        has = np.array([p.typical is not None for p in model.parameters], dtype=bool)
-        information[has, has] += 1.0
+    asked = model.cell.design.prior == "typical"
+    counted = np.array([asked and p.typical is not None for p in model.parameters], dtype=bool)
+    information = np.diag(counted.astype(float))
     if known.prior is not None:
         P = known.prior.rows(model.names)[0] * sizes
         information += P.T @ P
+        counted |= np.isin(model.names, known.prior.names)
     if known.done is not None:
         information += known.done.information * np.outer(sizes, sizes)
-    names = () if known.prior is None else known.prior.names
-    typical = model.cell.design.prior == "typical"
-    counted = [p.name in names or (typical and p.typical is not None) for p in model.parameters]
-    return information, np.array(counted, dtype=bool)
+    return information, counted
 
 
 def _combination(model: Model, found: Estimable) -> Array | None:
@@ -322,7 +300,7 @@ def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
 MOST = 0.9  # share at most
 CLOSE = 0.05  # of the price under the limit: a better share would not be noticed
 LOOSE = 1e-3  # gap of the relaxations
-SOME = 4000  # candidates that tell the share: it hangs on where poses are, not on each of them
+SOME = 4000  # candidates
 
 
 def share_within(
@@ -333,7 +311,10 @@ def share_within(
     if setup.elsewhere_rows is None or not cap:
         return 0.0
     progress(f"weight of the joint ranges, at most {100 * cap:g} % worse at the test poses")
-    problem = _some(setup.sharing(0.0).problem(pool, shares))
+    # As many as tell the share: it hangs on where poses are, not on each of them.
+    each = max(SOME // len(shares), 20 * int(shares.max()))
+    pool = pool.take(evenly(pool.group, each))
+    problem = replace(setup, share=0.0).problem(pool, shares)
     own, T = problem.criterion, balancing(problem)
     alone = relax(in_terms(problem, T), LOOSE)
     weights, price = alone.weights, ((1 + cap) ** 2 - 1) * alone.value
@@ -341,7 +322,7 @@ def share_within(
     def over(u: float) -> float:
         """What the test poses pay more than they should, of the price; near enough is 0."""
         nonlocal weights
-        other = replace(problem, criterion=setup.sharing(u / (1 + u)).criterion)
+        other = replace(problem, criterion=replace(setup, share=u / (1 + u)).criterion)
         weights = relax(in_terms(other, T), LOOSE, weights).weights
         paid = (float(own.of_information(problem.at(weights))) - alone.value) / price
         return 0.0 if 1 - CLOSE <= paid <= 1 else paid - 1 + CLOSE / 2
@@ -351,12 +332,6 @@ def share_within(
         return MOST
     u = optimize.brentq(over, 0.0, most)
     return float(u / (1 + u))
-
-
-def _some(problem: DesignProblem) -> DesignProblem:
-    each = max(SOME // len(problem.shares), 20 * int(problem.shares.max()))
-    members = [np.flatnonzero(problem.group == g) for g in range(len(problem.shares))]
-    return problem.restricted(np.sort(np.concatenate([m[:: -(-len(m) // each)] for m in members])))
 
 
 # What time shows.  The order says when each reading is made and from where each joint came, so that

@@ -36,10 +36,7 @@ LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a 
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:
-    """Numbers of joints and joint values of [design].
-
-    Raises InputError that names the key, what was found and what to do.
-    """
+    """Numbers of joints and joint values of [design]."""
     _check_levels(cell, chain)
     _check_motion(cell, chain)
     for k, pose in enumerate(cell.design.test_poses):
@@ -48,7 +45,6 @@ def check_cell(cell: Cell, chain: Chain) -> None:
 
 
 def check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
-    """A posture q (n,) that `key` states: number of joints, their unit, their limits."""
     _check_count(cell, chain, key, q)
     if degrees:
         _check_revolute(cell, chain, key)
@@ -175,11 +171,8 @@ def _reached(
     source: str, missed: Callable[[int, str], str],
 ) -> TargetPoses:  # fmt: skip
     """Test poses with the `point` (3,) of the flange at places (T, 3) m of the data's frame, the
-    flange at `rotation` (T, 3, 3), None for any, under `force` (T, 3) N or, None, the cell's loads.
-
-    Each is the first posture found that the rules allow; where they allow none of many, the first
-    of all.  InputError with what `missed` says of the first place out of reach.
-    """
+    flange at `rotation` (T, 3, 3), None for any, under `force` (T, 3) N or, None, the cell's loads:
+    each the first posture found that the rules allow; where they allow none of many, the first."""
 
     def postures(some: IntArray, count: int) -> Postures:
         return inverse_kinematics(
@@ -284,16 +277,10 @@ class TargetPoses(NewPoses):
 def test_poses(
     cell: Cell, chain: Chain, feasibility: Feasibility | None = None, seed: int = 0
 ) -> TargetPoses:
-    """The test poses of the cell: [[design.test_pose]], [design.test_path], [design.test_box].
-
-    Several sources add up.  A pose without a force of its own is taken under each of the
-    design's loads that is not zero, which share its weight.  Places are reached by the posture
-    nearest to the home posture, or the middle of the joint ranges; with `feasibility` by the
-    first that its rules allow.  Without any source 100 poses are drawn over the joint limits.
-
-    Raises InputError where a pose lies beyond the joint limits or out of reach, a table is wrong,
-    and InsufficientDataError where the cell allows none of the drawn poses.
-    """
+    """The test poses of the cell: [[design.test_pose]], [design.test_path] and [design.test_box]
+    together, or 100 poses drawn over the joint limits.  A pose without a force of its own is taken
+    under each of the design's loads that is not zero, which share its weight.  Places are reached
+    by the posture nearest to home, or the middle of the joint ranges, that the rules allow."""
     spec, loads = cell.design, working_loads(cell)
     point = _point_of(cell)
     groups = []
@@ -316,7 +303,6 @@ def test_poses(
 
 
 def where_used(model: Model) -> NewPoses | None:
-    """Where the cell says that position must be right; None where it says nothing."""
     stated = model.cell.design.states_test_poses
     return test_poses(model.cell, model.chain) if stated else None
 
@@ -343,11 +329,8 @@ def _point_of(cell: Cell) -> Array:
 def _along_path(
     cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Feasibility | None, seed: int
 ) -> TargetPoses:
-    """The poses of a CSV or Parquet (.parquet, .pq) file; columns as in the measurement table.
-
-    q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is
-    prescribed; force_x_N … and weight may be added.
-    """
+    """The poses of a table: q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw …
+    where the rotation is prescribed; force_x_N … and weight may be added."""
     raw = read_table(spec.file, lambda header: _layout(str(spec.file), header, chain.kinds))
     columns, n, loads = raw.layout.columns, len(raw.row), working_loads(cell)
     require(
@@ -456,11 +439,10 @@ OUTSIDE = 1e-6
 def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool = False) -> Array:
     """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
 
-    The position is that under load in the data's frame; base and markers move it too, so that it
-    does not depend on how the arm's frames are chosen.  It is that of the test point.  Where the
-    markers' own places are fitted and no point was stated, it is that of the M markers, each
-    divided by √M, as only they can be known: the sum of squares is then their mean.  A stated point
-    may be `carried` by the markers instead of the flange, as a body that they are fixed to.
+    The position is that of the test point under load in the data's frame.  Where the markers' own
+    places are fitted and no point was stated, it is that of the M markers, each divided by √M, as
+    only they can be known.  A stated point may be `carried` by the markers, as a body that they are
+    fixed to, instead of the flange.
     """
     by_marker = ~targets.stated & fitted_markers(model)
     bodies = targets.stated & carried
@@ -557,10 +539,7 @@ def known_rows(
 ) -> tuple[Array, tuple[str, ...]]:
     """The rows of `prediction_rows` of the arm `at_work`, and what to say of them: where the
     markers' places are fitted and the readings cannot tell where the flange is, points that are
-    stated are taken to be fixed to the markers.
-
-    Raises InputError where a joint whose compliance is known at levels stands at none of them.
-    """
+    stated are taken to be fixed to the markers."""
     cell, chain = at_work.cell, at_work.chain
     for joint, levels in cell.model.compliance_levels.items():
         j = joint_index(joint)
@@ -585,12 +564,9 @@ def known_rows(
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:
-    """A (T, r, kept) on the kept parameters, scaled by their sizes.
-
-    A test point is predictable where its motion by the dropped parameters is that by the kept
-    ones they combine with: A_D = A_K · mixing.  Raises InsufficientDataError that names the
-    parameter where it is not: no number of poses would make that position certain.
-    """
+    """A (T, r, kept) on the kept parameters, scaled by their sizes.  A test point is predictable
+    where its motion by the dropped parameters is that by the kept ones they combine with,
+    A_D = A_K · mixing; where it is not, no number of poses would make that position certain."""
     lost = unpredictable(A, found)
     if lost is not None:
         pose, index = lost
@@ -614,10 +590,8 @@ def unpredictable(A: Array, found: Estimable) -> tuple[int, int] | None:
 
 
 def remaining_bias(A: Array, weight: Array, found: Estimable) -> float:
-    """Rms in m of what typical deviations of held parameters move the test points by.
-
-    A (T, r, parameters), `weight` (T,): held are those that the poses show below their noise.
-    """
+    """Rms in m of what typical deviations of held parameters, which the poses show below their
+    noise, move the test points by, A (T, r, parameters) with `weight` (T,)."""
     off = _unexplained(A, found.reduction, found.sizes)
     return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
 
