@@ -63,7 +63,6 @@ ROUNDED = 1e-15  # of a number: what is left of it when it has been to a file in
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two values are the same, arrays and records by what they hold."""
     if a is b:
         return True
     if hasattr(a, "nnz") and hasattr(b, "nnz"):  # sparse
@@ -192,7 +191,6 @@ def write_page(
     result: object, path: str | Path, inputs: Any, command: str | None, seed: int | None,
     **told: Any,
 ) -> None:  # fmt: skip
-    """Write a result's page; `told` is what its kind of page takes besides."""
     import_module(VIEWS).write_page(result, Path(path), inputs, command, seed, **told)
 
 

@@ -230,7 +230,6 @@ def _shown(value: Any) -> str:
 
 
 def whole(name: str, given: Any, least: int | None = None) -> int:
-    """A whole number, `least` or more.  Raises InputError that names the argument."""
     more = "" if least is None else f", {least} or more"
     if _whole(given) and abs(given) > MOST:
         more += f" and at most {MOST:,}"

@@ -215,7 +215,6 @@ fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
 
 
 def keys_of(*classes: Any, without: Sequence[str] = ()) -> list[Key]:
-    """The keys that state tables or records in a file."""
     every = (known for one in classes for keys in fields_of(one).values() for known in keys)
     return [known for known in every if known.name not in without]
 
@@ -445,7 +444,6 @@ def shown(found: object) -> str:
 
 
 def dotted(keys: Sequence[str]) -> str:
-    """Keys as TOML writes them: joined by dots, quoted where they are no bare keys."""
     return ".".join(k if re.fullmatch(r"[\w-]+", k, re.ASCII) else quoted(k) for k in keys)
 
 
@@ -490,7 +488,6 @@ def _unknown(cls: Any, name: str, found: Any, spot: Spot) -> str:
 
 
 def _homes_of(name: str, table: Any, above: tuple[str, ...]) -> Iterator[str]:
-    """The headers of the tables below the top level that take the key `name`."""
     for one in keys_of(table):
         for inner, many in tables_in(one.kind):
             names = dotted((*above, one.name))
@@ -503,7 +500,6 @@ def _homes_of(name: str, table: Any, above: tuple[str, ...]) -> Iterator[str]:
 
 
 def is_number(value: object) -> bool:
-    """Whether `value` is a finite number; true and false are none."""
     number = isinstance(value, int | float | np.integer | np.floating)
     return number and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
 
@@ -548,7 +544,6 @@ def matrix(rows: int | None, columns: int) -> PlainValidator:
 
 
 def _unit_vector(vector: Array) -> Array | None:
-    """`vector` at unit length, None where it is zero."""
     largest = np.abs(vector).max()
     if largest == 0:
         return None
@@ -558,7 +553,6 @@ def _unit_vector(vector: Array) -> Array | None:
 
 
 def direction(vector: Array, spot: Spot, name: str) -> Array:
-    """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
     unit = _unit_vector(np.asarray(vector, dtype=float))
     if unit is None:
         what = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
@@ -582,7 +576,6 @@ def _tuple(value: object) -> object:
 
 
 def existing_file(found: str, spot: Spot, name: str) -> Path:
-    """The file that a key names relative to the cell file; raises InputError where it is none."""
     return check_exists(spot.path.parent / found, spot.key(name), spot.path)
 
 

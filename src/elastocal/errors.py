@@ -93,7 +93,6 @@ class UnknownNameError(InputError, KeyError):
 
 
 def flag_of(keyword: str) -> str:
-    """The flag of a keyword argument."""
     return FLAGS.get(keyword, "--" + keyword.replace("_", "-"))
 
 
@@ -190,6 +189,5 @@ def _of_plugin(error: Exception) -> str:
 
 
 def require(condition: bool, message: str) -> None:
-    """Raise InputError with `message` unless `condition` holds."""
     if not condition:
         raise InputError(message)

@@ -85,7 +85,6 @@ def check_ending(path: Path, endings: Collection[str]) -> None:
 
 
 def check_size(path: str | Path, what: str, size: int, max_bytes: int | None) -> None:
-    """Raise InputError where `size` is more than `max_bytes`."""
     if max_bytes is not None and size > max_bytes:
         raise InputError(
             f"{path}: larger than {max_bytes / 1e6:g} MB, which no {what} is; check the path"
@@ -275,7 +274,6 @@ def remove_abandoned(folder: Path, name: str) -> None:
 
 
 def _runs(process: int) -> bool:
-    """Whether a process of this number may run."""
     try:
         if os.name == "posix":  # elsewhere the signal 0 would end it
             os.kill(process, 0)

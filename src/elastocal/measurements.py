@@ -427,7 +427,6 @@ def order_contradicted(table: Measurements) -> str | None:
 
 
 def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
-    """Every family of columns for a robot with these joints ("revolute" or "prismatic")."""
     numbered = list(enumerate(joint_kinds, start=1))
 
     def per_joint(stem: str, revolute: tuple[str, ...], prismatic: tuple[str, ...]) -> dict:
@@ -490,7 +489,6 @@ def layout_of(
 
 
 def _wrong_joint(text: str, header: Sequence[str], known: Mapping[str, Family]) -> str | None:
-    """What to say of a column of a joint that the robot does not have."""
     numbered = NUMBERED.fullmatch(text)
     if not numbered or any(numbered[1] + numbered[2] in f.units for f in known.values()):
         return None
@@ -710,7 +708,6 @@ def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
 
 
 def read_matrix(path: str | Path, what: str) -> Array:
-    """A matrix of finite numbers without a header: CSV, or numpy's .npy."""
     if Path(path).suffix.lower() == ".npy":
         return _read_npy(path, what)
     lines = enumerate(read_text(path, what, tables.MOST_BYTES).splitlines(), start=1)

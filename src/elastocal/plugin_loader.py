@@ -94,14 +94,12 @@ def _has_run(name: str, fresh: bool) -> bool:
 
 
 def _trusted(cell: Path) -> bool:
-    """Whether TRUSTED allows all, or lists a folder that holds the cell, wherever links lead."""
     stated = os.environ.get(TRUSTED, "")
     folders = (Path(each).resolve() for each in stated.split(os.pathsep) if os.path.isabs(each))
     return stated == "1" or any(cell.resolve().is_relative_to(folder) for folder in folders)
 
 
 def is_plugin_file(module: str) -> bool:
-    """Whether an entry of `[plugins] modules` names a file, not a module to import."""
     return module.endswith(".py")
 
 

@@ -64,12 +64,10 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def save_published(result: Any, path: Path) -> None:
-    """What the result publishes of itself, as JSON."""
     write_json(path, result.to_json())
 
 
 def save_residuals(fit: Calibration, path: Path) -> None:
-    """One row per observation: its residual and its held-out residual (CSV)."""
     rows = fit.residual_table()
     atomic_write_text(path, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
 

@@ -210,7 +210,6 @@ def shown(text: str) -> str:
 
 
 def say(text: str, error: bool = False, end: str = "\n") -> None:
-    """Show `text` on stdout, or on stderr where it tells of an `error`."""
     stream = sys.stderr if error else sys.stdout
     if stream is None:
         return
@@ -223,14 +222,12 @@ def say(text: str, error: bool = False, end: str = "\n") -> None:
 
 
 def complain(message: str) -> None:
-    """The one line on stderr by which a command says why it ended."""
     # splitlines() would swallow \u2028 and the like, which a name may be made of.
     lines = map(printable, message.replace("\r\n", "\n").split("\n"))
     say(f"elastocal: {' '.join(lines)}", error=True)
 
 
 def safe_console(**how: Any) -> Console:
-    """A rich console that shows texts as they can be read and takes none as its markup."""
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
 

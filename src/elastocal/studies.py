@@ -164,7 +164,6 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
 
 
 def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
-    """The files of the study as its folder stands now, without hidden folders and caches."""
     for name in stated.files:
         named = f"{path}: key files names {quoted(name)}"
         inside = (folder / name).resolve().is_relative_to(folder)
@@ -178,7 +177,6 @@ def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
 
 
 def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
-    """The defaults, with KEY=VALUE in their place; a value is of its default's type."""
     options = dict(defaults)
     for text in given:
         key, equals, written = (part.strip() for part in text.partition("="))
@@ -267,7 +265,6 @@ def load(sources: Sources) -> ModuleType:
 
 
 def _standing(sources: Sources) -> Path:
-    """The study's folder where it stands here with these very contents, else a copy of it."""
     with suppress(OSError):
         if all((sources.folder / n).read_bytes() == d for n, d in sources.contents.items()):
             return sources.folder
@@ -372,7 +369,6 @@ OURS = {RESULTS, STATEMENT, FAILURES, PAGE, "_written.txt"}  # the last by earli
 
 @contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """The results in `folder`, made where absent, with no other process writing to it."""
     import fcntl
 
     try:
@@ -647,7 +643,6 @@ def _security(
 
 
 def connect(address: str, **way: Any) -> Any:
-    """Returns a client of the scheduler at `address`, or in Dask's configuration ("config")."""
     try:
         import dask
         import distributed

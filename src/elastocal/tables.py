@@ -417,7 +417,6 @@ def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> s
 
 
 def _meant(name: str) -> str:
-    """The stem that other tables call `name`; empty where none is known."""
     for pattern, stem in CALLED.items():
         if found := re.fullmatch(pattern, name.lower()):
             return found.expand(stem)
@@ -584,7 +583,6 @@ def _plain_numbers(cells: Sequence[str]) -> Array | None:
 
 
 def _numbers(cells: Iterable[str]) -> Array:
-    """Numbers cell by cell, NaN where one is empty."""
     texts = (cell.replace(",", ".").strip() for cell in cells)
     return np.array([float(text or "nan") for text in texts])
 
@@ -613,7 +611,6 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
 
 
 def _check_unpacked(source: str, what: str) -> None:
-    """Raise InputError where a Parquet file of some kilobytes would unpack beyond all bounds."""
     try:
         from pyarrow.parquet import ParquetFile
 
@@ -661,7 +658,6 @@ def write_parquet(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
 def csv_text(
     header: Iterable[str], rows: Iterable[Iterable[object]], comments: Iterable[str] = ()
 ) -> str:
-    """The text that `write_csv` writes."""
     text = StringIO()
     write_csv(text, header, rows, comments)
     return text.getvalue()

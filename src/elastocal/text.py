@@ -35,7 +35,6 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def listed(names: Iterable[str], limit: int = 40) -> str:
-    """Names joined by commas, cut after `limit` with the number left off."""
     names = list(names)
     more = f", … ({len(names) - limit} more)" if len(names) > limit else ""
     return ", ".join(names[:limit]) + more
@@ -100,7 +99,6 @@ def cell_text(cell: object) -> object:
 
 
 def cell_meaning(cell: str) -> str:
-    """The text that `cell_text` wrote."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
@@ -109,7 +107,6 @@ _MINUS = re.compile(rb'(^|[,;\t"][ \t"]*)(?:\xe2\x88\x92|\xe2\x80\x93|\xef\xbc\x
 
 
 def plain_minus(line: bytes) -> bytes:
-    """A line of a table with minus signs of text programs as -."""
     return line if line.isascii() else _MINUS.sub(rb"\1-", line)
 
 

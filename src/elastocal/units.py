@@ -92,7 +92,6 @@ def to_si(value: Value, unit: str) -> Value:
 
 
 def quantities(unit: str) -> tuple[str, ...]:
-    """The quantities that have this unit."""
     return tuple(name for name, units in FACTORS.items() if unit in units)
 
 

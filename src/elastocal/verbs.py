@@ -676,7 +676,6 @@ def compensate(
 
 
 def check_frame(frame: str) -> None:
-    """Raise InputError for a frame that targets cannot stand in."""
     from elastocal.compensation.compensate import FRAMES
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
@@ -782,7 +781,6 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
 
 
 def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
-    """One name or several, as a tuple."""
     names = (given,) if isinstance(given, str) else tuple(given)
     for each in names:
         require(isinstance(each, str), f"{option(name)} takes names; found {quoted(each)}")
