@@ -14,7 +14,6 @@ from elastocal.planning.exchange import (
     first_allowed,
     prospects,
     random_plan,
-    rounded,
     sized_plans,
     values_without,
 )
@@ -152,15 +151,6 @@ def test_the_same_plan_in_parameters_of_any_scale():
         turned, _ = balanced(one)
         plans.append(exact_plan(turned, relax(turned))[0].tolist())
     assert plans[0] == plans[1]
-
-
-def test_rounding_keeps_shares():
-    problem, _ = balanced(problem_of("D", 0))
-    weights = relax(problem).weights
-    for rng in (None, np.random.default_rng(1)):
-        plan = rounded(problem, weights, rng)
-        assert np.bincount(problem.group[plan]).tolist() == problem.shares.tolist()
-        assert np.bincount(plan).max() == 1
 
 
 def test_what_a_plan_loses_without_a_pose():

@@ -35,21 +35,6 @@ def cell(workspace: Workspace | None = None, model: Any = None, **design: Any) -
 
 
 @pytest.mark.parametrize(
-    "good",
-    [
-        cell(),
-        cell(levels={"joint2": (-np.pi / 2, 0.0)}),
-        cell(model={"compliance_levels": {"joint2": (-1.0, 0.0)}}, levels={"joint2": (-1.0,)}),
-        cell(motion=Motion(home=HOME, speed=np.ones(6))),
-        cell(motion=Motion(speed=np.ones(1), degrees=True)),
-        cell(test_poses=(TargetPose(HOME, degrees=True), TargetPose(HOME))),
-    ],
-)
-def test_what_fits_passes(good: Cell) -> None:
-    check_cell(good, kr270_chain())
-
-
-@pytest.mark.parametrize(
     ("bad", "told"),
     [
         (cell(levels={"joint2": (-1.0, 0.2)}), ["joint2 at 11.4592°", "-146° to 0°"]),

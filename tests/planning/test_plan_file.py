@@ -1,12 +1,10 @@
 """plan.csv and plan.json: read back exactly, and taken by simulate and identify."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.cells import kr270_chain
 
-from elastocal.errors import InputError
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.planning.plan import write_plan
 from elastocal.text import is_label
@@ -53,9 +51,3 @@ def test_what_is_written_is_read_back(tmp_path_factory, data):
     assert (
         plan.approach is None if approach is None else np.array_equal(plan.approach, rows.approach)
     )
-
-
-def test_where_there_is_no_folder_nothing_is_written(tmp_path):
-    with pytest.raises(InputError, match="does not exist"):
-        write_plan(tmp_path / "no" / "plan.csv", plan_of(("a", "b"), np.zeros((2, 6)), KINDS), {})
-    assert not list(tmp_path.iterdir())

@@ -113,7 +113,6 @@ CASES: dict[str, tuple[Any, Any]] = {
         CHAIN,
         lambda c: plan_cell(("joint_compliance", "distance_sensor"), "distance", loads=BOTH),
     ),
-    "7 axes": ("iiwa14", lambda c: any_cell(c, FEW, loads=SMALL)),
     "7 axes, deflections": (
         "Panda", lambda c: any_cell(c, ("joint_compliance",), observe="deflection", loads=SMALL)
     ),

@@ -59,7 +59,7 @@ def test_a_beam_passes_at_its_radius():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("x", np.linspace(-2.9, 2.4, 12))
+@pytest.mark.parametrize("x", [-2.9, 0.1, 2.4])
 def test_the_beam_reaches_from_the_tracker_to_the_marker_and_no_further(x):
     """Whatever its length: walls behind tracker and marker do not hide, one between does."""
     sight = Visibility(beam_radius=0.005)
