@@ -484,8 +484,8 @@ def import_(
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.assemble import import_files
+    from elastocal.importing.exports import likely_presets
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
-    from elastocal.importing.records import likely_presets
     from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
 

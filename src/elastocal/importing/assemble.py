@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.mistakes import NominalFit, nominal_fit
-from elastocal.importing import joining, mapping_file, records
+from elastocal.importing import joining, mapping_file
+from elastocal.importing.exports import Records, Understood, joint_stems, read_records
 from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import ImportMapping, MappingTable, SourceTable
-from elastocal.importing.records import Records, Understood
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import load_chain
@@ -169,7 +169,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     settings = mapping.join or mapping_file.JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
     numbers, units = _numbers(points, log, joined, rows)
-    stems = records.joint_stems(numbers)
+    stems = joint_stems(numbers)
     if not stems:
         raise InputError(
             f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
@@ -467,14 +467,12 @@ def import_files(
     understood = []
     spherical = False
     for path, source in _assigned(where, files, mapping.sources):
-        found = records.with_labels(
-            where, records.read_records(where, path, source, units), source.names
-        )
-        spherical = spherical or records.is_spherical(found)
-        found = records.with_positions(found, clockwise=source.azimuth == "clockwise")
+        found = joining.with_labels(where, read_records(where, path, source, units), source.names)
+        spherical = spherical or joining.is_spherical(found)
+        found = joining.with_positions(found, clockwise=source.azimuth == "clockwise")
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip
-        if role in ("joints", "both") and records.joint_stems(found.numbers):
+        if role in ("joints", "both") and joint_stems(found.numbers):
             found = joining.with_joints(where, found, table.joints, names)
         by_role["joints" if role == "joints" else "points"].append(found)
         understood.append(found.understood)

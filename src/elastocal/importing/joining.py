@@ -1,4 +1,5 @@
-"""Which joint values belong to which point: by order, name, time or dwell."""
+"""What a row stands for: point, marker, pose and load by name, its position from distance and
+angles, joint values as the model counts them; and which joint values belong to which point."""
 
 from __future__ import annotations
 
@@ -10,10 +11,175 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError, require
-from elastocal.importing.mapping_file import JoinTable, JointsTable
-from elastocal.importing.records import Records, joint_stems
-from elastocal.text import listed
+from elastocal.importing import exports
+from elastocal.importing.exports import Records, joint_stems, taken
+from elastocal.importing.mapping_file import JoinTable, JointsTable, NamesTable
+from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, IntArray
+
+HEIGHT = ("zenith", "elevation")
+SPHERICAL = ("range", "azimuth", *HEIGHT)
+
+
+def is_spherical(records: Records) -> bool:
+    """Does the file give any spherical coordinate?"""
+    return any(stem in records.numbers for stem in SPHERICAL)
+
+
+def with_positions(records: Records, clockwise: bool = False) -> Records:
+    """The records with x, y, z, where the file has spherical coordinates.
+
+    With range d, azimuth α and zenith angle ζ (π/2 − elevation), in a right-handed frame with z up
+    and x at azimuth zero:
+
+        x = d sin ζ cos α,   y = d sin ζ sin α,   z = d cos ζ
+
+    α counts counterclockwise seen from above; where `clockwise`, as theodolites count, y has the
+    other sign.  Readings in the second face, ζ beyond 180° with α turned by 180°, come out right.
+    """
+    if not is_spherical(records):
+        return records
+    height = _height(records)
+    numbers = dict(records.numbers)
+    d = numbers.pop("range")
+    alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
+    _check_spherical(records, d, height, angle)
+    zeta = np.radians(angle if height == "zenith" else 90.0 - angle)
+    level = d * np.sin(zeta)
+    y = level * np.sin(alpha)
+    numbers |= {"x": level * np.cos(alpha), "y": -y if clockwise else y, "z": d * np.cos(zeta)}
+    kept = {stem: unit for stem, unit in records.units.items() if stem not in SPHERICAL}
+    return replace(records, numbers=numbers, units=kept | dict.fromkeys("xyz", "mm"))
+
+
+def _height(records: Records) -> str:
+    found = [stem for stem in SPHERICAL if stem in records.numbers]
+    both = [stem for stem in "xyz" if stem in records.numbers]
+    if both:
+        raise InputError(
+            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
+            f"{listed(found)}; keep one of the two in [source.columns]"
+        )
+    heights = [stem for stem in HEIGHT if stem in found]
+    if len(heights) == 2:
+        raise InputError(
+            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
+            "gives (a level line has zenith 90° and elevation 0°)"
+        )
+    missing = [stem for stem in ("range", "azimuth") if stem not in found]
+    missing += [] if heights else ["zenith or elevation"]
+    if missing:
+        raise InputError(
+            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
+            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
+        )
+    return heights[0]
+
+
+def _check_spherical(records: Records, d: Array, height: str, angle: Array) -> None:
+    if not (d > 0).all():
+        i = int(np.argmin(d > 0))
+        raise InputError(
+            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
+            "positive: correct the line, or the column of range in [source.columns]"
+        )
+    low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
+    off = (angle < low) | (angle > high)
+    if off.any():
+        i = int(np.argmax(off))
+        raise InputError(
+            f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
+            f"{high:g}°; is it an angle of another unit, or {other}_deg?"
+        )
+
+
+GROUPS = ("configuration", "marker", "repeat", "load")
+NAMED = "write pattern in [source.names]"
+
+
+def with_labels(where: str, records: Records, names: NamesTable | None) -> Records:
+    """The records with `labels` from their columns, and from their names where a pattern is given.
+
+    A group that a column gives too is taken from the column.  A name that no pattern matches is
+    an error, or with unmatched = "ignore" passed over and listed.
+    """
+    names = names or NamesTable()
+    labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
+    named = records.texts.get("name")
+    if names.pattern is not None and named is not None:
+        found, bad = _labels_of_names(where, records, names, named)
+        if bad:
+            keep = np.setdiff1d(np.arange(len(records)), bad)
+            reasons = [
+                (int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad
+            ]
+            before = records.understood
+            ignored = tuple(sorted([*before.ignored, *reasons]))
+            understood = replace(before, rows=len(keep), ignored=ignored)
+            records = replace(records.take(keep), understood=understood)
+            labels, found = taken(labels, keep), taken(found, keep)
+        labels = found | labels
+    if names.markers and "marker" in labels:
+        labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
+    if names.in_order and "marker" not in labels:
+        n = len(names.in_order)
+        labels["marker"] = [names.in_order[i % n] for i in range(len(records))]
+        if len(records) % n:
+            raise InputError(
+                f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
+                f"{listed(names.in_order)} of in_order; a point is missing or one too many: name "
+                "the points"
+            )
+    for stem, texts in labels.items():
+        for i, text in enumerate(texts):
+            if not is_label(text):
+                raise InputError(
+                    f"{records.where(i)}: {stem} {quoted(text)} cannot stand in a table; correct "
+                    f"the name, or {NAMED}"
+                )
+    return replace(records, labels=labels)
+
+
+def _labels_of_names(
+    where: str, records: Records, names: NamesTable, named: list[str]
+) -> tuple[dict[str, list[str]], list[int]]:
+    patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
+    expressions = [exports.compiled(where, "pattern", text) for text in patterns]
+    for expression in expressions:
+        if not set(expression.groupindex) & set(GROUPS):
+            raise InputError(
+                f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
+                f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
+            )
+    found: dict[str, list[str]] = {stem: [] for stem in GROUPS}
+    bad: list[int] = []
+    with exports.bounded(where, named):
+        for i, name in enumerate(named):
+            match = next((m for e in expressions if (m := e.search(name))), None)
+            if match is None:
+                bad.append(i)
+            groups = match.groupdict() if match else {}
+            for stem in GROUPS:
+                found[stem].append((groups.get(stem) or "").strip())
+    if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
+        raise InputError(
+            f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
+            f"({listed(map(quoted, patterns), 3)}), as do not {len(bad) - 1} others; {NAMED}, or "
+            'unmatched = "ignore" to leave such points out'
+        )
+    unnamed = set(bad)
+    present = {stem: texts for stem, texts in found.items() if any(texts)}
+    for stem, texts in present.items():
+        empty = [i for i, text in enumerate(texts) if not text and i not in unnamed]
+        if empty and stem in ("configuration", "marker"):
+            raise InputError(
+                f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "
+                f"others do; {NAMED} that finds it in every name"
+            )
+        if empty:
+            default = "0" if stem == "repeat" else "none"
+            present[stem] = [text or default for text in texts]
+    return present, bad
 
 
 def with_joints(
