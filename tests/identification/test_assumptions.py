@@ -77,17 +77,6 @@ def test_copies_under_new_labels_are_counted_once(clean):
     assert result.to_json()["copies"] == list(result.copies)
 
 
-@pytest.mark.parametrize("digits", [None, 6], ids=["all digits", "micrometres"])
-def test_one_repeated_reading_stops_nothing(clean, digits):
-    """With all digits it is a copy; rounded, one equal pair may be a repeat, and counts as one."""
-    model, table, _, alone = clean
-    if digits:
-        table = replace(table, position=np.round(table.position, digits))
-    result = identify(model, doubled(table, [5]))
-    assert len(result.copies) == (0 if digits else 1)
-    assert result.heldout_rms == pytest.approx(alone.heldout_rms, rel=0.02)
-
-
 def test_repeats_that_rounding_makes_equal_are_no_copies():
     """Hardly any clean table loses a reading; nearly every one does of which a third is copied."""
     model, plan = arm(poses=8, nominal=None, effects=("base_frame",))

@@ -8,7 +8,6 @@ from support.calibration import (
     GEOMETRY,
     cell_of,
     measured,
-    placement,
     planar_chain,
     table_at,
     true_values,
@@ -19,7 +18,7 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.start import check_limits, check_table, fixed_and_free
-from elastocal.model.chain import Chain, Joint, joint_limits
+from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 
 
@@ -82,19 +81,6 @@ def test_radians_in_columns_of_degrees(model):
     radians = replace(table, q=np.radians(table.q))
     refused(model, radians, InputError,
             "the joint angles are probably radians in columns named …_deg")  # fmt: skip
-
-
-def test_prismatic_limits_are_in_metres():
-    joints = list(planar_chain().joints)
-    axis = np.array([1.0, 0.0, 0.0])
-    joints[2] = Joint("slide", "prismatic", placement([0.5, 0, 0]), axis, 0.0, 0.8)
-    model = Model.assembled(
-        Chain("slider", tuple(joints), placement([0.1, 0, 0])), cell_of(GEOMETRY)
-    )
-    q = np.zeros((5, 3))
-    q[2, 2] = 15.0  # not an angle: no talk of turns
-    with pytest.raises(InputError, match=r"line 4: joint3 \(slide\) at 15 m is beyond"):
-        check_limits(model, table_at(q))
 
 
 def test_fewer_equations_than_parameters(model):

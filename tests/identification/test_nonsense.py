@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.parts import deflections, positions
+from support.parts import deflections
 
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.mistakes import refuse_nonsense
@@ -27,11 +27,3 @@ def test_deflections_are_small_but_their_positions_tell_swapped_columns() -> Non
     refuse_nonsense(model, observed, model.nominal, none_left, table)
     with pytest.raises(InsufficientDataError, match=f"no deflections of this arm.*{MENDED}"):
         refuse_nonsense(model, observed, model.nominal, none_left, mirrored(table))
-
-
-def test_the_cause_is_sought_in_all_readings_where_most_were_left_out() -> None:
-    model, table = positions()
-    few = observe(table.take(np.arange(5)), "position")
-    far = np.ones(few.value.size)
-    with pytest.raises(InsufficientDataError, match=rf"no arm of .* m could be.*{MENDED}"):
-        refuse_nonsense(model, few, model.nominal, far, mirrored(table))

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import statsmodels.api as sm
 from scipy import integrate, stats
-from scipy.spatial.transform import Rotation
 from support.calibration import binomial_band
 
 from elastocal.identification.faulty_readings import outlier_report
@@ -104,19 +103,6 @@ def test_estimate_scale_and_covariance_are_those_of_statsmodels():
     assert found.scale == pytest.approx(reference.scale, rel=1e-8)
     scaled = covariance_of(found, B).matrix * np.outer(unit, unit)
     np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
-
-
-@pytest.mark.parametrize("fit", [huber, least_absolute], ids=["huber", "l1"])
-def test_the_axes_of_a_reading_do_not_matter(arm, fit):
-    """Each reading turned by its own rotation, as another tracker frame would: same x, weights."""
-    rng = np.random.default_rng(9)
-    y = arm.observed(arm.errors(rng, 0.1)[0])
-    turn = Rotation.random(270, random_state=1).as_matrix()
-    B2 = (turn @ arm.B.reshape(270, 3, 9)).reshape(-1, 9)
-    y2 = (turn @ y.reshape(270, 3, 1)).ravel()
-    one, two = fit(arm.B, y, 3), fit(B2, y2, 3)
-    np.testing.assert_allclose(one.x, two.x, atol=1e-7)
-    np.testing.assert_allclose(one.weights, two.weights, rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize("size", [2, 3])

@@ -79,13 +79,6 @@ def test_pairs_of_mistakes(made, change, told):
     assert told in refusal(path, joints(change)(table))
 
 
-def test_a_left_handed_frame_beside_a_sign(made):
-    path, table = made
-    wrong = joints(lambda q: q[2].__imul__(-1))(table)
-    told = refusal(path, replace(wrong, position=table.position[:, [1, 0, 2]]))
-    assert "sign of joint 3" in told and "left-handed" in told
-
-
 @pytest.mark.parametrize(
     ("missing", "told"),
     [
