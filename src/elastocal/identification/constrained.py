@@ -72,16 +72,9 @@ class ActiveConstraint:
     multiplier: float
 
 
-@dataclass(frozen=True)
-class Nearest:
-    """The point u (q,) of a region nearest to 0: u = Σ prices · rows + Σ ⟨prices, slopes⟩.
-
-    The prices of the rows (k,) and of each matrix (n, n), half of what they are for |u|².
-    """
-
-    u: Array
-    rows: Array
-    matrices: tuple[Array, ...]
+# The point u (q,) of a region nearest to 0, u = Σ prices · rows + Σ ⟨prices, slopes⟩, the prices of
+# the rows (k,) and of each matrix (n, n), half of what they are for |u|².
+Nearest = tuple[Array, Array, tuple[Array, ...]]
 
 
 @dataclass(frozen=True)
@@ -168,9 +161,9 @@ class Reduced:
         found = self._nearest()
         if found is None:
             raise_conflict(self.limits)
-        x = self.unit * (self.centre + self.T @ found.u)
-        held = self.of_row[found.rows > 0]
-        above = self.sides[found.rows > 0] > 0
+        u, prices, _ = found
+        x = self.unit * (self.centre + self.T @ u)
+        held, above = self.of_row[prices > 0], self.sides[prices > 0] > 0
         x[held] = np.where(above, self.system.lower[held], self.system.upper[held])
         left = self.t - self.J @ x
         return Minimum(x, float(left @ left), self._named(stated or self.system, found), found)
@@ -187,15 +180,15 @@ class Reduced:
         """None where nothing satisfies all constraints."""
         if self._holds(u := np.zeros(self.T.shape[1])):
             nothing = tuple(np.zeros_like(m.constant) for m in self.matrices)
-            return Nearest(u, np.zeros(len(self.least)), nothing)
+            return u, np.zeros(len(self.least)), nothing
         found = self._cone_program()
         if found is None or any(N.shape[1] for N in self._nulls(found)):
             return found
-        held = found.rows > 0
+        held = found[1] > 0
         u, prices = equality_space(self.rows[held], self.least[held])[0], np.zeros(len(held))
         if held.any():  # scipy's nnls of no column at all ends the process
             prices[held] = scipy.optimize.nnls(self.rows[held].T, u)[0]
-        return Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
+        return u, prices, tuple(np.zeros_like(Z) for Z in found[2])
 
     def _cone_program(self) -> Nearest | None:
         """The nearest point to a solver's accuracy, in units of the least that it can be away.
@@ -223,12 +216,12 @@ class Reduced:
             price, slack = size * wanted[0].dual_value / 2, self.rows @ u - self.least
             prices = np.where(slack < price, price, 0.0)
         duals = tuple(size * (c.dual_value + c.dual_value.T) / 4 for c in matrices)
-        return Nearest(u, prices, duals)
+        return u, prices, duals
 
     def _touched(self, found: Nearest) -> BoolArray:
         """Which rows (k,) the point lies on."""
-        slack = (self.rows @ found.u - self.least) * self.lengths
-        return np.asarray((found.rows > 0) | (slack <= ON_BOUND))
+        slack = (self.rows @ found[0] - self.least) * self.lengths
+        return np.asarray((found[1] > 0) | (slack <= ON_BOUND))
 
     def _nulls(self, found: Nearest) -> list[Array]:
         """A null-space basis (n, ·) of each matrix at the point.
@@ -237,8 +230,8 @@ class Reduced:
         are those of −Z, and belong to the null space.
         """
         out = []
-        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
-            values, vectors = np.linalg.eigh(matrix.at(found.u) - Z)
+        for matrix, Z in zip(self.matrices, found[2], strict=True):
+            values, vectors = np.linalg.eigh(matrix.at(found[0]) - Z)
             out.append(vectors[:, values <= ON_BOUND])
         return out
 
@@ -255,12 +248,12 @@ class Reduced:
 
     def _named(self, stated: System, found: Nearest) -> tuple[ActiveConstraint, ...]:
         """Equalities, then bounds, then matrices on which u lies, prices in the units of x."""
-        limits, each = self.limits, self.sides * found.rows / self.lengths
+        limits, each = self.limits, self.sides * found[1] / self.lengths
         # What they leave of the gradient of half the objective is the equalities'.
-        J, z = self.J * self.unit, self.T @ found.u
+        J, z = self.J * self.unit, self.T @ found[0]
         pull = J.T @ (self.J @ (self.unit * (self.centre + z)) - self.t)
         np.subtract.at(pull, self.of_row, each)
-        for own, in_u, Z in zip(limits.matrices, self.matrices, found.matrices, strict=True):
+        for own, in_u, Z in zip(limits.matrices, self.matrices, found[2], strict=True):
             both = in_u.balance / own.balance
             pull -= np.tensordot(own.slopes, np.outer(both, both) * Z, axes=2)
         shares = least_norm(limits.A.T, pull) if len(limits.b) else np.zeros(0)
@@ -280,7 +273,7 @@ class Reduced:
             kind: Literal["lower", "upper"] = "lower" if low else "upper"
             active.append(ActiveConstraint(label, kind, (name,), value, price))
         for in_x, matrix, N, Z in zip(
-            limits.matrices, self.matrices, self._nulls(found), found.matrices, strict=True
+            limits.matrices, self.matrices, self._nulls(found), found[2], strict=True
         ):
             if N.shape[1]:
                 names = _names(stated, np.abs(in_x.slopes).sum(axis=(1, 2)))
@@ -295,7 +288,7 @@ class Reduced:
         These are the ends of the profile interval {v: S(v) − Ŝ ≤ rise}, S(v) the least objective
         with the parameter at v.
         """
-        c, s, u = side * self.T[index], float(np.sqrt(rise)), found.nearest.u
+        c, s, u = side * self.T[index], float(np.sqrt(rise)), found.nearest[0]
         length = float(np.linalg.norm(c))
         if s == 0 or length <= RANK * float(np.max(np.linalg.norm(self.T, axis=1), initial=0.0)):
             return found.x  # equalities leave a single value
@@ -368,23 +361,10 @@ MATTERS = 1e-6  # of the largest multiplier
 def raise_conflict(system: System) -> NoReturn:
     """Raise InputError that names the constraints which no x satisfies together.
 
-    Every constraint is relaxed by one t, in the units of `system`, and t made as small as can be.
-    The constraints with a multiplier are a proof of the contradiction (Farkas); the others could
-    be dropped and it would remain.
+    Every constraint is relaxed by one t ≥ 0, in the units of `system`, and t made as small as can
+    be.  The constraints with a multiplier are a proof of the contradiction (Farkas); the others
+    could be dropped and it would remain.
     """
-    found = _least_excess(system)
-    largest = max(found.values(), default=0.0)
-    guilty = [f"'{k}'" for k, v in found.items() if v > MATTERS * largest] or [
-        f"'{label}'" for label in found
-    ]
-    raise InputError(
-        f"the constraints contradict each other: no values satisfy {listed(guilty)} together; "
-        "relax or drop one of them"
-    )
-
-
-def _least_excess(system: System) -> dict[str, float]:
-    """Multipliers by label of min t subject to every constraint relaxed by t ≥ 0."""
     import cvxpy as cp
 
     z, t = cp.Variable(len(system.names)), cp.Variable(nonneg=True)
@@ -401,10 +381,14 @@ def _least_excess(system: System) -> dict[str, float]:
     for m in system.matrices:
         named.append((m.label, _value(cp, m, z) + t * np.eye(len(m.balance)) >> 0))
     _solve(cp.Problem(cp.Minimize(t), [constraint for _, constraint in named]))
-    return {
-        label: 0.0 if c.dual_value is None else float(np.abs(c.dual_value).max())
-        for label, c in named
-    }
+    prices = [0.0 if c.dual_value is None else np.abs(c.dual_value).max() for _, c in named]
+    matter = MATTERS * max(prices, default=0.0)
+    labels = [f"'{label}'" for label, _ in named]
+    guilty = [label for label, price in zip(labels, prices, strict=True) if price > matter]
+    raise InputError(
+        f"the constraints contradict each other: no values satisfy {listed(guilty or labels)} "
+        "together; relax or drop one of them"
+    )
 
 
 # Cone programs.

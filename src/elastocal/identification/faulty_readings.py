@@ -383,7 +383,6 @@ def report_faulty(
 
 
 def _fitted_markers(model: Model, columns: NDArray[np.int64]) -> set[str]:
-    """Names of the markers whose positions are among the fitted parameters."""
     fitted = [model.parameters[c] for c in columns]
     return {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
 

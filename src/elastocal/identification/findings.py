@@ -125,7 +125,6 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
 
 
 def _trust(found: list[Finding]) -> Finding:
-    """Can the calibration be used?  As the worst finding says."""
     worst: Severity = "good"
     for severity in ("care", "poor"):
         if any(f.severity == severity for f in found):
@@ -135,7 +134,6 @@ def _trust(found: list[Finding]) -> Finding:
 
 
 def _spoilt(result: Calibration) -> Iterator[Finding]:
-    """What makes the result worthless."""
     if not result.converged:
         yield _poor("not_converged", reason=result.reason)
     held, nominal = result.heldout_rms, result.nominal_rms
@@ -160,7 +158,6 @@ def _explained(result: Calibration, noise: tuple[Finding, ...]) -> bool:
 
 
 def _overfitted(result: Calibration) -> float:
-    """n / (n - p)"""
     return len(result.observations.value) / max(result.dof, 1)
 
 
@@ -718,7 +715,6 @@ def of_solution(
 
 
 def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
-    """Names of markers that are exchanged: a note where the readings were set apart."""
     found = exchanged(result.model, whole)
     if found is not None:
         lines = whole.row[found.rows]

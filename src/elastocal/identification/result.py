@@ -517,18 +517,13 @@ class Calibration(Result):
         return self.model.regressor(observed.table, self.x, observations=observed).B
 
     @property
-    def _looked(self) -> scrutiny.Looked | None:
-        """The fit for a second look; None for a table too large to do it in passing, for an exact
-        fit, which leaves nothing to look at, and for one that priors or bounds hold as well: what
-        a configuration decides there is not said by B alone."""
-        others = self.prior_share or self.smooth or self.active
+    def _looks(self) -> bool:
+        """Whether to look again: not at a table too large to do it in passing, an exact fit, which
+        leaves nothing to look at, and one that priors or bounds hold as well: what a configuration
+        decides there is not said by B alone."""
         numbers = len(self.residual) * len(self.estimates)
-        if others or not self.residual.any() or numbers > MOST_NUMBERS:
-            return None
-        return scrutiny.Looked(
-            self.model, self.observations, self.weights, self.x, self.B, self.columns,
-            self.residual, self.dof,
-        )  # fmt: skip
+        others = self.prior_share or self.smooth or self.active
+        return not others and bool(self.residual.any()) and numbers <= MOST_NUMBERS
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
         """Leverage and influence of every configuration, in the table's order; empty for tables
@@ -540,21 +535,16 @@ class Calibration(Result):
             >>> strongest.configuration, strongest.leverage, strongest.moved
             ('...', 1..., 'joint...')
         """
-        fit = self._looked
-        return () if fit is None else scrutiny.influence(fit)
+        return scrutiny.influence(self) if self._looks else ()
 
     def parameter_sets(self) -> tuple[scrutiny.ParameterSet, ...]:
         """Sets of parameters side by side: held-out errors and restricted likelihoods."""
-        fit = self._looked
-        return () if fit is None else scrutiny.parameter_sets(fit)
+        return scrutiny.parameter_sets(self) if self._looks else ()
 
     def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""
-        fit = self._looked
-        if fit is None:
-            return None
-        return scrutiny.uncertainty_budget(fit, self.arm, self.noise_parts, table)
+        return scrutiny.uncertainty_budget(self, table) if self._looks else None
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:

@@ -8,7 +8,7 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import linalg, special
@@ -17,30 +17,16 @@ from elastocal.engine.sizes import Standardised
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
 from elastocal.identification.solve import reduce
-from elastocal.identification.weighted_problem import Weights, least_norm, same_size
+from elastocal.identification.weighted_problem import least_norm, same_size
 from elastocal.measurements import Measurements
-from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array, BoolArray, IntArray, microns
+from elastocal.units import Array, BoolArray, microns
+
+if TYPE_CHECKING:
+    from elastocal.identification.result import Calibration
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
-
-
-@dataclass(frozen=True)
-class Looked:
-    """The fit as it ended: B (rows, parameters) of all parameters, which of them were fitted
-    (`columns`, by index), residual (rows,), weights."""
-
-    model: Model
-    observations: Observations
-    weights: Weights
-    x: Array
-    B: Array
-    columns: IntArray
-    residual: Array
-    dof: int
 
 
 # Leverage and influence.
@@ -75,7 +61,7 @@ class Influence:
         }
 
 
-def influence(fit: Looked) -> tuple[Influence, ...]:
+def influence(fit: Calibration) -> tuple[Influence, ...]:
     """Leverage and influence of every configuration, in the order of the table."""
     observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
@@ -220,7 +206,7 @@ CHOSEN = "chosen"
 RESAMPLED = 1000
 
 
-def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
+def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
     model, free = fit.model, ~fit.model.shrunk
@@ -333,19 +319,14 @@ class UncertaintyBudget:
         return {"at": self.at, **{f"{k}_um": microns(v) for k, v in told.items()}}
 
 
-def uncertainty_budget(
-    fit: Looked, arm: CalibratedArm, parts: dict[str, float], table: Measurements | None = None
-) -> UncertaintyBudget:
-    """The budget at the poses and loads of a `table`, by default those fitted.
-
-    `parts`: mean squares (m²) of the noise, "readings" and "visits".
-    """
+def uncertainty_budget(fit: Calibration, table: Measurements | None = None) -> UncertaintyBudget:
+    """The budget at the poses and loads of a `table`, by default those fitted."""
     B, at = fit.B, "the poses fitted"
     if table is not None:
         B, at = fit.model.regressor(table, fit.x).B, table.source
-    own, left = mean_squares(arm, B, fit.observations.size)
-    visits, readings = (parts.get(part, 0.0) for part in ("visits", "readings"))
-    lack = min(max(arm.lacking**2 - visits, 0.0), readings)
+    own, left = mean_squares(fit.arm, B, fit.observations.size)
+    visits, readings = (fit.noise_parts.get(part, 0.0) for part in ("visits", "readings"))
+    lack = min(max(fit.arm.lacking**2 - visits, 0.0), readings)
     parameters, open_, shared, single, beyond = np.sqrt(
         [own, left, visits, readings - lack, lack]
     ).tolist()
