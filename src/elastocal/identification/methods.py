@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy import sparse, special
@@ -186,7 +187,10 @@ def _by_method(
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
-    drop = options.sets_aside(faulty) and (method in ("wls", "reml") or options.faulty == "drop")
+    explained = partial(_explained, every, sound, None, ~faulty)
+    drop = options.sets_aside(faulty, explained) and (
+        method in ("wls", "reml") or options.faulty == "drop"
+    )
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):
         return _published(method, every, solution, good, options, progress)
@@ -294,12 +298,7 @@ def _reml(
         start: Solution, good: BoolArray, kind: str, known: NoiseAndOutliers | None = None
     ) -> Adapted:
         solution, noise, good = _adapted(every, start, good, kind, progress, refit, known)
-
-        def explained() -> BoolArray:
-            report = report_faulty(every, solution, noise, good)
-            known = [] if report is None else [f.readings for f in report.shifted]
-            return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
-
+        explained = partial(_explained, every, solution, noise, good)
         if not good.all() and not options.sets_aside(~good, explained):
             # So many faulty readings look like anything that scatters or drifts.
             plainly, everything = OF_READINGS if kind == "auto" else kind, np.ones_like(good)
@@ -320,6 +319,15 @@ def _reml(
             noise = replace(noise, tests=tests)  # which say what is not counted
     intervals = intervals_of(solution, options.intervals, noise)
     return MethodResult("reml", solution, intervals, noise, good)
+
+
+def _explained(
+    every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
+) -> BoolArray:
+    """Readings (N,) that are not `good`, of groups which one common shift each explains."""
+    report = report_faulty(every, fitted, noise, good)
+    known = [] if report is None else [f.readings for f in report.shifted]
+    return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
 
 
 WORSE = 1.02  # held-out errors that differ by less are alike

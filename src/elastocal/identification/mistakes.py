@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import chain as chain_of
 from itertools import combinations
 
 import numpy as np
@@ -54,13 +55,9 @@ SAMPLE = 80
 CONFIRMED = 6  # alternatives of joints and positions that are tried in earnest
 
 
-@dataclass(frozen=True)
-class Alternative:
-    """The table as it would read without a mistake; `words` say what is otherwise, {} being what it
-    then fits to."""
-
-    words: str
-    table: Measurements
+# The table as it would read without a mistake, after words that say what is otherwise, {} being
+# what it then fits to.
+Alternative = tuple[str, Measurements]
 
 
 @dataclass(frozen=True)
@@ -97,10 +94,11 @@ def nominal_fit(
         return NominalFit(error, "")
     near, best = far, ""
     # The simplest that mends it, else what does most.
-    for other in _alternatives(rigid, table, spherical):
-        left = _errors(rigid, other.table)[1]
+    of_columns = _of_columns(chain, _some(table), spherical)
+    for words, other in chain_of(of_columns, _of_rows(rigid, table)):
+        left = _errors(rigid, other)[1]
         if left < near:
-            near, best = left, other.words.format(_mm(left))
+            near, best = left, words.format(_mm(left))
         if near <= POOR:
             break
     if near >= far / BETTER:
@@ -134,11 +132,6 @@ def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     place = found.places(problem.flange_rotation, problem.flange_position, problem.marker)
     distance = np.linalg.norm(problem.points - place, axis=1)
     return found.error, float(np.percentile(distance, MOST))
-
-
-def _alternatives(model: Model, table: Measurements, spherical: bool) -> Iterator[Alternative]:
-    yield from _of_columns(model.chain, _some(table), spherical)
-    yield from _of_rows(model, table)
 
 
 # Joint values as a controller may count them.  Its c become the model's q by signs, offsets, an
@@ -251,7 +244,7 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
             if words:
                 told = " and ".join(words).replace("{", "{{").replace("}", "}}")
                 changed = replace(table, q=q[k], position=undone)
-                other = Alternative(f"{told} they would fit to {{}}", changed)
+                other = (f"{told} they would fit to {{}}", changed)
                 found.append((float(fits.left[k]), count, other))
     found.sort(key=lambda one: one[0])
     likely = [one for one in found if one[0] <= POOR] or found[:2]
@@ -328,7 +321,7 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
     later = visit[np.clip(rows + moved, 0, len(rows) - 1)] - visit
     blocks = [(b, np.unique(later[b[good[b]]])) for b in np.split(rows, starts[1:])]
     words = _slipped_words(table, moved, blocks)
-    yield Alternative(words, _moved(table, inside, moved[inside]))
+    yield words, _moved(table, inside, moved[inside])
 
 
 def _placed_by(
@@ -569,6 +562,12 @@ BESIDE, NEARER = 3.0, 5.0
 SHOWN = 6  # runs of lines, and configurations, that are named
 
 
+IN_ALL = (
+    "Markers {} lie where [tool.markers_m] states each other: their names are exchanged in all "
+    "rows of the table, or in the cell. Exchange them in one of the two."
+)
+
+
 @dataclass(frozen=True)
 class Exchanged:
     """Rows (k,) of a table with the name of another marker, the `markers` that are mixed up, and in
@@ -609,7 +608,9 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
     mixed = np.unique([*table.marker[rows], *meant[rows]])
     whole = len(rows) == np.isin(table.marker, mixed).sum()
     markers = tuple(names[m] for m in mixed)
-    return Exchanged(rows, markers, _in_all(markers) if whole else _in_some(table, rows, markers))
+    return Exchanged(
+        rows, markers, IN_ALL.format(listed(markers)) if whole else _in_some(table, rows, markers)
+    )
 
 
 def _as_stated(tool: Tool, names: tuple[str, ...], places: Array) -> IntArray:
@@ -624,13 +625,6 @@ def _as_stated(tool: Tool, names: tuple[str, ...], places: Array) -> IntArray:
         if (off**2).sum() > level * (crossed**2).sum():
             best[[a, b]] = best[[b, a]]
     return best
-
-
-def _in_all(markers: tuple[str, ...]) -> str:
-    return (
-        f"Markers {listed(markers)} lie where [tool.markers_m] states each other: their names are "
-        "exchanged in all rows of the table, or in the cell. Exchange them in one of the two."
-    )
 
 
 def _in_some(table: Measurements, rows: IntArray, markers: tuple[str, ...]) -> str:
