@@ -149,3 +149,16 @@ def test_as_many_that_one_shift_explains_are_set_apart_and_the_shift_is_told():
     found = result.finding("faulty_readings")
     assert found.numbers["shifted"] == 6
     assert "One common shift each explains lines 12 to 17 by 17.4 mm" in found.remedy
+
+
+def test_a_missing_effect_in_one_load_state_is_no_shift():
+    """Compliances that the model lacks move a loaded fifth of the readings, each otherwise."""
+    stiff = {"nominal": Nominal(joint_compliance=(2e-5,) * 3)}
+    true = Model.assembled(planar_chain(), cell_of((*PLACED, "joint_compliance"), **stiff))
+    rng = np.random.default_rng(0)
+    plan = table_at(random_poses(true.chain, 60, 0), STATES)
+    loaded = plan.force.any(axis=1)
+    plan = plan.take(np.flatnonzero(loaded == (plan.configuration >= 48)))
+    rigid = Model.assembled(true.chain, cell_of(PLACED))
+    result = identify(rigid, measured(true, plan, true_values(true, rng), SIGMA, rng))
+    assert result.excluded == () and not result.verdict.trusted
