@@ -22,8 +22,7 @@ import numpy as np
 from bench_tools import ONE_THREAD, Seconds, peer, required, table, timed, where
 
 from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.exchange import exact_plan
-from elastocal.planning.relaxation import DesignProblem, balanced, relax
+from elastocal.planning.relaxation import DesignProblem, balanced, exact_plan, relax
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10

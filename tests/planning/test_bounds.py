@@ -8,22 +8,20 @@ import pytest
 
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, SpectralCriterion
-from elastocal.planning.exchange import (
-    exact_plan,
-    exchange,
-    first_allowed,
-    prospects,
-    random_plan,
-    sized_plans,
-    values_without,
-)
 from elastocal.planning.relaxation import (
     DesignProblem,
     balanced,
     check_enough,
     efficiency,
+    exact_plan,
+    exchange,
+    first_allowed,
     in_terms,
+    prospects,
+    random_plan,
     relax,
+    sized_plans,
+    values_without,
 )
 
 FIVE = ("test_pose", "D", "E", "G", "O5")

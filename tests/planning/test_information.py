@@ -12,7 +12,6 @@ from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker, 
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -47,20 +46,6 @@ def relative(found: np.ndarray, expected: np.ndarray) -> float:
     scale = np.sqrt(np.diag(expected))
     scale[scale == 0] = 1.0
     return float(np.abs((found - expected) / np.outer(scale, scale)).max())
-
-
-@pytest.mark.parametrize("noise", [POLAR, AXIS])
-@pytest.mark.parametrize("observed", ["position", "deflection"])
-def test_information_of_poses_is_that_of_their_readings(observed: str, noise: object) -> None:
-    """Σ B_iᵀΣ_i⁻¹B_i over poses equals BᵀΣ⁻¹B of the simulated table, three repeats and all."""
-    cell = cell_for(observed, noise, loads=np.array([[0.0, 0, 0], DOWN]), repeats=3)
-    information = information_of(cell)
-    model = information.model
-    poses = expand_plan(_plan(information), tuple(cell.tool.markers), 3, DOWN)
-    table = simulate(model, poses, model.nominal, 0, noise=False)
-    seen = observe(table, observed)
-    B = weights_for(seen, cell.tracker).apply(model.regressor(table, None, None, seen).B)
-    assert relative(gathered(information, TABLE_2), B.T @ B) < 1e-9
 
 
 def _plan(information: PoseInformation):

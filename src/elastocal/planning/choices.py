@@ -26,13 +26,19 @@ from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of
 from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.exchange import exact_plan, prospects
 from elastocal.planning.execution import at_stops, nearest_first
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Plan, TimedSize
-from elastocal.planning.relaxation import Relaxed, balanced, check_enough, relax
+from elastocal.planning.relaxation import (
+    Relaxed,
+    balanced,
+    check_enough,
+    exact_plan,
+    prospects,
+    relax,
+)
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, BoolArray, IntArray, Progress

@@ -31,12 +31,6 @@ from elastocal.planning.candidates import (
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice, applied, chosen_states, within
 from elastocal.planning.criteria import CRITERIA, criterion_named
-from elastocal.planning.exchange import (
-    first_allowed,
-    random_information,
-    sized_plans,
-    values_without,
-)
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import (
     IDENTIFIED,
@@ -58,7 +52,13 @@ from elastocal.planning.plan import (
     reasons,
 )
 from elastocal.planning.polish import Searches
-from elastocal.planning.relaxation import DesignProblem
+from elastocal.planning.relaxation import (
+    DesignProblem,
+    first_allowed,
+    random_information,
+    sized_plans,
+    values_without,
+)
 from elastocal.planning.search import EFFORTS, POOL, Search, Selection, ordered
 from elastocal.planning.setup import (
     OPEN,

@@ -14,15 +14,6 @@ import numpy as np
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.criteria import inverse
-from elastocal.planning.exchange import (
-    check_determined,
-    exact_plan,
-    exchange,
-    fitted,
-    prospects,
-    random_plan,
-    rounded,
-)
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Roadmap, Unreachable, blockers_of, travel_times
@@ -32,9 +23,16 @@ from elastocal.planning.relaxation import (
     RIDGE,
     DesignProblem,
     balancing,
+    check_determined,
     check_enough,
     efficiency,
+    exact_plan,
+    exchange,
+    fitted,
     in_terms,
+    prospects,
+    random_plan,
+    rounded,
 )
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
-from elastocal.planning.exchange import random_plan
 from elastocal.planning.polish import JointSearch, estimate, polish
-from elastocal.planning.relaxation import RIDGE, balancing, in_terms, relax
+from elastocal.planning.relaxation import RIDGE, balancing, in_terms, random_plan, relax
 
 Build = Callable[..., Any]
 FLOOR = HalfSpace("floor", np.zeros(3), np.array([0.0, 0.0, 1.0]))
