@@ -29,17 +29,24 @@ def wide(path: Path, degrees: np.ndarray, points: np.ndarray, head: str, unit: s
     return path
 
 
+@pytest.fixture(scope="module")
+def readings(tmp_path_factory):
+    """The folder of the cell, joint values and points."""
+    folder = tmp_path_factory.mktemp("cell")
+    return folder, *kr270_readings(folder)[1:]
+
+
 def table(path: Path) -> list[dict[str, str]]:
     with path.open() as file:
         return list(csv.DictReader(file))
 
 
 @pytest.mark.parametrize("head", ["{marker}_{axis}", "{marker} {axis}"])
-def test_every_marker_of_a_row_becomes_a_reading(tmp_path, head):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_every_marker_of_a_row_becomes_a_reading(tmp_path, readings, head):
+    folder, degrees, points = readings
     file = wide(tmp_path / "log.csv", degrees, points, head)
     out = tmp_path / "data.csv"
-    done = run(file, "--preset", "wide", "--cell", tmp_path / "cell.toml", "-o", out)
+    done = run(file, "--preset", "wide", "--cell", folder / "cell.toml", "-o", out)
     assert done.exit_code == 0 and "Warning" not in done.output, done.output
     rows = table(out)
     assert [row["marker"] for row in rows[:4]] == ["M1", "M2", "M1", "M2"]
@@ -49,8 +56,8 @@ def test_every_marker_of_a_row_becomes_a_reading(tmp_path, head):
     assert len({row["configuration"] for row in rows}) == len(degrees)
 
 
-def test_a_marker_that_was_hidden_is_left_out_alone_and_listed(tmp_path):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_a_marker_that_was_hidden_is_left_out_alone_and_listed(tmp_path, readings):
+    _, degrees, points = readings
     file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
     lines = file.read_text().splitlines()
     cells = lines[3].split(",")
@@ -61,8 +68,8 @@ def test_a_marker_that_was_hidden_is_left_out_alone_and_listed(tmp_path):
     assert len(table(tmp_path / "data.csv")) == 2 * len(degrees) - 1
 
 
-def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path, readings):
+    _, degrees, points = readings
     file = wide(tmp_path / "log.csv", degrees, points, "pos{axis}({marker})", "")
     (tmp_path / "map.toml").write_text(
         '[[source]]\n[source.columns]\n"q#_deg" = "q#"\nx_mm = "posx(*)"\ny_mm = "posy(*)"\n'
@@ -78,8 +85,8 @@ def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path):
     [("log_2600N", 2600.0), ("payload_2p5kg", 2.5 * 9.80665), ("load2.6kN", 2600.0),
      ("arm7_unloaded", 0.0), ("P12N3", 0.0)],
 )  # fmt: skip
-def test_a_load_in_a_files_name_is_taken_and_told(tmp_path, name, force):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_a_load_in_a_files_name_is_taken_and_told(tmp_path, readings, name, force):
+    _, degrees, points = readings
     file = wide(tmp_path / f"{name}.csv", degrees, points, "{marker}_{axis}")
     done = run(file, "--preset", "wide", "-o", tmp_path / "data.csv")
     assert done.exit_code == 0, done.output
@@ -88,8 +95,8 @@ def test_a_load_in_a_files_name_is_taken_and_told(tmp_path, name, force):
     assert ("by its name, hanging straight down" in done.output) == (force > 0)
 
 
-def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path, readings):
+    _, degrees, points = readings
     for name in ("unloaded", "full_2600N", "loaded"):
         wide(tmp_path / f"{name}.csv", degrees, points, "{marker}_{axis}")
     files = tmp_path / "unloaded.csv", tmp_path / "full_2600N.csv"
@@ -132,8 +139,8 @@ def test_places_of_markers_that_are_not_there_are_told(tmp_path, columns, told):
     assert not (tmp_path / "data.csv").exists()
 
 
-def test_one_message_names_the_units_of_all_columns_that_state_none(tmp_path):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_one_message_names_the_units_of_all_columns_that_state_none(tmp_path, readings):
+    _, degrees, points = readings
     file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}", "")
     file.write_text(file.read_text().replace("_deg", ""))
     words = [file, "--preset", "wide", "-o", tmp_path / "data.csv"]
@@ -147,8 +154,8 @@ def test_one_message_names_the_units_of_all_columns_that_state_none(tmp_path):
     assert float(table(tmp_path / "data.csv")[0]["q1_deg"]) == degrees[0, 0]
 
 
-def test_a_lone_force_column_is_the_load_and_no_marker(tmp_path):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_a_lone_force_column_is_the_load_and_no_marker(tmp_path, readings):
+    _, degrees, points = readings
     file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
     head, *rows = file.read_text().splitlines()
     text = [f"{head},force_z_N", *(f"{row},-{100 + i}" for i, row in enumerate(rows))]
@@ -161,8 +168,8 @@ def test_a_lone_force_column_is_the_load_and_no_marker(tmp_path):
 
 
 @pytest.mark.parametrize("width", [40, 77])
-def test_the_preview_shows_as_many_whole_columns_as_there_is_room_for(tmp_path, width):
-    _, degrees, points = kr270_readings(tmp_path)
+def test_the_preview_shows_as_many_whole_columns_as_there_is_room_for(tmp_path, readings, width):
+    _, degrees, points = readings
     file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
     words = ["import", str(file), "--preset", "wide", "--preview"]
     shown = CliRunner().invoke(app, words, env={"COLUMNS": str(width)}).output.splitlines()

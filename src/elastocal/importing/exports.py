@@ -120,7 +120,6 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
 
 
 def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
-    """A regular expression of the mapping."""
     try:
         return re.compile(pattern)
     except re.error as error:
@@ -323,7 +322,6 @@ class NumberCells:
         return text.replace(self.thousands, "") if self.thousands else text
 
     def looks_numeric(self, cell: str) -> bool:
-        """Whether a cell can be a number in some way of writing."""
         bare = self._bare(cell)
         return bool(NUMBER.fullmatch(bare)) or bare.casefold() in self.missing - {""}
 
@@ -341,7 +339,6 @@ class NumberCells:
         return number
 
     def complaint(self, source: str, number: int, cell: str, header: str) -> InputError:
-        """What to say of a cell that `value` did not take."""
         where = f"{source}, line {number}, column {header}"
         if self.decimal == "," and "." in cell:
             return InputError(
@@ -608,7 +605,6 @@ _UNITS = {
 
 
 def table_unit(stem: str, unit: str) -> str:
-    """The unit in which a column that a file has in `unit` is written."""
     return "um" if stem.startswith("sigma_") else _UNITS[quantities(unit)[0]]
 
 

@@ -140,7 +140,6 @@ def robot_of(
 
 
 def first_cell(robot: Robot, folder: str | Path = ".") -> str:
-    """Text of a cell file for a robot, to stand in `folder`."""
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
     arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None

@@ -214,12 +214,9 @@ def with_joints(
         units = [units[int(taken[0, j])] for j in range(taken.shape[1])]
     n = len(values)
     _check_lengths(where, joints, n)
-    for j in range(n):
-        if joints.sign is not None:
-            values[j] = values[j] * joints.sign[j]
-        given = joints.offset_deg if units[j] == "deg" else joints.offset_mm
-        if given is not None:
-            values[j] = values[j] + given[j]
+    for j, unit in enumerate(units):
+        given = joints.offset_deg if unit == "deg" else joints.offset_mm
+        values[j] = values[j] * (joints.sign or [1] * n)[j] + (given or [0.0] * n)[j]
     before = list(values)
     for k, coupling in enumerate(joints.coupling or ()):
         for name in ("joint", "of"):
@@ -294,7 +291,6 @@ def _check_lengths(where: str, joints: JointsTable, n: int) -> None:
 
 
 def pooled(records: Sequence[Records]) -> Records:
-    """The rows of all files, in the order of the files."""
     first = records[0]
     for other in records[1:]:
         _same("columns", first, other, set(first.numbers), set(other.numbers))
@@ -411,7 +407,6 @@ class Joined:
 
 
 def join(where: str, points: Records, log: Records, settings: JoinTable | None) -> Joined:
-    """The joint values of every point."""
     settings = settings or JoinTable()
     how = settings.by or _obvious(points, log)
     if how in ("time", "standstill"):

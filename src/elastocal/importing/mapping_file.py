@@ -170,7 +170,6 @@ class ImportMapping:
 
 
 def preset_text(name: str) -> str:
-    """The TOML of a preset."""
     if name not in PRESETS:
         raise InputError(
             f"no preset {quoted(name)}{did_you_mean(name, PRESETS)}; there are {listed(PRESETS)}"
@@ -292,7 +291,6 @@ class ColumnKey:
         return isinstance(self.at, str) and EACH in self.at
 
     def of_marker(self, name: str) -> ColumnKey:
-        """The column of the marker that the file calls `name`."""
         return replace(self, at=str(self.at).replace(EACH, name)) if self.of_each_marker else self
 
     @property
@@ -301,7 +299,7 @@ class ColumnKey:
 
     @property
     def default(self) -> str:
-        """What it measures where no unit says so: joints are angles first."""
+        # Joints are angles first.
         return self.quantities[0]
 
     @property
@@ -310,13 +308,11 @@ class ColumnKey:
         return self.stem.endswith("#")
 
     def numbered(self, i: int) -> ColumnKey:
-        """The column of joint i (from 1) of a template."""
         key, stem = self.key.replace("#", str(i)), f"{self.stem[:-1]}{i}"
         return replace(self, key=key, stem=stem, required=self.required and i == 1)
 
 
 def column_key(where: str, key: str) -> ColumnKey:
-    """What a key of [source.columns] means."""
     numbered = _NUMBERED.fullmatch(key)
     if numbered:
         family, number, tail = numbered.groups()
@@ -369,10 +365,8 @@ def wanted(
     filled: dict[str, str] = {}
     result: list[ColumnKey] = []
     for part in (required, optional):
-        for target in [
-            replace(column_key(where, name), at=at, required=part is required)
-            for name, at in part.items()
-        ]:
+        for name, at in part.items():
+            target = replace(column_key(where, name), at=at, required=part is required)
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             name = target.key if target.stem == "time" else target.stem
             if name in filled:
@@ -401,7 +395,6 @@ def wanted(
 
 
 def by_name(asked: Sequence[ColumnKey]) -> bool:
-    """Whether any required column is looked for by its name in a header."""
     return any(isinstance(part, str) for c in asked if c.required for part in c.parts)
 
 
@@ -501,7 +494,6 @@ def resolve(
 
 
 def _no_unit(source: str, columns: Sequence[FileColumn]) -> InputError:
-    """What to say of columns that state no unit: all that is needed, at once."""
     usual = {c: USUAL.get(q := c.target.default) or next(iter(FACTORS[q])) for c in columns}
     keys = {c: f"{c.target.stem}_{unit}" for c, unit in usual.items()}
     options = [option(f"{c.target.default}_unit", usual[c]) for c in columns
