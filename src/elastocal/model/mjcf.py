@@ -29,7 +29,7 @@ from elastocal.errors import InputError, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, JointKind, LinkMass, check_angles
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.robot_tree import FileJoint, Tree
+from elastocal.model.urdf import FileJoint, Tree
 from elastocal.model.xml_file import XmlFile, check_bounds
 from elastocal.text import listed, printable
 from elastocal.units import Array

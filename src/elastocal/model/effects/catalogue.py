@@ -161,7 +161,7 @@ def check_settings(chain: Chain, cell: Cell) -> None:
     on this arm."""
     nominal = cell.model.nominal
     for table, what, given, keys_of in (
-        ("settings", "setting", nominal.settings, _keys_of_settings),
+        ("settings", "setting", nominal.settings, lambda e, *at: [s.key for s in e.settings(*at)]),
         ("sizes", "parameter", nominal.sizes, _keys_of_sizes),
     ):
         known: dict[str, list[str]] = {}
@@ -175,10 +175,6 @@ def check_settings(chain: Chain, cell: Cell) -> None:
             for key in (key for key in values if key not in known[place]):
                 kind = f"{what} of {place}"
                 raise InputError(_unknown(f"nominal.{table}", kind, key, known[place], cell))
-
-
-def _keys_of_settings(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
-    return [setting.key for setting in effect.settings(place, chain, cell)]
 
 
 def _keys_of_sizes(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
