@@ -69,19 +69,12 @@ def test_markers_that_only_the_table_named_are_found_in_the_result(
     ("change", "told"),
     [
         (lambda r: r.update(schema="elastocal/plan/1"), "schema is 'elastocal/plan/1'"),
-        (lambda r: r.pop("parameters"), "key parameters is missing"),
         (lambda r: r["parameters"].pop(0), "the result lacks joint1.compliance"),
-        (lambda r: r["parameters"].append({"name": "joint9.offset", "held": 0}), "joint9.offset"),
         (lambda r: r["parameters"].append(r["parameters"][0]), "is listed twice"),
         (
             lambda r: r["parameters"][2].update(held=None),
             "held .* no. 3 takes a number",
         ),
-        (
-            lambda r: r["parameters"][2].update(combined_with=[3]),
-            "combined_with .* a list",
-        ),
-        (lambda r: r["parameters"][2].update(dof="many"), "dof .* takes a number"),
         (lambda r: r["parameters"][2].update(held=float("nan")), "NaN is no number of JSON"),
         (lambda r: r["covariance_of"].pop(), "covariance of"),
     ],

@@ -7,7 +7,6 @@ import pytest
 from support.calibration import table_at
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
-from elastocal.errors import InputError
 from elastocal.model.observations import available_noise, polar_axes, position_covariance
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 3e-5])))
@@ -62,8 +61,3 @@ def test_the_tables_sigmas_come_first():
     polar = Tracker(noise=NOISE)
     assert [available_noise(rows, t) for t in (AXIS, polar, Tracker())] == ["rows"] * 3
     assert [available_noise(bare, t) for t in (AXIS, polar, Tracker())] == ["axis", "polar", "none"]
-
-
-def test_a_marker_inside_the_tracker_is_refused():
-    with pytest.raises(InputError, match="a marker stands at the tracker's own position"):
-        position_covariance(table([STATION]), Tracker(STATION, NOISE), "polar")

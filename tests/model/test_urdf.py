@@ -62,14 +62,8 @@ def test_kinds_limits_and_default_axis(tmp_path: Path) -> None:
 
 CASES: dict[str, tuple[str, str]] = {
     "not xml": ("hello", "not XML: syntax error in line 1, column 1"),
-    "empty": ("", "not XML: no element found in line 1, column 1"),
-    "broken": (arm().replace("</robot>", ""), "not XML: no element found in line 1, column"),
     "root": ("<sdf/>", "root element is <sdf>, a URDF has <robot.*this is SDF"),
     "no links": ("<robot/>", "has no <link>"),
-    "xacro element": (
-        '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="a"/></robot>',
-        r"xacro macros are left in \(<xacro:include>\); run xacro first: xacro arm.urdf > expa",
-    ),
     "xacro prefix": ("<robot><xacro:kuka/></robot>", "xacro macros are left in.*run xacro first"),
     "xacro value": (
         arm(replace={'xyz="0 0 1"': 'xyz="0 0 ${d}"'}),
@@ -79,7 +73,6 @@ CASES: dict[str, tuple[str, str]] = {
         arm(replace={'<parent link="l1"/>': ""}),
         "joint 'q2' has no parent link; add <parent",
     ),
-    "no child": (arm(replace={'<child link="l2"/>': "<child/>"}), "joint 'q2' has no child link"),
     "unknown parent": (
         arm(replace={'<parent link="l1"/>': '<parent link="l1x"/>'}),
         r"joint 'q2': parent link 'l1x' is not there \(did you mean 'l1'\?\)",
@@ -92,15 +85,8 @@ CASES: dict[str, tuple[str, str]] = {
         arm(extra=joint("back", "l4", "l0")),
         "joints .*q1.* form a closed loop.*open it at one joint",
     ),
-    "loop beside": (
-        arm(extra=link("a") + link("b") + joint("ab", "a", "b") + joint("ba", "b", "a")),
-        "joints (ab, ba|ba, ab) form a closed loop",
-    ),
     "two roots": (arm(extra=link("lost")), "2 links have no parent joint: l0, lost;.*connect"),
     "unnamed link": (arm(extra="<link/>"), 'link number 6 has no name; write <link name="…">'),
-    "unnamed joint": (arm(extra='<joint type="fixed"/>'), "joint number 5 has no name"),
-    "same link": (arm(extra=link("l3")), "two links are named 'l3'; names must be unique"),
-    "same joint": (arm(extra=joint("q1", "l0", "l1")), "two joints are named 'q1'"),
     "no type": (arm(replace={' type="revolute"': ""}), "joint 'q1' has no type; write type="),
     "type": (
         arm(replace={'type="revolute"': 'type="revolut"'}),
@@ -110,23 +96,16 @@ CASES: dict[str, tuple[str, str]] = {
         arm(replace={LIMIT: LIMIT + '<axis xyz="0 0 0"/>'}),
         'joint \'q1\': axis is zero; give a direction such as xyz="0 0 1"',
     ),
-    "two numbers": (
-        arm(replace={LIMIT: LIMIT + '<axis xyz="0 1"/>'}),
-        "joint 'q1', axis xyz: '0 1' is not three numbers",
-    ),
     "nan": (
         arm(replace={'xyz="0 0 1"': 'xyz="0 0 nan"'}),
         "joint 'q1', origin xyz: 'nan' is not a finite number",
     ),
-    "huge": (arm(replace={'xyz="0 0 1"': 'rpy="0 0 1e999"'}), "origin rpy: '1e999' is not a fin"),
-    "garbage": (arm(replace={'lower="-1"': 'lower="-1_0"'}), "limit lower: '-1_0' is not a finite"),
     "no limit": (arm(replace={LIMIT: ""}), "joint 'q1' is revolute without <limit>; add <limit"),
     "no room": (
         arm(replace={'lower="-1" upper="2"': ""}),
         "joint 'q1': limits lower=0, upper=0 leave no room to move",
     ),
     "mass": (arm(extra=link("m", -1)), "link 'm': mass -1 kg is negative"),
-    "mass text": (arm(extra=link("m", "1kg")), "link 'm', mass value: '1kg' is not a finite"),
     "no mass": (
         arm(extra='<link name="m"><inertial/></link>'),
         "link 'm': <inertial> without <mass",
@@ -143,7 +122,6 @@ CASES: dict[str, tuple[str, str]] = {
         arm(replace={'type="revolute"': 'type="floating"'}),
         "joint 'q1' is floating and lies between base and flange",
     ),
-    "few joints": (arm(3), r"3 moving joints between 'l0' and 'l3' \(q1, q2, q3\); 4 to 9 are"),
     "many joints": (arm(10), r"10 moving joints between 'l0' and 'l10' \(q1, .*q10\); 4 to 9"),
     "two arms": (
         arm(extra="".join(
