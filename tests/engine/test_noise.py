@@ -10,7 +10,7 @@ from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.noise_choice import estimate_noise, own_noise
-from elastocal.identification.noise_structure import Readings, noise_models
+from elastocal.identification.noise_structure import noise_models
 from elastocal.identification.outliers import FALSE_ALARM, majority, prediction_errors, settle
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
@@ -51,18 +51,6 @@ def test_each_noise_is_told_apart(kind):
     assert chosen[kind] >= 5, chosen
 
 
-def test_variances_are_the_simulated_ones():
-    rng, r = np.random.default_rng(4), readings(BASE, 9)
-    for kind, own, common in (
-        ("axis", [1e-10, 4e-10, 16e-10], None), ("stated", [1.0], None),
-        ("independent+configuration", [4e-10], 16e-10),
-    ):  # fmt: skip
-        found = [estimate_noise(r.moved(drawn(kind, rng, r)), kind).fit for _ in range(30)]
-        np.testing.assert_allclose(np.median([f.own for f in found], axis=0), own, rtol=0.1)
-        if common:
-            assert np.median([f.common[0] for f in found]) == pytest.approx(common, rel=0.15)
-
-
 def test_what_cannot_be_asked_for_is_refused():
     with pytest.raises(InputError, match=r"found 'axes'.*did you mean 'axis'"):
         estimate_noise(readings(BASE, 0), "axes")
@@ -85,28 +73,6 @@ def test_what_cannot_be_asked_for_is_refused():
         estimate_noise(replace(few, B=B))
 
 
-def test_few_rows_to_spare_leave_one_variance():
-    """Sixteen rows beyond the parameters are enough for three variances, twelve for one only."""
-    few = readings(Table(configurations=8, markers=1, repeats=1, p=12, unbalanced=False), 0)
-    assert {t.kind for t in estimate_noise(few).trials} == {"independent", "stated"}
-    more = readings(Table(configurations=10, markers=1, repeats=1, p=12, unbalanced=False), 0)
-    assert "axis" in {t.kind for t in estimate_noise(more).trials}
-
-
-@pytest.mark.parametrize("size", [1, 3])
-def test_one_variance_without_shared_effects_is_least_squares(size):
-    """Φ_A = s² (BᵀB)⁻¹ with t on rows − p degrees of freedom, exactly."""
-    r = readings(Table(size=size, configurations=9, markers=2), 0)
-    B, e = r.B.reshape(-1, 4), r.e.ravel()
-    x, rss = np.linalg.lstsq(B, e)[:2]
-    found = estimate_noise(r, "independent")
-    np.testing.assert_allclose(found.x, x, rtol=1e-9)
-    dof = len(e) - 4
-    expected = rss[0] / dof * np.linalg.inv(B.T @ B)
-    np.testing.assert_allclose(found.covariance.matrix, expected, rtol=1e-4)
-    np.testing.assert_allclose(found.covariance.dof, dof, rtol=1e-4)
-
-
 def test_an_effect_that_the_parameters_explain_is_left_out():
     """A free offset per configuration: what a configuration shares cannot be told from it."""
     r = readings(Table(configurations=4, markers=1, repeats=4, unbalanced=False), 1, shared=5e-5)
@@ -125,28 +91,6 @@ def test_perfect_data_have_next_to_no_noise(kind):
     found = settle(r.moved(0 * r.e), kind)
     assert found.good.all() and not found.noise.x.any()
     assert found.noise.covariance.std.max() < 1e-30
-
-
-KINDS = ["auto", "independent+configuration", "groups", "polar+configuration", "stated"]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_units_and_scale_of_the_parameters_do_not_matter(kind):
-    r = readings(Table(configurations=9, markers=3, repeats=4), 2, shared=2e-5)
-    e = r.e * [1.0, 2.0, 3.0]
-    e[5] += 3e-3
-    r, start = r.moved(e), np.arange(len(r)) != 5
-    plain = settle(r, kind, start)
-    scale = np.array([1e-9, 1e-3, 1e4, 1e9])
-    km = {"e": r.e * 1e6, "stated": r.stated * 1e12}
-    for other, factor in ((replace(r, B=r.B * scale), 1 / scale),
-                          (replace(r, B=r.B * 1e6, **km), np.ones(4))):  # fmt: skip
-        found = settle(other, kind, start)
-        assert found.noise.kind == plain.noise.kind
-        np.testing.assert_array_equal(found.good, plain.good)
-        np.testing.assert_allclose(found.noise.x, factor * plain.noise.x, rtol=1e-4)
-        std = plain.noise.covariance.std
-        np.testing.assert_allclose(found.noise.covariance.std, factor * std, rtol=1e-4)
 
 
 # Which readings are judged to be faulty.
@@ -214,22 +158,6 @@ def test_gross_errors_are_found_and_nothing_else(kind):
         e[bad, rng.integers(3, size=3)] += 1e-3
         start = majority(r.B, e)[0] if kind == "auto" else None
         assert set(np.flatnonzero(~settle(r.moved(e), kind, start).good)) == set(bad)
-
-
-def test_errors_that_mask_each_other_are_found_from_a_robust_start():
-    """Two readings with the same error and the same great leverage draw the fit to them: each is
-    predicted well by the other.  Starting from all readings they stay; the majority finds them."""
-    r = table(4, configurations=10, repeats=4, unbalanced=False)
-    bad = np.flatnonzero((r.configuration == 0) & (r.marker == 0))[:2]
-    B, e = r.B.copy(), 1e-5 * np.random.default_rng(5).normal(size=r.e.shape)
-    B[bad] *= 50
-    e[bad] += B[bad] @ np.full(4, 1e-5)
-    marker = np.where(np.isin(np.arange(len(r)), bad), 9, r.marker)
-    r = Readings(B, e, r.configuration, r.load, marker)
-    assert settle(r, "independent").good[bad].all()
-    first = majority(r.B, e)[0]
-    assert not first[bad].any()
-    assert set(np.flatnonzero(~settle(r, "independent", first).good)) == set(bad)
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.4, False), (0.6, True)])

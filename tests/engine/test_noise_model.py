@@ -11,8 +11,8 @@ from engine.dense import Table, readings
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.identification.noise_choice import NoisyReadings, estimate_noise, own_noise
-from elastocal.identification.noise_structure import Kind, NoiseModel, Readings
+from elastocal.identification.noise_choice import estimate_noise, own_noise
+from elastocal.identification.noise_structure import NoiseModel, Readings
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)
@@ -63,21 +63,6 @@ def test_it_has_the_likelihood_of_a_built_in_model_that_says_the_same(
     some = UNBALANCED.take(np.arange(len(UNBALANCED)) % 2 == 0)
     for mine, its in zip(own_noise(own.fit, some), own_noise(other.fit, some), strict=True):
         np.testing.assert_allclose(mine, its, rtol=1e-3)
-
-
-def test_repeats_share_the_mean_of_what_each_says() -> None:
-    class Growing(NoiseModel):
-        name = "growing"
-        description = "a variance that grows with the number of the reading"
-
-        def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
-            return {"growing": 1.0 + np.arange(len(readings))}
-
-    register_noise_model(Growing())
-    noisy = NoisyReadings(UNBALANCED, Kind("growing"))
-    sets, number = noisy.sets, 1.0 + np.arange(len(UNBALANCED))
-    for c, S in enumerate(sets.mean(noisy.structure.matrix)):
-        np.testing.assert_allclose(S[0], number[sets.of == c].mean() * np.eye(3))
 
 
 WRONG: dict[str, tuple[Callable[[int], Any], str]] = {

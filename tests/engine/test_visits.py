@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from elastocal.identification.noise_choice import NoiseFit, estimate_noise
+from elastocal.identification.noise_choice import estimate_noise
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.visit_record import VisitRecord
 
@@ -91,20 +91,6 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
     assert np.abs(found.fit.model.objective(np.log(found.fit.theta))[1]).max() < 1e-2
 
 
-@pytest.mark.parametrize(
-    ("joints", "drift", "part"), [(SCATTER, 0.0, "joints"), (0.0, DRIFT, "time")]
-)
-def test_what_is_there_is_chosen_and_its_size_found(joints, drift, part):
-    r, rng = readings(), np.random.default_rng(3)
-    kinds: list[NoiseFit] = [estimate_noise(drawn(r, rng, joints, drift)) for _ in range(5)]
-    assert all(part in k.kind or (part == "joints" and "joint" in k.kind) for k in kinds)
-    assert all({t.part: t.p for t in k.tests}[part] < 0.01 for k in kinds)
-    if joints:
-        sizes = [np.sqrt(k.fit.common[-1]) for k in kinds]
-        assert abs(np.mean(sizes) / SCATTER - 1) < 0.2
-        assert not any("each-joint" in k.kind for k in kinds)
-
-
 def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
     """p-values of independent noise are uniform: 1 % and 20 % below these, within chance."""
     r, rng = readings(configurations=12), np.random.default_rng(4)
@@ -113,9 +99,3 @@ def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
         assert (((p < level).sum(axis=0)) <= most).all()
         assert stats.binom.sf(most, len(p), level) < 2e-3
     assert ((p > 0.5).mean(axis=0) > 0.3).all()
-
-
-def test_kenward_roger_widens_for_a_drift_and_knows_few_degrees_of_freedom():
-    found = estimate_noise(drawn(readings(), np.random.default_rng(6), 0.0, DRIFT), "axis+time")
-    plain = (found.basis @ found.fit.state.Phi @ found.basis.T).diagonal()[:5]
-    assert (found.covariance.matrix.diagonal() >= plain).all()

@@ -5,29 +5,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table_at
-from support.cells import random_poses
+from support.calibration import GEOMETRY, measured
 from support.parts import (
     CASES,
     SIGMA,
     arm,
     faulty_of,
-    positions,
     solved,
 )
 
-from elastocal.cell.arm_description import Nominal
 from elastocal.identification import outliers, solve
 from elastocal.identification import weighted_problem as chunked
 from elastocal.identification import weighted_problem as partition
-from elastocal.identification.identify import identify
-from elastocal.identification.knowledge import physical_constraints
-from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe
 from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import residual_sigma
 from elastocal.identification.weighted_problem import Weights
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 
 UNIT = Weights("none", None, False, "")
@@ -104,39 +97,7 @@ def test_faulty_readings_are_found_in_parts_too(in_parts):
     np.testing.assert_allclose([o.residual for o in one], [o.residual for o in other], rtol=0.01)
 
 
-def test_a_bounded_fit_in_parts_is_that_of_the_whole_table(in_parts):
-    """Two true compliances are zero, of which one is held at its bound."""
-    chain = planar_chain(4)
-    cell = cell_of(("joint_compliance",), nominal=Nominal(joint_compliance=(1e-5,) * 4))
-    model = Model.assembled(chain, cell)
-    plan = table_at(random_poses(chain, 60, 3), [[0, 0, 0], [80, 40, -200]])
-    truth, rng = np.array([1e-5, 0.0, 1e-5, 0.0]), np.random.default_rng(0)
-    table = measured(model, plan, truth, SIGMA, rng)
-    options = Options(method="ols", constraints=physical_constraints(model))
-    whole = identify(model, table, options)
-    in_parts()
-    parts = identify(model, table, options)
-    assert (whole.x >= 0).all() and (whole.x == 0).any() and whole.active
-    np.testing.assert_allclose(parts.x, whole.x, rtol=1e-6)
-    assert [a.label for a in parts.active] == [a.label for a in whole.active]
-    np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-4, atol=1e-16)
-    np.testing.assert_allclose(parts.held_out, whole.held_out, rtol=1e-5, atol=1e-9)
-
-
 # --- passes ---------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("workers", [1, 3])
-def test_the_number_of_workers_changes_no_bit(workers, in_parts, monkeypatch):
-    model, table = positions()
-    in_parts()
-    parts = partition.partition(observe(table, "position"), UNIT, len(model.parameters))
-    columns = np.arange(len(model.parameters))
-    reference = chunked.evaluate(model, parts, model.nominal, columns)
-    monkeypatch.setattr(chunked, "AT_ONCE", workers)
-    found = chunked.evaluate(model, parts, model.nominal, columns)
-    assert np.array_equal(found.r_factor.augmented, reference.r_factor.augmented)
-    assert np.array_equal(found.residual, reference.residual)
 
 
 def peak_of_a_pass(model, truth, observed):

@@ -18,20 +18,6 @@ def objective_of(residual, jacobian, p, tie=np.inf):
     return SumOfSquares(evaluate, np.eye(p) / tie, np.zeros(p))
 
 
-def rosenbrock(u):
-    return np.array([10 * (u[1] - u[0] ** 2), 1 - u[0], 0.0])
-
-
-def rosenbrock_slope(u):
-    return np.array([[-20 * u[0], 10.0], [-1.0, 0.0], [0.0, 0.0]])
-
-
-def test_descent_through_a_curved_valley():
-    found = descend(objective_of(rosenbrock, rosenbrock_slope, 2), np.array([-1.2, 1.0]), 1e-12, 99)
-    assert found.converged
-    np.testing.assert_allclose(found.u, [1, 1], atol=1e-10)
-
-
 def test_descent_turns_back_where_there_is_no_prediction():
     """1/u − 2 has none below zero, where the full step from 3 leads."""
 

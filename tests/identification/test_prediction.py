@@ -13,7 +13,7 @@ from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.identification.findings import ENOUGH, judged, spare_equations
 from elastocal.identification.identify import identify
 from elastocal.identification.prediction import NewPoses
-from elastocal.identification.residuals import rms_3d, told_by_one
+from elastocal.identification.residuals import rms_3d
 from elastocal.model.calibrated import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -78,16 +78,6 @@ def test_few_configurations_and_unknown_noise_are_no_ground_for_trust(fits):
     unknown = replace(fit, noise=replace(fit.noise, ratio_to_stated=None, lack_of_fit=None))
     assert not judged(unknown).verdict.trusted
     assert judged(unknown).finding("noise_unknown") is not None
-
-
-def test_what_single_configurations_hold_is_unseen_by_all_others():
-    rng = np.random.default_rng(0)
-    B, configuration = rng.normal(size=(40, 5)), np.repeat(np.arange(10), 4)
-    B[4:] = B[4:] @ (np.eye(5) - np.ones((5, 5)) / 5)  # the mean is shown by the first alone
-    P = told_by_one(B, np.where(configuration == 0, 0, -1))
-    assert np.allclose(P @ P, P) and np.linalg.matrix_rank(P) == 1
-    assert np.abs(B[4:] @ P).max() < 1e-12 < 1e-3 < np.abs(B[:4] @ P).max()
-    assert not told_by_one(B, np.full(40, -1)).any()
 
 
 @pytest.mark.parametrize("sideways", [0.0, 300.0])

@@ -80,25 +80,6 @@ def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
 
-def test_expected_counts_of_internally_studentised_residuals() -> None:
-    """With 6 degrees of freedom |z| cannot exceed √6; the expected counts are the mean counts."""
-    observed = readings(1)
-    rng = np.random.default_rng(6)
-    Q = np.linalg.qr(rng.normal(size=(12, 6)))[0]
-    h = (Q**2).sum(axis=1)
-    total = np.zeros(2)
-    runs = 250
-    for _ in range(runs):
-        e = rng.normal(size=12)
-        e -= Q @ (Q.T @ e)
-        whole = summary(observed, e, h, absolute=False)
-        assert np.abs(whole.whole.scores.observed).max() <= np.sqrt(6)
-        middle = len(whole.whole.counts) // 2
-        total += whole.whole.counts[middle], whole.whole.expected[middle]
-    # A count of 12 correlated values has a standard deviation below 2 (measured: 1.6).
-    assert abs(total[0] - total[1]) / runs < 4 * 2 / np.sqrt(runs)
-
-
 def test_a_group_that_scatters_more_is_named_and_clean_tables_name_none() -> None:
     observed = readings(12)
     wrong = 0

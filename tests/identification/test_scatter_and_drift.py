@@ -146,11 +146,3 @@ def test_scatter_that_the_cell_does_not_state_stays_above_the_stated_noise():
     fit = identified(scatter=SCATTER, stated=False)
     assert fit.finding("residual_above_stated_noise") is not None
     assert "State it as [noise] joints_urad" in fit.finding("joint_scatter").remedy
-
-
-def test_a_drift_that_repeats_share_is_counted_by_the_noise_model():
-    fit = identified(drift=2 * DRIFT, scatter=SCATTER, repeats=3, seed=4)
-    assert fit.noise.kind.endswith("+time")
-    assert fit.finding("lack_of_fit").numbers["counted_by"] == "the noise model"
-    assert fit.finding("lack_of_fit").severity == "note"
-    assert not any("default method" in w or "too narrow" in w for w in fit.warnings)

@@ -47,23 +47,8 @@ def test_an_effect_beside_noise_as_stated_is_no_noise(tmp_path):
     assert CORRECT not in steps(fit) and "diagnose" in steps(fit)
 
 
-def test_an_effect_beside_noise_stated_too_small_is_both(tmp_path):
-    table = readings(tmp_path, THREE)
-    table = replace(table, position=table.position + 1e-4 * np.sin(3 * table.q[:, 1:4]))
-    fit = ec.identify(cell(tmp_path, sigma=30), table)
-    assert not fit.verdict.trusted
-    assert CORRECT in steps(fit) and fit.finding("residual_above_stated_noise") is not None
-
-
 def test_the_guesses_of_a_first_cell_are_no_evidence():
     """Markers and a noise that init guessed: the readings tell the noise themselves."""
     folder = CASES / "init_markers"
     fit = ec.identify(folder / "cell.toml", folder / "train.csv")
     assert fit.verdict.trusted and "scatter 2 times" in steps(fit)
-
-
-def test_without_a_load_there_is_no_unit_of_one(tmp_path):
-    effects = ("base_frame", "marker_position", "joint_compliance")
-    path = cell(tmp_path, effects=effects)
-    fit = ec.identify(path, readings(tmp_path, THREE))
-    assert fit.finding("load_unit") is None

@@ -5,14 +5,13 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from scipy import stats
-from support.calibration import PLACED, cell_of, covered, measured, planar_chain, table_at
+from support.calibration import PLACED, cell_of, measured, planar_chain, table_at
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.model.manipulator import Model, smooth_groups
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, subset
 from elastocal.units import Array
 
@@ -75,17 +74,6 @@ def test_new_poses_are_predicted_to_the_noise():
     assert len(fit.smooth) == 3 and all(0.1 < part.scale < 10 for part in fit.smooth)
 
 
-def test_the_interval_of_a_size_holds_the_true_one():
-    inside = []
-    for seed in range(3):
-        _model, x, _, _, fit = campaign(seed)
-        for part in fit.smooth:
-            exact = replace(part, value=x[part.group.columns], covariance=0 * part.covariance)
-            (true_rms, _, _), (_, (low, high), _) = exact.sizes["rad"], part.sizes["rad"]
-            inside.append(low <= true_rms <= high)
-    assert np.mean(inside) > 0.7
-
-
 def test_held_out_residuals_are_those_of_refits():
     """Leaving out a configuration for good: prior and noise as found, on the model itself."""
     model, rng = arm(*(e for e in EFFECTS if e != "joint_offset")), np.random.default_rng(0)
@@ -112,23 +100,6 @@ def test_held_out_residuals_are_those_of_refits():
         expected = fit.residual[~rows] - B[~rows] @ step
         assert np.allclose(fit.held_out[~rows], expected, rtol=0.02, atol=2e-8)
     assert len(subset(observed, keep).lead) == 39
-
-
-def test_ordinary_intervals_beside_curves_hold_the_truth():
-    hits = []
-    for seed in range(7):
-        model, x, _, _, fit = campaign(seed) if seed < 3 else campaign_of(seed)
-        names = [n for n in fit.determined if not model.parameters[model.names.index(n)].shrunk]
-        hits += covered(fit, x, names).tolist()
-    low = stats.binom.ppf(0.001, len(hits), 0.93)
-    assert sum(hits) >= low, f"{sum(hits)} of {len(hits)}"
-
-
-def campaign_of(seed: int):
-    model, rng = arm(), np.random.default_rng(seed)
-    x = true(model, rng)
-    table = readings(model, x, 60, rng)
-    return model, x, table, None, identify(model, table)
 
 
 def test_nothing_is_claimed_where_there_are_no_curves():
@@ -185,31 +156,3 @@ def test_the_result_says_where_it_was_not_measured():
     assert far.to_json()["test"]["far"] == far.test.far
     assert far.to_json()["measured_poses"]["configurations"] == 100
     assert far.arm.shown.most == pytest.approx(inside.arm.shown.most, rel=1e-9)
-
-
-def test_a_field_that_follows_time_needs_it_and_is_of_one_campaign():
-    settings = {"base": {
-        "field_time_size": 3e-4, "field_time_length": 600.0, "field_time_low": 0.0,
-        "field_time_high": 3600.0,
-    }}  # fmt: skip
-    cell = cell_of(
-        (*PLACED, "joint_offset", "residual_field:base"), {"M1": np.array([0.1, 0.05, 0.1])},
-        nominal=Nominal(settings=settings),
-    )  # fmt: skip
-    model, rng = Model.assembled(planar_chain(), cell), np.random.default_rng(0)
-    (group,) = smooth_groups(model)
-    assert not group.lasting and group.columns.shape[0] == 6
-    x = true(model, rng)
-    table = replace(
-        table_at(rng.uniform(-HALF, HALF, (120, 3))), time=np.linspace(0.0, 3600.0, 120)
-    )
-    fit = identify(model, measured(model, table, x, SIGMA, rng))
-    assert (
-        fit.heldout_rms
-        < 0.7
-        * identify(
-            model, measured(model, table, x, SIGMA, rng), Options(fixed=("residual_field",))
-        ).heldout_rms
-    )
-    units = [entry["unit"] for entry in fit.to_json()["smooth"]]
-    assert units == ["m", "rad"]
