@@ -11,7 +11,7 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED
 
 from elastocal.diagnosis.diagnosis import Diagnosis, Gap, publish
-from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.manipulator import Model
 
 

@@ -5,8 +5,7 @@ import pytest
 from scipy import linalg, stats
 
 from elastocal.identification.noise_choice import estimate_noise
-from elastocal.identification.noise_structure import Readings
-from elastocal.identification.visit_record import VisitRecord
+from elastocal.identification.noise_structure import Readings, VisitRecord
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
 

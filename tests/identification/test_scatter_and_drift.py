@@ -10,10 +10,10 @@ from support.cells import random_poses
 from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
+from elastocal.identification.noise_structure import LASTING as TRIED
+from elastocal.identification.noise_structure import in_random_order
 from elastocal.identification.options import Options
 from elastocal.identification.result import Calibration
-from elastocal.identification.visit_record import LASTING as TRIED
-from elastocal.identification.visit_record import in_random_order
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation import simulate

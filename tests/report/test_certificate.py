@@ -14,7 +14,7 @@ from support.pages import Page
 
 from elastocal.cell.work_cell import CertificateEntries
 from elastocal.errors import InputError
-from elastocal.identification.error_budget import gap_budget, pose_accuracy
+from elastocal.identification.scrutiny import gap_budget, pose_accuracy
 from elastocal.report.blocks import length
 from elastocal.report.judgement_view import judgement
 from elastocal.report.smaller_views import (

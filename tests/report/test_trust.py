@@ -15,10 +15,10 @@ from identification.test_far_values import CASES
 
 import elastocal as ec
 from elastocal.identification import error_budget
-from elastocal.identification.error_budget import gap_budget
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.result import Finding, TestErrors
+from elastocal.identification.scrutiny import gap_budget
 from elastocal.identification.sentences import Told
 from elastocal.report import judgement_view
 from elastocal.report.blocks import length

@@ -24,7 +24,7 @@ from elastocal.diagnosis.diagnosis import (
     StructureTest,
     Untested,
 )
-from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification.scrutiny import BudgetStep
 from elastocal.measurements import Measurements
 
 HOSTILE = "<script>alert(1)</script>\x1b[31m"

@@ -44,7 +44,7 @@ from elastocal.diagnosis.stated_floor import (
     squared_lengths,
     supported_floor,
 )
-from elastocal.identification.error_budget import BudgetStep
+from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve

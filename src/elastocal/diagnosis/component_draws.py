@@ -35,7 +35,7 @@ from elastocal.diagnosis.components import (
 from elastocal.diagnosis.evidence import at_scales
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import Weighted
-from elastocal.engine.sizes import beside
+from elastocal.engine.mixed import beside
 from elastocal.units import Array, IntArray
 
 GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes

@@ -54,8 +54,7 @@ from elastocal.diagnosis.noise_floor import (
     posterior,
     project,
 )
-from elastocal.engine.mixed import ROUNDING
-from elastocal.engine.sizes import Standardised, beside
+from elastocal.engine.mixed import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.loads import GravitySag, LinkWeights

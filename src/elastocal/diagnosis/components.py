@@ -39,8 +39,7 @@ from elastocal.diagnosis.noise_floor import (
     log_prior,
     posterior,
 )
-from elastocal.engine.mixed import climb
-from elastocal.engine.sizes import Products, Standardised
+from elastocal.engine.mixed import Products, Standardised, climb
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves
 from elastocal.units import Array, IntArray

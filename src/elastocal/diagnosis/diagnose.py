@@ -57,8 +57,8 @@ from elastocal.diagnosis.verdict import (
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
-from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.scrutiny import BudgetStep
 from elastocal.identification.start import Fallen, check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of

@@ -10,8 +10,8 @@ from typing import Any, Literal
 from elastocal.above import Result
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.errors import option
-from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.result import Finding, Number
+from elastocal.identification.scrutiny import BudgetStep
 from elastocal.measurements import Measurements
 from elastocal.model.effects.base import Stage
 from elastocal.model.manipulator import Model

@@ -16,10 +16,11 @@ from elastocal.engine.mixed import (
     Mixed,
     Pack,
     Parts,
+    Products,
+    Standardised,
     Whitened,
     climb,
 )
-from elastocal.engine.sizes import Products, Standardised
 from elastocal.model.evaluate import thread_count
 from elastocal.units import Array, BoolArray, IntArray
 

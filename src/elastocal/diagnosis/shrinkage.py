@@ -31,8 +31,7 @@ from elastocal.diagnosis.stated_floor import (
     squared_lengths,
     supported_floor,
 )
-from elastocal.identification.error_budget import BudgetStep, resampled_rms
-from elastocal.identification.scrutiny import stage_of
+from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.units import Array, BoolArray, IntArray

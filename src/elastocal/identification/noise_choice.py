@@ -28,6 +28,7 @@ from elastocal.identification.noise_structure import (
     EACH,
     EACH_HAS,
     JOINTS,
+    LONGEST,
     PARTS,
     STRUCTURES,
     TIME,
@@ -37,8 +38,8 @@ from elastocal.identification.noise_structure import (
     Structure,
     ranked_within,
     stated_deviations,
+    visit_record,
 )
-from elastocal.identification.visit_record import LONGEST, visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,

@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
-from elastocal.engine.mixed import climb
-from elastocal.engine.sizes import Products, Standardised
+from elastocal.engine.mixed import Products, Standardised, climb
 from elastocal.identification.covariance import root_of, t_quantile
 from elastocal.identification.weighted_problem import RFactor
 from elastocal.model.manipulator import SmoothGroup

@@ -17,7 +17,7 @@ from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
-from elastocal.identification.visit_record import course_waves
+from elastocal.identification.noise_structure import course_waves
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.moves import BlockersOf, Moves, PathChecker
 from elastocal.units import Array, BoolArray, IntArray, Progress

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elastocal.errors import option
-from elastocal.identification.error_budget import ErrorBudget, gap_budget
 from elastocal.identification.findings import (
     ABSORBED,
     ALONE,
@@ -32,7 +31,7 @@ from elastocal.identification.result import (
     Estimate,
     deviation,
 )
-from elastocal.identification.scrutiny import stage_of
+from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say

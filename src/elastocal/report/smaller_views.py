@@ -14,9 +14,9 @@ import numpy as np
 
 from elastocal import __version__
 from elastocal.errors import InputError
-from elastocal.identification.error_budget import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
+from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.report import blocks as say
 from elastocal.report.identification_view import (
     at_new_poses,
