@@ -62,7 +62,6 @@ class VisitRecord:
     lasting: tuple[float, ...] = LASTING
 
     def take(self, chosen: BoolArray | IntArray) -> VisitRecord:
-        """That of the `chosen` readings."""
         names = ("visit", "motion", "share", "place")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
@@ -248,7 +247,6 @@ class Readings:
         return (self.e.size - self.n_parameters) // ROWS_PER_VARIANCE
 
     def take(self, chosen: BoolArray) -> Readings:
-        """Only the readings where `chosen` (N,) holds."""
         parts = {f.name: getattr(self, f.name) for f in fields(self)}
         parts = {k: v[chosen] for k, v in parts.items() if isinstance(v, np.ndarray)}
         own = None if self.visits is None else self.visits.take(chosen)
@@ -263,7 +261,6 @@ class Readings:
         return self.take(np.isin(code, order[: np.searchsorted(np.cumsum(count[order]), n) + 1]))
 
     def moved(self, e: Array) -> Readings:
-        """The same readings with other residuals (N, size)."""
         return replace(self, e=e)
 
 
@@ -319,7 +316,6 @@ class NoiseModel:
 
     @property
     def words(self) -> str:
-        """The model in a list of others."""
         return self.description
 
     def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
@@ -341,10 +337,9 @@ class NoiseModel:
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
-        return _a_term_each(each)
+        return tuple(each), list(enumerate(each.values()))
 
     def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
-        """S (N, size, size) of one component, checked."""
         n, size = len(readings), readings.size
         S = np.asarray(S, dtype=np.float64)
         where = f"component '{name}' of the noise model '{self.name}'"
@@ -372,10 +367,6 @@ class BuiltIn(NoiseModel):
     shrunk: ClassVar[bool] = False
 
 
-def _a_term_each(components: Mapping[str, Array]) -> Terms:
-    return tuple(components), list(enumerate(components.values()))
-
-
 def _axes(size: int) -> Array:
     """E_a (size, size, size), 1 at a, a and 0 elsewhere."""
     return np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
@@ -388,11 +379,10 @@ class Independent(BuiltIn):
     description = "one variance for all readings"
 
     def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
-        axes = _axes(readings.size)
-        if readings.size == 1:
-            return _a_term_each({"distance": axes[0]})
-        own = {"position": axes[:3].sum(axis=0), "rotation": axes[3:].sum(axis=0)}
-        return _a_term_each({name: S for name, S in own.items() if S.any()})
+        turns = np.arange(readings.size) >= 3
+        if not turns.any():
+            return ["distance" if readings.size == 1 else "position"], [(0, np.eye(len(turns)))]
+        return ["position", "rotation"], [(0, np.diag(1.0 - turns)), (1, np.diag(1.0 * turns))]
 
 
 class ByAxis(BuiltIn):
@@ -405,7 +395,7 @@ class ByAxis(BuiltIn):
 
     def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
         own = ("x", "y", "z", "rx", "ry", "rz") if readings.size > 1 else ("distance",)
-        return _a_term_each(dict(zip(own, _axes(readings.size), strict=False)))
+        return own[: readings.size], list(enumerate(_axes(readings.size)))
 
 
 class ByMarker(BuiltIn):
@@ -473,7 +463,7 @@ class Polar(BuiltIn):
         own = {"range": along, "transverse": np.eye(3) - along}
         if "angular" in names if names else np.ptp(d) > 0.2 * d.mean():
             own["angular"] = own["transverse"] * d[:, None, None] ** 2
-        return _a_term_each(own)
+        return tuple(own), list(enumerate(own.values()))
 
 
 class AsStated(BuiltIn):
@@ -491,7 +481,7 @@ class AsStated(BuiltIn):
 
     def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
         require(readings.stated is not None, "no noise is stated that could be used")
-        return _a_term_each({"factor": np.asarray(readings.stated)})
+        return ["factor"], [(0, np.asarray(readings.stated))]
 
 
 STRUCTURES: dict[str, NoiseModel] = {
@@ -631,7 +621,8 @@ def of_joints(
 ) -> Iterator[Deviation]:
     """The scatter of the joints from visit to visit: of all that turn and of all that slide, or of
     `each` by itself."""
-    record = _visits(readings)
+    record = readings.visits
+    assert record is not None
     seen = np.abs(record.motion).max(axis=(0, 1, 2), initial=0.0) > ALIKE
     groups = [("each joint", seen & record.turning), ("each slide", seen & ~record.turning)]
     if each:
@@ -641,18 +632,19 @@ def of_joints(
             yield _settling(record, EACH if each else JOINTS, name, np.flatnonzero(joints))
 
 
-def _settling(record: VisitRecord, part: str, name: str, joints: IntArray) -> Deviation:
-    loading, turns = record.motion[..., joints], bool(record.turning[joints[0]])
-    name = f"scatter of {name} from visit to visit"
-    return Deviation(part, name, record.visit, loading, tuple(joints.tolist()), turns=turns)
+def _settling(record: VisitRecord, part: str, who: str, joints: IntArray) -> Deviation:
+    return Deviation(
+        part, f"scatter of {who} from visit to visit", record.visit, record.motion[..., joints],
+        tuple(joints.tolist()), turns=bool(record.turning[joints[0]]),
+    )  # fmt: skip
 
 
 def of_time(readings: Readings, lasting: float, _every: bool) -> Iterator[Deviation]:
-    """A drift of positions, and one of rotations."""
+    assert readings.visits is not None
     position = np.arange(readings.size) < 3
     for name, along in ((DRIFT, position), (f"{DRIFT} (rotation)", ~position)):
         if along.any():
-            yield _drift(_visits(readings), name, lasting, along.astype(float))
+            yield _drift(readings.visits, name, lasting, along.astype(float))
 
 
 def _drift(record: VisitRecord, name: str, lasting: float, along: Array) -> Deviation:
@@ -664,11 +656,6 @@ def _drift(record: VisitRecord, name: str, lasting: float, along: Array) -> Devi
     waves = waves.reshape(*waves.shape[:2], -1)
     turns = not along[:3].any()
     return Deviation(TIME, name, record.visit, faster, waves=waves, turns=turns)
-
-
-def _visits(readings: Readings) -> VisitRecord:
-    assert readings.visits is not None
-    return readings.visits
 
 
 CONFIGURATION, JOINTS, EACH, TIME = "configuration", "joints", "each-joint", "time"
@@ -735,7 +722,6 @@ class Kind(NamedTuple):
         return self._replace(parts=tuple(part for part in PARTS if part in parts))
 
     def with_part(self, part: str) -> Kind:
-        """With this part besides, in place of another for the joints."""
         others = (p for p in self.parts if not {p, part} <= {JOINTS, EACH})
         return self.having(part, *others)
 
@@ -749,12 +735,10 @@ class Kind(NamedTuple):
 
     @property
     def by_visit(self) -> bool:
-        """Whether it matters at which visit a reading was made."""
         return any(part in BY_VISIT for part in self.parts)
 
     @property
     def words(self) -> str:
-        """The kind in a list of others."""
         model = STRUCTURES.get(self.own)
         own = self.own if model is None else model.words
         return " + ".join([own, *(PARTS[part].words for part in self.parts if part in PARTS)])
