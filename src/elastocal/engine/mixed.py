@@ -434,7 +434,6 @@ def fit(
 def _climbed(
     evaluated: Objective, t: Array, lower: Array, upper: Array, enough: float
 ) -> tuple[Array, bool]:
-    """The climb in those logarithms that are finite."""
     free = np.flatnonzero(np.isfinite(t))
     if not len(free):
         return t, True

@@ -150,7 +150,6 @@ def _shortened(
 
 
 def _steepest(at: Evaluation) -> float:
-    """The largest squared column of B."""
     return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
 

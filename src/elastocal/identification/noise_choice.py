@@ -558,7 +558,6 @@ class _Choice:
             self.least, self.best = criterion, found
 
     def _changed(self) -> bool:
-        """Whether one part more or less is better than what there is."""
         before, record = self.least, self.readings.visits
         together = np.unique(self.readings.configuration, return_counts=True)[1]
         rows = int(together.max()) * self.readings.size

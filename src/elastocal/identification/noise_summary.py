@@ -345,7 +345,6 @@ def noise_parts(found: MethodResult) -> dict[str, float]:
 
 
 def _bare(solution: Solution) -> Readings:
-    """The readings fitted, without columns of B."""
     problem = solution.problem
     none = np.zeros(0, dtype=np.int64)
     return linearised(problem.model, problem.observations, solution.fit.x, none)
@@ -394,7 +393,6 @@ def _single(found: MethodResult) -> SingleReadings | None:
 
 
 def _spent(found: MethodResult) -> int:
-    """How many parameters the readings paid for."""
     spent = found.effective if found.smooth else None
     return len(found.solution.fit.columns) if spent is None else spent
 

@@ -97,11 +97,11 @@ def growth(B: Array, Q: Array, e: Array, configuration: IntArray) -> Array:
         Qc, ec = Q[rows], e[rows]
         if rows.shape[1] > Q.shape[1]:
             # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
-            moved, alone = moved_by(Qc.transpose(0, 2, 1) @ Qc, _times(Qc.transpose(0, 2, 1), ec))
+            moved, alone = moved_by(Qc.transpose(0, 2, 1) @ Qc, (ec[:, None] @ Qc)[:, 0])
         else:
             solved, alone = moved_by(Qc @ Qc.transpose(0, 2, 1), ec)
-            moved = _times(Qc.transpose(0, 2, 1), solved)
-        grown[rows] = _times(B[rows], moved)
+            moved = (solved[:, None] @ Qc)[:, 0]
+        grown[rows] = (B[rows] @ moved[..., None])[..., 0]
         grown[rows[alone]] = np.inf
     return grown
 
@@ -168,10 +168,6 @@ def moved_by(share: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
     gap[alone] = np.eye(share.shape[1])
     moved = np.asarray(np.linalg.solve(gap, right[..., None])[..., 0], dtype=np.float64)
     return moved, alone
-
-
-def _times(matrices: Array, vectors: Array) -> Array:
-    return (matrices @ vectors[..., None])[..., 0]
 
 
 def rms_3d(residual: Array, size: int) -> float:
@@ -499,7 +495,6 @@ class _Table:
 
     @cached_property
     def _spread(self) -> tuple[float, float]:
-        """Interquartile range of z, and its largest value."""
         low, high = np.quantile(self.z, [0.25, 0.75])
         largest = float(np.abs(self.z).max())
         return float(high - low) or largest, largest
@@ -540,7 +535,6 @@ def _two_sided(total: ArrayLike, f: ArrayLike) -> Array:
 
 
 def _shape(z: Array) -> tuple[float, float]:
-    """Skewness and excess kurtosis, from moments."""
     away = z - z.mean()
     squared = (away**2).mean()
     return float((away**3).mean() / squared**1.5), float((away**4).mean() / squared**2 - 3)

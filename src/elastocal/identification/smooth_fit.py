@@ -228,7 +228,6 @@ def joint_fit(
 
 
 def _chosen(problem: Problem, sizes: Array, free: LinearRows, scales: Scales) -> Reduction:
-    """The ordinary parameters that are worth a column beside the functions."""
     marginal = free.posterior(scales).marginal
     return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), WORTH_A_COLUMN)
 
@@ -288,7 +287,6 @@ def standardised(fit: JointFit, others: Part | None) -> Array:
 
 
 def _triangular(R: Array, B: Array) -> Array:
-    """B R⁻¹."""
     solved = linalg.solve_triangular(R, B.T, trans="T", check_finite=False)
     return np.ascontiguousarray(solved.T)
 
@@ -335,7 +333,6 @@ def _followed(observed: Observations, group: SmoothGroup) -> Array:
 
 
 def _without(solution: Solution, sized: IntArray) -> Solution:
-    """The solution with these parameters neither free nor chosen among."""
     problem, r = solution.problem, solution.reduction
     kept, dropped = ~np.isin(r.kept, sized), ~np.isin(r.dropped, sized)
     return replace(

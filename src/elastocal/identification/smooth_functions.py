@@ -276,7 +276,9 @@ class SmoothPart:
             if basis is None:
                 waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
             else:
-                waves = self._own_waves(_thinned(self.places))
+                places = np.sort(self.places)
+                even = np.linspace(0, len(places) - 1, min(len(places), PLACES)).astype(int)
+                waves = self._own_waves(places[even])
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
             k = waves.shape[1]
@@ -303,14 +305,6 @@ class SmoothPart:
             }
             for unit, (rms, ci95, half) in self.sizes.items()
         ]  # fmt: skip
-
-
-def _thinned(places: Array) -> Array:
-    """At most PLACES of them, evenly over their order."""
-    if len(places) <= PLACES:
-        return places
-    ordered = np.sort(places)
-    return np.asarray(ordered[np.linspace(0, len(ordered) - 1, PLACES).astype(int)])
 
 
 def _finite(value: float) -> float | None:

@@ -491,7 +491,6 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
 
 
 def _sampled(problem: Problem) -> Problem:
-    """The problem of a sample, where there are many readings."""
     n = len(problem.observations.lead)
     if n <= MANY:
         return problem
@@ -500,7 +499,6 @@ def _sampled(problem: Problem) -> Problem:
 
 
 def _misfit(problem: Problem) -> float:
-    """Root mean square of the whitened residual at the start."""
     residual = problem.weights.apply(residual_at(problem.model, problem.parts, problem.x0))
     return max(float(np.sqrt(np.mean(residual**2))), 1e-12)
 
