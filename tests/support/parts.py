@@ -24,7 +24,6 @@ from elastocal.simulation import simulate
 from elastocal.units import Array
 
 SIGMA = 3e-5
-POLAR = PolarNoise(1e-5, 3e-7, 1.5e-5, 6e-6)
 CARTESIAN = CartesianNoise(np.array([1.0, 2.0, 0.5]) * SIGMA)
 Case = tuple[Model, Measurements]
 
@@ -60,16 +59,6 @@ def positions() -> Case:
     return model, simulate(model, plan, truth, rng)
 
 
-def unit_weights_and_loads() -> Case:
-    model, plan, truth, rng = arm((*GEOMETRY, "joint_compliance"), 2, 30, [[0, 0, 0], [0, 50, -90]])
-    return model, shuffled(measured(model, plan, truth, SIGMA, rng), 2)
-
-
-def polar() -> Case:
-    model, plan, truth, rng = arm(GEOMETRY, 3, noise=POLAR)
-    return model, simulate(model, plan, truth, rng)
-
-
 def deflections() -> Case:
     """Two loads and three repeats share the unloaded readings of their configuration."""
     model, plan, truth, rng = arm(
@@ -102,7 +91,7 @@ def distances() -> Case:
     return model, measured(model, plan, truth, 1e-4, rng)
 
 
-CASES = (positions, unit_weights_and_loads, polar, deflections, poses, distances)
+CASES = (positions, deflections, poses, distances)
 
 
 def solved(model: Model, table: Measurements, covariance: Array | None = None) -> Solution:
