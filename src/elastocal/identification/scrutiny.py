@@ -8,24 +8,61 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.engine.mixed import Standardised
+from elastocal.identification.noise_summary import Noise
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
 from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
+from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
-from elastocal.identification.weighted_problem import least_norm, same_size, weights_for
+from elastocal.identification.weighted_problem import Weights, least_norm, same_size, weights_for
 from elastocal.measurements import Measurements
+from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, pure_error
-from elastocal.units import Array, BoolArray, microns
+from elastocal.units import Array, BoolArray, IntArray, microns
 
-if TYPE_CHECKING:
-    from elastocal.identification.result import Calibration
+
+class FoundFit(Protocol):
+    """What of a calibration is looked at again, by the names that it has there."""
+
+    @property
+    def model(self) -> Model: ...
+    @property
+    def x(self) -> Array: ...
+    @property
+    def B(self) -> Array: ...
+    @property
+    def residual(self) -> Array: ...
+    @property
+    def held_out(self) -> Array: ...
+    @property
+    def residual_rms(self) -> float: ...
+    @property
+    def dof(self) -> int: ...
+    @property
+    def observations(self) -> Observations: ...
+    @property
+    def weights(self) -> Weights: ...
+    @property
+    def columns(self) -> IntArray: ...
+    @property
+    def determined(self) -> tuple[str, ...]: ...
+    @property
+    def smooth(self) -> tuple[SmoothPart, ...]: ...
+    @property
+    def noise(self) -> Noise: ...
+    @property
+    def noise_parts(self) -> dict[str, float]: ...
+    @property
+    def arm(self) -> CalibratedArm: ...
+
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
 
@@ -62,7 +99,7 @@ class Influence:
         }
 
 
-def influence(fit: Calibration) -> tuple[Influence, ...]:
+def influence(fit: FoundFit) -> tuple[Influence, ...]:
     """Leverage and influence of every configuration, in the order of the table."""
     observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
@@ -207,7 +244,7 @@ CHOSEN = "chosen"
 RESAMPLED = 1000
 
 
-def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
+def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
     model, free = fit.model, ~fit.model.shrunk
@@ -320,7 +357,7 @@ class UncertaintyBudget:
         return {"at": self.at, **{f"{k}_um": microns(v) for k, v in told.items()}}
 
 
-def uncertainty_budget(fit: Calibration, table: Measurements | None = None) -> UncertaintyBudget:
+def uncertainty_budget(fit: FoundFit, table: Measurements | None = None) -> UncertaintyBudget:
     """The budget at the poses and loads of a `table`, by default those fitted."""
     B, at = fit.B, "the poses fitted"
     if table is not None:
@@ -361,7 +398,7 @@ class ErrorBudget:
     floor_name: str
 
 
-def gap_budget(result: Calibration) -> ErrorBudget | None:
+def gap_budget(result: FoundFit) -> ErrorBudget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
     functions.
 
@@ -393,9 +430,7 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
     return ErrorBudget(tuple(steps), *_floor(result))
 
 
-def _fitted(
-    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
-) -> Array | None:
+def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_]) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
     model linearised at the whole fit."""
     model, observed, B = result.model, result.observations, result.B
@@ -418,7 +453,7 @@ def _fitted(
     return found if np.isfinite(found).all() else None
 
 
-def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
+def _step(name: str, result: FoundFit, residual: Array, rng: np.random.Generator) -> BudgetStep:
     observed = result.observations
     parts = residual.reshape(-1, observed.size)[:, :3]
     squared = (parts**2).sum(axis=1)
@@ -427,7 +462,7 @@ def _step(name: str, result: Calibration, residual: Array, rng: np.random.Genera
     return BudgetStep(name, rms, ci95, parts)
 
 
-def _floor(result: Calibration) -> tuple[float | None, str]:
+def _floor(result: FoundFit) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
     observed = result.observations
     parts = result.residual.reshape(-1, observed.size)[:, :3]
