@@ -50,13 +50,14 @@ def test_wam_is_no_matter_of_geometry_alone(folder):
     assert found["heldout_rms_um"] > 1000
 
 
-@pytest.mark.long
 def test_iiwa_bends_at_its_joints(folder):
-    """Three payloads, one tool point each, springs driven by the measured torques."""
+    """Three payloads, one tool point each, springs driven by the measured torques; of more
+    parameters than the readings show, those stay without which the fit settles."""
     rigid = identified(folder, "iiwa7_rigid.toml", "iiwa7.csv")
     soft = identified(folder, "iiwa7.toml", "iiwa7.csv")
     one = identified(folder, "iiwa7_joint2.toml", "iiwa7.csv")
     assert rigid["heldout_rms_um"] == pytest.approx(1600, rel=0.1)
+    assert soft["converged"]
     assert soft["heldout_rms_um"] <= 450 and one["heldout_rms_um"] <= 450
     compliance = next(p for p in one["parameters"] if p["name"] == "joint2.compliance")
     assert compliance["identifiable"] and 5e-5 < compliance["value"] < 2e-4
@@ -65,9 +66,9 @@ def test_iiwa_bends_at_its_joints(folder):
 @pytest.mark.long
 def test_the_faulty_block_of_the_cable_data_is_found(folder):
     """A shift by some 4 mm over lines 142 to 507, seen by the tool itself."""
-    as_is = identified(folder, "irb120.toml", "irb120.csv")
+    as_is = identified(folder, "irb120.toml", "irb120.csv", "--outliers", "keep")
     assert as_is["excluded"] == [] and len(as_is["outliers"]) > 300
-    clean = identified(folder, "irb120.toml", "irb120.csv", "--outliers", "drop")
+    clean = identified(folder, "irb120.toml", "irb120.csv")
     left_out = {o["line"] for o in clean["excluded"]}
     assert len(left_out & set(range(142, 508))) > 350 and len(left_out) < 400
     assert clean["heldout_rms_um"] < 620 < as_is["heldout_rms_um"]

@@ -80,13 +80,14 @@ def _adapted(
     readings are settled at its values and the kept parameters fitted anew with these weights, until
     neither changes.  Then what was chosen on the way is chosen again by what is there now:
     the parameters, if other readings are good or the weights show more, and the kind of noise,
-    unless it is `known`.  Without `refit` no reading is judged.
+    unless it is `known`.  More parameters that do not settle are none: the fit without them stays.
+    Without `refit` no reading is judged.
     """
     asked = "auto" if kind == OF_READINGS else kind
     problem, solution, now, fitted = every.problem, start, good, good
     readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
     check_supported(asked, readings)
-    sure, restarts = False, 0
+    sure, restarts, fewer = False, 0, None
     for left in reversed(range(ROUNDS)):
         before, kept = now, start.reduction.kept
         like = None if known is None else known.noise
@@ -109,12 +110,13 @@ def _adapted(
         others = refit is not None and restarts < RESTARTS and not np.array_equal(now, fitted)
         if others and refit is not None:
             start, fitted, restarts = every if now.all() else refit(now), now, restarts + 1
-            solution, more = start, start.reduction
+            solution, more, fewer = start, start.reduction, None
         else:
             # Weights that make light of what is noisy may show more than those of the first fit.
             heavy = noise.kind not in FIRST and left > 0
             more = chosen_again(solution) if heavy else start.reduction
         if others or len(more.kept) > len(kept):
+            fewer = fewer if others else (solution, noise, now, readings)
             start, sure = replace(start, reduction=more), False
             readings = _linearised(problem, solution.fit.x, more.kept, kind)
             continue
@@ -125,6 +127,9 @@ def _adapted(
         if again.kind == noise.kind:
             noise = again
             break
+    else:
+        if fewer is not None:
+            solution, noise, now, readings = fewer
     final = readings.take(now)
     return solution, over_times(estimate_noise(final, noise.kind, noise), final), now
 
