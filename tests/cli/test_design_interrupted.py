@@ -26,7 +26,6 @@ PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "from elastocal.cli.main import main; main()"
 )
-STAGES = ("candidates", "exchange", "start0", "continuum1", "warm0")
 
 
 @pytest.fixture(scope="module")
@@ -51,32 +50,22 @@ def interrupt_after(monkeypatch, saves):
     monkeypatch.setattr(checkpoint, "atomic_write_bytes", saving)
 
 
-def interrupted(cell, monkeypatch, saves, *extra):
+@pytest.mark.parametrize("edited", [False, True])
+def test_it_goes_on_and_ends_with_the_same_plan(tmp_path, monkeypatch, whole, edited):
+    cell = write_cell(tmp_path)
     with monkeypatch.context() as patch:
-        interrupt_after(patch, saves)
-        result = design(cell, *extra)
-    assert result.exit_code == 130
-    assert result.stderr == "elastocal: interrupted\n"
-    assert everything_in(cell.parent) == ["cell.toml", "plan.csv.resume"]
-
-
-def test_it_goes_on_and_ends_with_the_same_plan(tmp_path, monkeypatch, whole):
-    cell = write_cell(tmp_path)
-    interrupted(cell, monkeypatch, 3)
+        interrupt_after(patch, 3)
+        result = design(cell)
+    assert result.exit_code == 130 and result.stderr == "elastocal: interrupted\n"
+    assert everything_in(tmp_path) == ["cell.toml", "plan.csv.resume"]
+    if edited:
+        write_cell(tmp_path, altered(DEFLECTION, poses="4"))
     result = design(cell, quiet=False)
-    assert result.exit_code == 0 and GOING_ON in result.stderr
-    assert "drawing candidates" not in result.stderr
-    assert (tmp_path / "plan.csv").read_bytes() == whole
+    assert result.exit_code == 0
+    assert (GOING_ON in result.stderr) == ("drawing candidates" not in result.stderr) != edited
+    assert edited != ((tmp_path / "plan.csv").read_bytes() == whole)
+    assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6 - edited
     assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
-
-
-def test_an_edited_cell_starts_anew(tmp_path, monkeypatch):
-    cell = write_cell(tmp_path)
-    interrupted(cell, monkeypatch, 2)
-    write_cell(tmp_path, altered(DEFLECTION, poses="4"))
-    result = design(cell, quiet=False)
-    assert result.exit_code == 0 and GOING_ON not in result.stderr
-    assert len((tmp_path / "plan.csv").read_text().splitlines()) == 5
 
 
 def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
@@ -106,48 +95,30 @@ def stages_in(begun):
         return {name.partition("/")[0] for name in kept.files} - {checkpoint.KEY}
 
 
-def stopped(cell, output, stage, number):
-    """Exit code and stderr of a process that gets a signal once a stage is saved."""
-    arguments = ["design", str(cell), "-o", str(cell.parent / output), "--effort"]
-    effort = "quick" if stage in STAGES[:2] else "normal"
-    command = [sys.executable, "-c", PROGRAM, *arguments, effort]
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    ("effort", "stage"),
+    [("quick", "candidates"), pytest.param("normal", "start0", marks=pytest.mark.long),
+     pytest.param("normal", "warm0", marks=pytest.mark.long)],
+)  # fmt: skip
+def test_a_process_that_is_stopped(tmp_path, effort, stage, number):
+    cell, begun = write_cell(tmp_path), tmp_path / "plan.csv.resume"
+    words = ["design", str(cell), "--effort", effort, "-o"]
+    command = [sys.executable, "-c", PROGRAM, *words, str(tmp_path / "plan.csv")]
     with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
-        begun = cell.parent / f"{output}.resume"
         while stage not in stages_in(begun):
             assert process.poll() is None, process.stderr.read().decode()
             time.sleep(0.01)
         process.send_signal(number)
         told = process.communicate()[1].decode()
-    return process.returncode, told
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_a_process_that_is_stopped(tmp_path, whole, number):
-    cell = write_cell(tmp_path)
-    code, told = stopped(cell, "plan.csv", "candidates", number)
     if number == signal.SIGINT:
-        assert code == 130
+        assert process.returncode == 130
         assert told.endswith("elastocal: interrupted\n") and "Traceback" not in told
     else:
-        assert code == -signal.SIGKILL
+        assert process.returncode == -signal.SIGKILL
     assert everything_in(tmp_path) == ["cell.toml", "plan.csv.resume"]
-    result = design(cell, quiet=False)
-    assert result.exit_code == 0 and GOING_ON in result.stderr
-    assert (tmp_path / "plan.csv").read_bytes() == whole
-    assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
-
-
-@pytest.mark.long
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-@pytest.mark.parametrize("stage", STAGES[2:])
-def test_a_process_that_is_stopped_in_any_stage(tmp_path, stage, number):
-    cell = write_cell(tmp_path)
-    code, _ = stopped(cell, "plan.csv", stage, number)
-    assert code == (130 if number == signal.SIGINT else -signal.SIGKILL)
-    plans = []
-    for output in ("plan.csv", "whole.csv"):
-        assert elastocal("design", cell, "-o", tmp_path / output, "-q").exit_code == 0
-        plans.append((tmp_path / output).read_bytes())
-    assert plans[0] == plans[1]
+    assert GOING_ON in elastocal(*words, tmp_path / "plan.csv").stderr
+    assert elastocal(*words, tmp_path / "whole.csv").exit_code == 0
+    assert (tmp_path / "plan.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+    assert not begun.exists()

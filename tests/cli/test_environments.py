@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -60,18 +59,12 @@ def test_everything_missing_at_once(campaign, tmp_path):
     assert laid_out and max(map(len, laid_out)) <= 20
 
 
-@pytest.mark.parametrize(
-    ("encoding", "words", "name"),
-    [
-        ("ascii", ("identify", "cell.toml", "data.csv"), "joint1.offset"),
-        ("latin-1", ("effects", "cell.toml"), "joint_offset"),
-    ],
-)
-def test_streams_that_lack_letters(campaign, encoding, words, name):
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_streams_that_lack_letters(campaign, encoding):
     """And no home at all."""
-    done = elastocal(campaign, *words, PYTHONIOENCODING=encoding)
+    done = elastocal(campaign, "effects", "cell.toml", PYTHONIOENCODING=encoding)
     assert done.returncode == 0, done.stderr.decode()
-    assert name in done.stdout.decode(encoding) and b"Traceback" not in done.stderr
+    assert "joint_offset" in done.stdout.decode(encoding) and b"Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -98,8 +91,6 @@ def test_streams_that_are_closed_or_full(campaign, tmp_path, shell, code):
     ("words", "shell", "code"),
     [
         (("identify", "--help"), '"$@" > /dev/full', 2),
-        (("--version",), '"$@" > /dev/full', 2),
-        (("nosuch",), '"$@" 2> /dev/full', 2),
         (("identify", "absent.toml", "absent.csv"), '"$@" 2> /dev/full', 2),
     ],
 )
@@ -108,35 +99,3 @@ def test_help_and_messages_where_a_stream_is_full(campaign, words, shell, code):
     done = elastocal(campaign, *words, shell=shell)
     full = b"elastocal: standard output: No space left on device\n"
     assert (done.returncode, done.stderr) == (code, b"" if "2>" in shell else full)
-
-
-def test_a_wheel_runs_outside_the_checkout(tmp_path):
-    """Built, unpacked where nothing else of the project is, and its command run as a user does."""
-    setuptools = pytest.importorskip("setuptools", minversion="77", reason="pip install .[test]")
-    del setuptools
-    root, source, place = SOURCE.parent, tmp_path / "source", tmp_path / "place"
-    source.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copyfile(root / name, source / name)
-    shutil.copytree(root / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
-    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index",
-               "--no-build-isolation", "--target", str(place), str(source)]  # fmt: skip
-    subprocess.run(install, check=True, capture_output=True, cwd=tmp_path)
-    shutil.rmtree(source)
-    environment = os.environ | {"PYTHONPATH": str(place)}
-
-    def run(*words: str) -> str:
-        done = subprocess.run(
-            [str(place / "bin" / "elastocal"), *words],
-            cwd=tmp_path, env=environment, capture_output=True, text=True,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        return done.stdout
-
-    where = [sys.executable, "-c", "import elastocal; print(elastocal.__file__)"]
-    found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert Path(found.stdout.strip()).is_relative_to(place)
-    assert "Report to open" in run("demo", "-q")
-    assert (tmp_path / "demo_out" / "report.html").stat().st_size > 100_000
-    again = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
-    assert "wrote result.json" in run("identify", *again)

@@ -18,26 +18,6 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["export", *map(str, arguments)], env={"COLUMNS": "200"})
 
 
-def test_a_mimic_beside_the_chain_stays_and_one_on_it_is_refused(tmp_path: Path) -> None:
-    finger = (
-        '<link name="f"/><joint name="grip" type="prismatic"><parent link="l5"/><child link="f"/>'
-        '<limit lower="0" upper="1" effort="1" velocity="1"/><mimic joint="q5" multiplier="2"/>'
-        "</joint>"
-    )
-    (tmp_path / "arm.urdf").write_text(arm(5, finger))
-    written = write_result(tmp_path, 'urdf = "arm.urdf"\nflange = "l5"', GEOMETRY)
-    output = tmp_path / "out.urdf"
-    assert run(*written, "-o", output, "-q", "--poses", "5").exit_code == 0
-    assert '<mimic joint="q5" multiplier="2"/>' in output.read_text()
-    on_chain = {
-        '<joint name="q5" type="revolute">': '<joint name="q5" type="revolute"><mimic joint="q4"/>'
-    }
-    (tmp_path / "arm.urdf").write_text(arm(5, finger, on_chain))
-    result = run(*written, "-o", tmp_path / "again.urdf", "-q")
-    assert result.exit_code == 2 and "mimics 'q4'" in result.output
-    assert not (tmp_path / "again.urdf").exists()
-
-
 def test_the_meshes_of_a_urdf_are_found_from_another_folder(tmp_path: Path) -> None:
     (tmp_path / "hull.stl").write_bytes(b"")
     shapes = [f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'

@@ -15,7 +15,6 @@ from fuzz import campaign
 from fuzz.campaign import COMMANDS
 from typer.testing import CliRunner
 
-import elastocal as ec
 from elastocal.cli.main import app
 
 WRITING = [c for c in COMMANDS if c.outputs and not any(
@@ -77,11 +76,14 @@ def test_an_output_is_refused_before_anything_is_read(tmp_path, monkeypatch, ver
     assert spoilt in done.stderr and words[0] not in done.stderr.replace(spoilt, "")
 
 
-def test_a_page_is_named_as_one_from_python_too(inputs, tmp_path):
-    fit = ec.identify(inputs / "deflecting.toml", inputs / "data.csv")
-    with pytest.raises(ec.InputError, match=r"ends in .txt; this output is written as .html"):
-        fit.report(tmp_path / "page.txt")
-    assert not list(tmp_path.iterdir())
+def test_limits_of_the_cell_have_an_exit_code_of_their_own(inputs, monkeypatch, tmp_path):
+    monkeypatch.chdir(inputs)
+    strict = Path("placed.toml").read_text() + "\n[require]\nheldout_um = 0.001\n"
+    strict = strict.replace('"arm.urdf"', f'"{inputs / "arm.urdf"}"')
+    (tmp_path / "strict.toml").write_text(strict)
+    words = ["identify", str(tmp_path / "strict.toml"), "placed.csv", "-q"]
+    assert CliRunner().invoke(app, words).exit_code == 3
+    assert CliRunner().invoke(app, [*words, "--require", "heldout=1e6"]).exit_code == 0
 
 
 def test_a_hard_link_to_an_input_is_parted_from_it(inputs, monkeypatch, tmp_path):

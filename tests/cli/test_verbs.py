@@ -1,21 +1,29 @@
-"""What every verb owes: its line in --help, inputs that are kept, options that are checked."""
+"""What every verb owes: its line in --help, options that are checked, messages that blame right."""
 
 from __future__ import annotations
 
+import json
+import os
+import re
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from support.files import write_campaign
+from support.registered import forgotten
+from support.tracker_exports import kr270_readings, krl, spatialanalyzer
+from typer.testing import CliRunner, Result
 
 from elastocal.cli.app import VERBS
 from elastocal.cli.main import app
+from elastocal.errors import InputError
+from elastocal.model.evaluate import VARIABLE, chosen_backend
 
 
-def run(*arguments: str):
-    return CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+def run(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
 
 
-def test_help_lists_every_verb_in_the_order_of_the_work_with_a_whole_sentence():
+def test_help_lists_every_verb_in_the_order_of_the_work_with_a_whole_sentence() -> None:
     shown = run("--help").stdout.partition("Commands:")[2].strip().splitlines()
     assert [line.split()[0] for line in shown] == list(VERBS)
     for line in shown:
@@ -29,12 +37,22 @@ def test_an_option_without_effect_is_taken_and_not_offered() -> None:
     assert done.exit_code == 2 and "no.toml: no such file" in done.stderr
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_no_help_text_shows_what_only_a_programmer_knows(verb: str) -> None:
-    options = run(verb, "--help").stdout.partition("Options:")[2]
-    assert "list[" not in options and "float,float" not in options
-    assert all(line.split()[0].startswith("--frames") for line in options.splitlines()
-               if " / " in line.partition("  ")[2])  # fmt: skip
+def test_the_backend_is_what_models_use_and_what_results_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(VARIABLE, "")
+    done = run("--backend", "nunpy", "identify", "no-cell.toml", "no-data.csv")
+    assert done.exit_code == 2 and "no-cell.toml" not in done.output
+    assert "--backend: unknown backend 'nunpy' (did you mean 'numpy'" in done.output
+    run("--backend", "auto", "identify", "no-cell.toml", "no-data.csv")
+    assert os.environ[VARIABLE] == chosen_backend() == "auto"
+    cell, data = write_campaign(tmp_path)
+    files = [tmp_path / "result.json", tmp_path / "report.html"]
+    done = run("--backend", "numpy", "identify", cell, data, "-o", files[0], "--report", files[1])
+    assert done.exit_code == 0, done.output
+    backend = json.loads(files[0].read_text())["backend"]
+    assert backend.startswith("numpy (") and "thread" in backend
+    assert backend in files[1].read_text("utf-8")
 
 
 @pytest.mark.parametrize(
@@ -64,3 +82,87 @@ def test_a_second_cell_file_is_no_table_and_no_result(tmp_path, monkeypatch) -> 
                   "compensate placed.toml placed.toml targets.csv -o"):  # fmt: skip
         told = run(*words.replace("-o", f"-o {tmp_path}/out.csv").split())
         assert told.exit_code == 2 and "ends in .toml, where the" in told.stderr
+
+
+@pytest.mark.parametrize("key", ["a" * 20_000, "'" + "é" * 20_000 + "'"])
+def test_a_message_has_an_end(key: str, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.toml"
+    name = key if key.isalnum() else f'"{key}"'
+    cell.write_text(f"[robot]\n{name} = 1\n", encoding="utf-8")
+    done = run("effects", cell)
+    assert done.exit_code == 2 and len(done.stderr) < 4000 and "cell.toml" in done.stderr
+    assert len(str(InputError(key))) < 9000
+
+
+def test_a_first_cell_that_cannot_be_read_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from elastocal.importing import first_cell
+
+    write_campaign(tmp_path)
+    monkeypatch.setattr(first_cell, "first_cell", lambda *given: "[robot]\nnothing = 1\n")
+    done = run("init", tmp_path / "arm.urdf", "-o", tmp_path / "first.toml")
+    assert done.exit_code == 2 and "arm.urdf" in done.stderr
+    assert not (tmp_path / "first.toml").exists()
+
+
+def test_what_the_robot_cannot_have_measured_is_shown_and_not_imported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, degrees, points = kr270_readings(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    Path("points.txt").write_text(spatialanalyzer(points), encoding="utf-8")
+    Path("poses.dat").write_text(krl(degrees), encoding="utf-8")
+    Path("map.toml").write_text("[joints]\noffset_deg = [0, 300, 0, 0, 0, 0]\n")
+    presets = ("--preset", "spatialanalyzer", "--preset", "kuka", "--map", "map.toml")
+    done = run("import", "points.txt", "poses.dat", *presets, "--preview", "--cell", "cell.toml",
+               "-o", "d.csv")  # fmt: skip
+    assert done.exit_code == 2 and "joint2" in done.stderr and "beyond its limits" in done.stderr
+    assert "offset_deg" in done.stderr and "Ranges" in done.stdout
+    assert not Path("d.csv").exists()
+
+
+MINE = """\
+from elastocal.plugins import *
+class Mine(DrivenEffect):
+  name, stage, entry = 'mine', 'transmission', JointMotion()
+  def places(self, chain, cell): return turning_joints(chain)
+  def parameters(self, place, chain, cell): return [ParameterSpec('a', 'rad', 0, 1e-5)]
+  def drive(self, arm, place, p): return p['b']
+register_effect(Mine())
+"""
+NOISE = """\
+from elastocal.plugins import *
+class Mine(NoiseModel):
+  name, description = 'mine', 'one variance'
+  def supports(self, readings): return readings.nothing
+  def components(self, readings): return {'all': 1.0}
+register_noise_model(Mine())
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "told"),
+    [
+        ("mine.py", MINE, r"mine\.py, line 6: 'mine': KeyError: 'b'; correct the plug-in"),
+        ("mine_by_name", MINE, r"mine_by_name\.py, line 6: 'mine': KeyError"),
+        ("mine.py", MINE.replace("[ParameterSpec('a', 'rad', 0, 1e-5)]", "1"),
+         r"mine\.py.*'mine': TypeError"),
+        ("mine.py", NOISE, r"mine\.py, line 4: 'mine': AttributeError"),
+    ],
+)  # fmt: skip
+def test_a_plug_in_that_fails_at_work_is_to_blame_itself(
+    module: str, code: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, data = write_campaign(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / f"{module.removesuffix('.py')}.py").write_text(code)
+    effects = '"joint_offset", "mine"' if "DrivenEffect" in code else '"joint_offset"'
+    text = cell.read_text().replace('"joint_offset"', effects)
+    cell.write_text(f'{text}\n[plugins]\nmodules = ["{module}"]\n')
+    # Ctrl-C in an earlier command of this process is not one here.
+    monkeypatch.setattr("elastocal.cli.app.interrupts", [2])
+    with forgotten():
+        done = run("identify", cell, data, "--plugins", "-q")
+    assert done.exit_code == 2 and re.search(told, done.stderr), done.stderr
+    assert "data.csv" not in done.stderr
