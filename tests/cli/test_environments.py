@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -99,3 +100,35 @@ def test_help_and_messages_where_a_stream_is_full(campaign, words, shell, code):
     done = elastocal(campaign, *words, shell=shell)
     full = b"elastocal: standard output: No space left on device\n"
     assert (done.returncode, done.stderr) == (code, b"" if "2>" in shell else full)
+
+
+def test_a_wheel_runs_outside_the_checkout(tmp_path):
+    """Built, unpacked where nothing else of the project is, and its command run as a user does."""
+    setuptools = pytest.importorskip("setuptools", minversion="77", reason="pip install .[test]")
+    del setuptools
+    root, source, place = SOURCE.parent, tmp_path / "source", tmp_path / "place"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copyfile(root / name, source / name)
+    shutil.copytree(root / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
+    install = [sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--no-index",
+               "--no-build-isolation", "--target", str(place), str(source)]  # fmt: skip
+    subprocess.run(install, check=True, capture_output=True, cwd=tmp_path)
+    shutil.rmtree(source)
+    environment = os.environ | {"PYTHONPATH": str(place)}
+
+    def run(*words: str) -> str:
+        done = subprocess.run(
+            [str(place / "bin" / "elastocal"), *words],
+            cwd=tmp_path, env=environment, capture_output=True, text=True,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    where = [sys.executable, "-c", "import elastocal; print(elastocal.__file__)"]
+    found = subprocess.run(where, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert Path(found.stdout.strip()).is_relative_to(place)
+    assert "Report to open" in run("demo", "-q")
+    assert (tmp_path / "demo_out" / "report.html").stat().st_size > 100_000
+    again = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
+    assert "wrote result.json" in run("identify", *again)
