@@ -14,7 +14,7 @@ import pytest
 from identification.test_far_values import CASES
 
 import elastocal as ec
-from elastocal.identification import error_budget
+from elastocal.identification import scrutiny
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.result import Finding, TestErrors
@@ -154,6 +154,6 @@ def test_floor_is_the_scatter_of_repeats_where_there_are_some(case: Any) -> None
     twice = replace(observed, table=observed.table.take(rows), lead=np.arange(len(rows)))
     apart = np.tile([d, -d], len(rows) // 2)[:, None]
     residual = (np.zeros((len(rows), 3)) + apart).ravel()
-    floor, name = error_budget._floor(replace(case.result, observations=twice, residual=residual))
+    floor, name = scrutiny._floor(replace(case.result, observations=twice, residual=residual))
     assert name == "repeats alone"
     assert floor == pytest.approx(np.sqrt(3 * 2) * d)
