@@ -8,7 +8,7 @@ import subprocess
 import sys
 import typing
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +17,15 @@ from typer.testing import CliRunner
 
 import elastocal as ec
 from elastocal import plugins
+from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cli.main import app
 from elastocal.demo.example import LOAD_N, run_demo
+from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.errors import options_as_flags
+from elastocal.identification.options import Options
+from elastocal.planning.design import DesignOptions
+from elastocal.report.renderers import FRAMES
+from elastocal.saving import WRITERS
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)
@@ -462,3 +468,25 @@ def test_type_hints_of_all_that_is_public_are_resolved(door):
             assert not unresolved, f"{told}: {unresolved}"
     assert typing.get_type_hints(ec.identify)["return"] is ec.Calibration
     assert ec.Knowledge in typing.get_args(typing.get_type_hints(ec.design)["knowledge"])
+
+
+def test_whatever_a_verb_returns_is_a_result():
+    """Its `save`, `report`, `plot` and `to_dataframe` find what they need by the class's name."""
+    returned = {inspect.signature(getattr(ec, name)).return_annotation
+                for name in ("design", "simulate", "identify", "diagnose", "compensate", "compare",
+                             "next_poses")}  # fmt: skip
+    assert returned == set(FRAMES) == set(WRITERS) - {"CalibratedArm"}
+
+
+@pytest.mark.parametrize(
+    ("verb", "kind", "renamed"),
+    [
+        ("identify", Options, {"faulty": "outliers"}),
+        ("design", DesignOptions, {"done": "augment", "notes": "knowledge", "pins": "keep"}),
+        ("design", DesignSpec, {"taught": "candidates"}),
+        ("diagnose", DiagnosisOptions, {}),
+    ],
+)
+def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
+    keywords = set(inspect.signature(getattr(ec, verb)).parameters)
+    assert {renamed.get(f.name, f.name) for f in fields(kind)} <= keywords

@@ -125,6 +125,14 @@ def test_constraints_cover_every_requirement() -> None:
     assert {_canonical(line) for line in required} - constrained <= {"elastocal"}
 
 
+def test_constraints_are_exact_versions_and_nothing_else() -> None:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    exact = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*==[0-9][A-Za-z0-9.!]*")
+    assert not [line for line in lines if not exact.fullmatch(line)]
+    names = [_canonical(line) for line in lines]
+    assert len(set(names)) == len(names)
+
+
 def _canonical(requirement: str) -> str:
     name = re.match(r"[A-Za-z0-9._-]+", requirement)
     assert name, requirement
