@@ -110,13 +110,13 @@ def _adapted(
         others = refit is not None and restarts < RESTARTS and not np.array_equal(now, fitted)
         if others and refit is not None:
             start, fitted, restarts = every if now.all() else refit(now), now, restarts + 1
-            solution, more, fewer = start, start.reduction, None
+            solution, more = start, start.reduction
         else:
             # Weights that make light of what is noisy may show more than those of the first fit.
             heavy = noise.kind not in FIRST and left > 0
             more = chosen_again(solution) if heavy else start.reduction
         if others or len(more.kept) > len(kept):
-            fewer = fewer if others else (solution, noise, now, readings)
+            fewer = None if others else (solution, noise, now, readings)
             start, sure = replace(start, reduction=more), False
             readings = _linearised(problem, solution.fit.x, more.kept, kind)
             continue
