@@ -237,19 +237,29 @@ class SumAnswer:
 
     @property
     def decided(self) -> SumAnswer:
-        """The same without effects that matter next to nothing and are probably something else: as
-        a cause they would be a guess, and what they correct is too little to be missed.  What they
-        may take from others is in the shares still."""
-        gone = [
-            k for k in self._rivals
-            if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
-        ]  # fmt: skip
+        """The same without doubtful effects that are not missed at left-out configurations, and
+        without what does harm there.  What they may take from others is in the shares still."""
+        gone = [k for k in self._doubtful if not self._missed(k)]
         answer = self._without(gone) if gone else self
         harmful = [
             k for key, gain in answer._not_paying.items() if gain < -HARM
             for k in answer._at_place[key]
         ]  # fmt: skip
         return answer._without(harmful) if harmful else answer
+
+    @cached_property
+    def _doubtful(self) -> list[int]:
+        """Effects of next to no share that are probably something else: as causes they would be a
+        guess."""
+        return [
+            k for k in self._rivals
+            if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
+        ]  # fmt: skip
+
+    def _missed(self, k: int) -> bool:
+        """Whether the error of left-out configurations grows by PAYS without component k."""
+        without, now = self._left_out_without([k])[0], self._left_out[0]
+        return bool(without.sum() > (1 + PAYS) ** 2 * now.sum())
 
     def _without(self, gone: Sequence[int]) -> SumAnswer:
         removed = [self.found.components[k] for k in gone]
@@ -505,7 +515,7 @@ class SumAnswer:
             spared = own[likeliest] < PROBABLE <= self._matters(members, self._of_kind(name))
             doubtful = {k for k, p in own.items() if p < PROBABLE}
             slight |= doubtful - {likeliest} if spared else doubtful
-        slight |= {self._at_place[key][0] for key in self._not_paying}
+        slight |= {self._at_place[key][0] for key in self._not_paying} | {*self._doubtful}
         return {k for own in self._at_place.values() if own[0] in slight for k in own}
 
     def _matters(self, members: Sequence[int], together: Sequence[int] = ()) -> float:

@@ -129,6 +129,7 @@ def search_components(
         if found.score <= before.score + GAINED:
             break
         found = _with_lines(full, found)
+    found = with_likelier_names(full, found, others)
     return full, found, hidden_fellows(found, others)
 
 
@@ -494,6 +495,37 @@ class Rivals:
         """Log evidence of component k over none in its place, and of every other hypothesis."""
         own, *others = self.beside.evidence_instead(self.own[k])
         return own, dict(zip(self.keys, others, strict=True))
+
+
+def with_likelier_names(
+    dataset: DiagnosisData, found: FittedSum, components: Sequence[Component]
+) -> FittedSum:
+    """The sum with another effect in the place of a single one, where that is more probable."""
+    by_key = {c.hypothesis.key: c for c in components if c.hypothesis is not None}
+    for _ in range(SWAPS):
+        rivals, better = Rivals(dataset, found), found
+        for k, c in enumerate(found.components):
+            if c.hypothesis is None or c.settings or c.given:
+                continue
+            rest = [*found.components[:k], *found.components[k + 1 :]]
+            own, others = rivals.of(k)
+            odds = {
+                key: evidence + log_odds(rest, by_key[key])
+                for key, evidence in others.items() if key in by_key
+            }  # fmt: skip
+            likeliest = max(odds, key=lambda key: odds[key], default=None)
+            if likeliest is None or odds[likeliest] <= own + log_odds(rest, c) + GAINED:
+                continue
+            swapped = exchanged(found, [c], [by_key[likeliest]], refit_noise=False)
+            if swapped.score > better.score + GAINED:
+                better = swapped
+        if better is found:
+            break
+        found = _refitted(better)
+    return found
+
+
+SWAPS = 4
 
 
 def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
