@@ -148,7 +148,7 @@ def test_as_many_that_one_shift_explains_are_set_apart_and_the_shift_is_told():
     assert [o.line for o in result.excluded] == list(range(12, 18)) and not result.outliers
     found = result.finding("faulty_readings")
     assert found.numbers["shifted"] == 6
-    assert "One common shift each explains lines 12 to 17 by 17.4 mm" in found.remedy
+    assert "One common shift explains lines 12 to 17 by 17.4 mm" in found.remedy
 
 
 def test_a_missing_effect_in_one_load_state_is_no_shift():

@@ -581,7 +581,8 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
         shifted = result.faulty_report.shifted if result.faulty_report else []
         if shifted:
             remedy += (
-                f" One common shift each explains {listed(map(str, shifted), 4)}: look for what "
+                f" One common shift{' each' * (len(shifted) > 1)} explains "
+                f"{listed(map(str, shifted), 4)}: look for what "
                 "moved there, a marker or the tracker."
             )
         numbers = {"left_out": len(result.excluded), "heldout_all_rms_um": result.heldout_all_rms}

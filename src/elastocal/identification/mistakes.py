@@ -506,6 +506,9 @@ def refuse_nonsense(
                 f"{table.source}: no deflections of this arm: {fit.warning}"
             )
         return
+    # Of those set apart too: beside them the few that fit say nothing.
+    if len(every_off):
+        error, rms = float(np.median(every_off)), float(np.sqrt((every_off**2).mean()))
     most = f", {share:.0%} of them more than {POOREST * length:.2g} m," if share > FEW else ""
     value = f", whose {beyond[0][0]} is {beyond[0][1]:.3g} m" if beyond else ""
     raise InsufficientDataError(

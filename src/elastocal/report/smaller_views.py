@@ -186,10 +186,13 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
         rows = {
             "nominal command": commands["error_before_um"],
             "new command": commands["error_after_um"],
-            "standard uncertainty": commands["std_um"],
+            "standard uncertainty of fitted parameters": commands["std_um"],
             "within, at 95 %": commands["within95_um"],
         }
         yield _spreads("Position of the tool, predicted", rows)
+        yield say.Sentence(
+            "Within counts possible model error and what the readings leave open as well."
+        )
         for k, command in enumerate(commands.get("commands", ())):
             joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
             yield say.Sentence(f"target {k + 1}: {joints or command['status']}")
