@@ -370,7 +370,7 @@ def exchanged(
 GAINED = 0.5  # nats that a search must bring for another one
 
 
-def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -> float:
+def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
     """Log posterior of a sum under the priors that the forward search's sets have.
 
     Within a sum many causes are expected, so that each costs little; to be believed instead of a
@@ -380,13 +380,9 @@ def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -
     prior = log_prior_odds(dataset.hypotheses, [], ANOTHER)
     odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior, strict=True)}
     usual = min(odds.values(), default=0.0)
-    known = {item.key: item.log_prior for item in chosen.items if item.known}
 
     def price(c: Component) -> float:
-        if c.hypothesis is None:
-            return usual
-        own = odds.get(c.hypothesis.key, usual)
-        return known.get(c.hypothesis.key, own) if c.settings else own
+        return usual if c.hypothesis is None else odds.get(c.hypothesis.key, usual)
 
     pool = Pool(found.components)
     score = found.score + pool.cost - sum(c.search for c in found.components)
@@ -608,8 +604,10 @@ def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
         if isinstance(h, Hypothesis) and len(item.settings):
             family = family_of(h.effect, dataset.base.model.cell)
             columns, settings = packed_columns(dataset, item), tuple(settings_of(item).items())
+            grid = dataset.grids[h.key]
+            search = -float(grid.log_prior[grid.nearest(item.settings)])
             found.append(Component(family, h.effect, h.where, columns, settings=settings,
-                                   hypothesis=h))  # fmt: skip
+                                   hypothesis=h, search=search))  # fmt: skip
     return found
 
 

@@ -325,7 +325,7 @@ def _sum_of_all(
         return None, 0.0, ()
     full, total, hidden = searched
     answer, nothing = SumAnswer(dataset, full, total, hidden, rng).decided, found.nothing.score
-    over = compared_score(full, total, found.chosen) - nothing
+    over = compared_score(full, total) - nothing
     if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
         return None, 0.0, answer.without_names if found.chosen.unknown else ()
     return answer, over, ()
