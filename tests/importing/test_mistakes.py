@@ -193,6 +193,25 @@ def test_units_mistaken_for_others(tmp_path, readings, length, angle, scale, tur
     assert any(words in w for w in found.warnings), found.warnings
 
 
+@pytest.mark.parametrize(
+    ("force", "sigma", "words"),
+    [
+        (-2e6, 10, ["forces reach 2e+06 N"]),
+        (2600, 10, ["some forces point up"]),
+        (-2600, 6000, ["standard deviations reach 6 mm"]),
+        (-2600, 10, []),
+    ],
+)
+def test_loads_and_noise_that_no_arm_has(tmp_path, force, sigma, words):
+    heads, *lines = DATA.splitlines()
+    data = "\n".join([f"{heads},F,S,N", *(f"{line},{force},{sigma},0" for line in lines)])
+    columns = [f"sigma_{axis}_um = 'S'" for axis in "xyz"]
+    columns += [f"force_{axis}_N = '{'F' if axis == 'z' else 'N'}'" for axis in "xyz"]
+    found = imported(tmp_path, {"data.csv": data}, GOOD + "\n".join(columns)).warnings
+    told = [w for w in found if w.startswith(("forces", "some forces", "standard"))]
+    assert [any(w.startswith(t) for t in words) for w in told] == [True] * len(words)
+
+
 def test_deflections_need_both_states(tmp_path, readings):
     cell, degrees, points = readings
     cell = replace(cell, model=replace(cell.model, observe="deflection"))
