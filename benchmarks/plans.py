@@ -79,6 +79,9 @@ CELLS: dict[str, tuple[str, str, int, tuple[str, ...]]] = {
     "UR10, limits, D": ("UR10", LIMITS, 20, ("--criterion", "D")),
 }
 EFFICIENCY, QUICKER, BETTER = 0.99, 1.0, 0.02  # goals
+EFFECTS = 'effects = ["base_frame", "joint_offset", "link_geometry", '
+FEWER = 'effects = ["base_frame", '
+MORE = f'{EFFECTS}"gear_eccentricity", "gear_second_harmonic", '
 
 
 def cell_file(folder: Path, arm: str, rules: str) -> Path:
@@ -154,12 +157,18 @@ def main() -> None:
             goal("quick: lower ρ₀, median", float(np.median(lower)), BETTER, least=True)
         if chosen.growth:
             cell = cell_file(Path(name), "UR10", LIMITS)
-            sizes = [("poses", n, n, ()) for n in (10, 20, 40, 80)]
-            sizes += [("candidates", n, 20, ("--candidates", n)) for n in (1000, 5000, 20_000)]
-            table("Growth, UR10, quick", ("of", "number", *heads[1:5]), [
-                (of, number_of, *figures(planned(cell, poses, "quick", *more)))
-                for of, number_of, poses, more in sizes
-            ])  # fmt: skip
+            sizes = [("poses", n, ()) for n in (10, 20, 40, 80)]
+            sizes += [("candidates", n, ("--candidates", n)) for n in (1000, 5000, 20_000)]
+            rows = [
+                [of, n, *figures(planned(cell, n if of == "poses" else 20, "quick", *more))]
+                for of, n, more in sizes
+            ]
+            for effects in (FEWER, EFFECTS, MORE):
+                other = cell.with_name("effects.toml")
+                other.write_text(cell.read_text().replace(EFFECTS, effects))
+                plan = planned(other, 20, "quick")
+                rows.append(["parameters", len(plan["predicted"]), *figures(plan)])
+            table("Growth, UR10, quick", ("of", "number", *heads[1:5]), rows)
 
 
 if __name__ == "__main__":

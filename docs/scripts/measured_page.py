@@ -132,6 +132,22 @@ PAGES: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/feasibility_check/result.md",
         ),
         Part(
+            "Eight cells, beside plans whose poses are polished one by one",
+            "",
+            "python benchmarks/plans.py --beside ../earlier/src",
+            "benchmarks/README.md",
+            "Eight cells",
+            tables=1,
+        ),
+        Part(
+            "Growth with poses, candidates and parameters",
+            "",
+            "python benchmarks/plans.py --only \"UR10, limits\" --efforts quick --growth",
+            "benchmarks/README.md",
+            "Growth of a UR10's quick plan",
+            tables=1,
+        ),
+        Part(
             "Compared with FIGAROH: UR10, its own pool and regressor",
             "",
             "python benchmarks/design_peers.py",

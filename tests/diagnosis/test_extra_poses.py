@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -115,6 +116,23 @@ def test_the_side_of_approach_is_chosen_where_rivals_depend_on_it() -> None:
     assert extra.plan is not None
     assert (extra.plan.approach[:, 2] == -1.0).any()
     assert any("side that the plan states" in text for text in extra.advice)
+
+
+def test_a_horizontal_pull_is_advised_where_it_helps() -> None:
+    """A weight turns joint 2 about one axis; a pull bends it across that axis too."""
+    model, table = campaign({"joint2.eccentricity_sin": 1e-4}, 2.0)
+    bent, base = ("off_axis_compliance", "joint2"), ("base_compliance", "base")
+    hard = ("joint_hardening", "joint2")
+
+    def told(*rivals: tuple[str, str]) -> list[str]:
+        pair = diagnosis_of(dict(zip(rivals, (0.6, 0.4), strict=True)))
+        return [t for t in plan_extra(model, table, pair, most=2).advice if "pull" in t]
+
+    (apart,), (more,) = told(bent, base), told(hard, bent)
+    assert "would separate off_axis_compliance:joint2 and base_compliance:base" in apart
+    low, high = map(float, re.findall(r"from (0\.\d+) to (0\.\d+)", more)[0])
+    assert more.startswith("pull horizontally: 2 poses") and high > low + 0.1
+    assert not told(("encoder_scale", "joint3"), ("gear_eccentricity", "joint2"))
 
 
 def test_a_cell_without_room_says_which_rule_is_in_the_way(narrow) -> None:

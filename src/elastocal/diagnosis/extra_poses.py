@@ -251,9 +251,9 @@ def _chosen(
         if after < enough:
             reachable = covered * expected(tasks, range(len(pool)))
             notes.append(
-                f"{len(chosen)} poses reach a probability of {covered * after:.2f} only; many more "
-                f"would reach {reachable:.2f}: allow more poses ({option('poses')}), or repeat "
-                "each of them"
+                f"with {len(chosen)} pose{'s' * (len(chosen) != 1)} the probability is "
+                f"{covered * after:.2f} only; many more would reach {reachable:.2f}: allow more "
+                f"poses ({option('poses')}), or repeat each of them"
             )
         notes += _pull_notes(base, pool, suspects, seed, tasks, hopeless, len(chosen), after)
     if not worthwhile:
@@ -316,10 +316,10 @@ def _pull_notes(
         chosen = fewest(same, n)
         reached = expected(same, chosen)
         if reached > after + GAIN:
+            also = f"{len(chosen)} pose{'s' * (len(chosen) > 1)}, measured also under"
             notes.append(
-                f"pull horizontally: {len(chosen)} poses that are also measured under "
-                f"{newton:.3g} N along x and along y, e.g. by a rope over a pulley, raise the "
-                f"probability from {suspects.covered * after:.2f} to "
-                f"{suspects.covered * reached:.2f}"
+                f"pull horizontally: {also} {newton:.3g} N along x and along y, e.g. by a rope "
+                "over a pulley, would raise the probability from "
+                f"{suspects.covered * after:.2f} to {suspects.covered * reached:.2f}"
             )
     return notes
