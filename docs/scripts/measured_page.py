@@ -142,7 +142,7 @@ PAGES: dict[str, tuple[Part, ...]] = {
         Part(
             "Growth with poses, candidates and parameters",
             "",
-            "python benchmarks/plans.py --only \"UR10, limits\" --efforts quick --growth",
+            'python benchmarks/plans.py --only "UR10, limits" --efforts quick --growth',
             "benchmarks/README.md",
             "Growth of a UR10's quick plan",
             tables=1,
