@@ -11,7 +11,7 @@ import pytest
 from support.files import write_campaign
 
 import elastocal as ec
-from elastocal.arguments import LARGEST_SEED
+from elastocal.above import LARGEST_SEED
 
 SEEDS = (10**12, LARGEST_SEED)
 

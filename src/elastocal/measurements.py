@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal import tables
-from elastocal.above import DataFrame, Result, later
-from elastocal.arguments import checked_arguments
+from elastocal.above import DataFrame, Result, checked_arguments, later
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import NO_UNIT, Family, Labels, Layout, RawTable, column

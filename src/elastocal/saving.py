@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elastocal.above import later
-from elastocal.arguments import checked_arguments
+from elastocal.above import checked_arguments, later
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements

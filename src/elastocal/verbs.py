@@ -14,8 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
-from elastocal.above import later
-from elastocal.arguments import checked_arguments, whole
+from elastocal.above import checked_arguments, later, whole
 from elastocal.errors import InputError, option, require
 from elastocal.text import quoted
 

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_args
 import typer
 from typer.core import TyperGroup
 
-from elastocal.arguments import LARGEST_SEED, kinds_of
+from elastocal.above import LARGEST_SEED, kinds_of
 from elastocal.errors import (
     TRACEBACK,
     ElastocalError,

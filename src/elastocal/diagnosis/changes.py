@@ -23,8 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
-from elastocal.above import Result
-from elastocal.arguments import checked_arguments
+from elastocal.above import Result, checked_arguments
 from elastocal.cell.arm_description import Tool
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.result import Calibration

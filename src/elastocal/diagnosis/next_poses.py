@@ -16,8 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from elastocal.above import Result
-from elastocal.arguments import checked_arguments
+from elastocal.above import Result, checked_arguments
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose

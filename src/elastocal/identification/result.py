@@ -12,8 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import DataFrame, Result, headline, write_page
-from elastocal.arguments import checked_arguments
+from elastocal.above import DataFrame, Result, checked_arguments, headline, write_page
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny

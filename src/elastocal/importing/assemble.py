@@ -46,7 +46,7 @@ def forces_of(
     "2600 N" or "2.5 kg", unless [loads] has it.  The names none, unloaded and 0 mean no force
     unless [loads] says otherwise.
     """
-    named = points.labels.get("load")
+    named = points.texts.get("load")
     if named is None:
         if loads and not _forces(points.numbers):
             raise InputError(
@@ -104,7 +104,7 @@ def with_loads_of_names(
     """The records with the loads that their files are named for, where nothing else states any, and
     what to tell.  They hang straight down."""
     made, every = dict(by_role), [r for role in by_role.values() for r in role]
-    if loads or any(r.load or "load" in r.labels or _forces(r.numbers) for r in every):
+    if loads or any(r.load or "load" in r.texts or _forces(r.numbers) for r in every):
         return made, []
     named = {r.source: load_in(Path(r.source).stem) for r in every}
     if not any(named.values()):
@@ -189,7 +189,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
         units |= dict.fromkeys(absent, "N")
         warnings.append(f"{listed(absent)} in no column: taken as 0 N beside {listed(stated)}")
     columns: dict[str, Sequence[str] | NDArray] = {"configuration": configuration}
-    marker = points.labels.get("marker")
+    marker = points.texts.get("marker")
     markers = [""] * len(rows) if marker is None else [marker[i] for i in rows]
     force = [tuple(row) for row in np.column_stack(
         [numbers.get(stem, np.zeros(len(rows))) for stem in FORCES])]  # fmt: skip
@@ -228,7 +228,7 @@ def _numbers(
 def _configurations(
     points: Records, joined: Joined | None, rows: IntArray, q: Array, spread: Array
 ) -> tuple[list[str], list[str]]:
-    stated = points.labels.get("configuration")
+    stated = points.texts.get("configuration")
     if stated is None and joined is not None:
         stated = joined.pose
     if stated is None:
@@ -257,7 +257,7 @@ def _configurations(
 
 
 def _repeats(points: Records, rows: IntArray, keys: list[tuple]) -> IntArray:
-    stated = points.labels.get("repeat")
+    stated = points.texts.get("repeat")
     count: dict[tuple, int] = {}
     known: dict[tuple, int] = {}
     repeats = np.zeros(len(rows), dtype=np.int64)

@@ -12,7 +12,7 @@ import threading
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -23,7 +23,6 @@ from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import (
     ColumnKey,
-    FileColumn,
     SourceTable,
     TextSourceKeys,
     UnitsTable,
@@ -52,17 +51,8 @@ MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"
 
 
-@dataclass(frozen=True)
-class ForeignText:
-    """`lines` without their ends; line k of the file is lines[k - 1]."""
-
-    source: str
-    encoding: str
-    lines: list[str]
-
-
-def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
-    """The lines of a text file of at most 300 MB.
+def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str]:
+    """The lines of a text file of at most 300 MB without their ends, and its encoding.
 
     `encoding` "auto": by the byte order mark, else UTF-8 where the bytes allow, else Windows-1252
     (Latin-1 where that has no character).
@@ -87,7 +77,7 @@ def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
         if len(content) > MAX_LINE:
             raise InputError(f"{source}, line {number}: longer than {MAX_LINE // 1024} KiB; this "
                              "is no table of readings")  # fmt: skip
-    return ForeignText(source, name, lines)
+    return lines, name
 
 
 def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
@@ -174,8 +164,9 @@ class Rows:
 
 
 def table_rows(
-    text: ForeignText, settings: TextSourceKeys, is_header: Judge | None, is_data: Judge
-) -> Rows:
+    source: str, lines: list[str], settings: TextSourceKeys, is_header: Judge | None,
+    is_data: Judge,
+) -> Rows:  # fmt: skip
     """The rows of a delimited table.
 
     `is_header` recognises the header where columns are asked for by name; without it the table
@@ -184,10 +175,10 @@ def table_rows(
     and listed.
     """
     marks = tuple(settings.comments or ())
-    skip = None if settings.ignore is None else compiled(text.source, "ignore", settings.ignore)
+    skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
-    with bounded(text.source, text.lines if skip else ()):
-        for number, line in enumerate(text.lines, start=1):
+    with bounded(source, lines if skip else ()):
+        for number, line in enumerate(lines, start=1):
             bare = line.strip()
             if marks and bare.startswith(marks):
                 comments.append((number, bare))
@@ -196,17 +187,17 @@ def table_rows(
             elif bare:
                 content.append((number, line))
     if not content:
-        raise InputError(f"{text.source}: only comments and blank lines; export the points again")
+        raise InputError(f"{source}: only comments and blank lines; export the points again")
     if is_header is not None:
         delimiter, header_line, header = _named_header(
-            text.source, settings, content, comments, is_header
+            source, settings, content, comments, is_header
         )
     else:
         delimiter = settings.delimiter or "auto"
         delimiter = _by_numbers(content)[0] if delimiter == "auto" else delimiter
-        header_line, header = _unnamed_header(text.source, delimiter, content, is_data)
+        header_line, header = _unnamed_header(source, delimiter, content, is_data)
     rows: list[Line] = []
-    for number, cells in _split(text.source, delimiter, content):
+    for number, cells in _split(source, delimiter, content):
         if is_header is None and header_line == 0 and not rows and not is_data(cells):
             ignored.append((number, "stands above the first reading"))
         elif number < header_line:
@@ -218,7 +209,7 @@ def table_rows(
         elif any(cell.strip() for cell in cells):
             rows.append((number, cells))
     if not rows:
-        raise InputError(f"{text.source}: a header but no readings below it; export the points")
+        raise InputError(f"{source}: a header but no readings below it; export the points")
     told = tuple(line for _, line in comments)
     return Rows(header, rows, ignored, header_line, delimiter, told)
 
@@ -394,7 +385,7 @@ _RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?
 _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
 
-def program_rows(text: ForeignText, kind: str) -> Rows:
+def program_rows(source: str, lines: list[str], kind: str) -> Rows:
     """The joint values in a robot program, KRL or RAPID, or in a log of its variables.
 
     KRL: every aggregate of A1, A2 … (and E1 …); FRAME, POS and E6POS (X, Y, Z) are passed over.
@@ -408,7 +399,7 @@ def program_rows(text: ForeignText, kind: str) -> Rows:
     }[kind]
     # Comments, outside quotation marks, go.
     bare = re.compile(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""")
-    whole = "\n".join(found[0] for line in text.lines if (found := bare.match(line)))
+    whole = "\n".join(found[0] for line in lines if (found := bare.match(line)))
     ends = [match.start() for match in re.finditer("\n", whole)]
     rows: list[Line] = []
     ignored: list[tuple[int, str]] = []
@@ -420,7 +411,7 @@ def program_rows(text: ForeignText, kind: str) -> Rows:
         for axis, cell in values.items():
             if not _NUMBER.fullmatch(cell):
                 raise InputError(
-                    f"{text.source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
+                    f"{source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
                     "values, not expressions"
                 )
         kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
@@ -429,7 +420,7 @@ def program_rows(text: ForeignText, kind: str) -> Rows:
         n = len(ignored)
         passed_over = f" ({n} Cartesian positions passed over)" if n else ""
         raise InputError(
-            f"{text.source}: {what} in {len(text.lines)} lines{passed_over}; check the file, or "
+            f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
             "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
@@ -509,9 +500,8 @@ class Understood:
 class Records:
     """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
 
-    `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` and
-    `labels` (configuration, marker, repeat, load) → n texts; `load` of all rows, where one is
-    stated.
+    `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` (name,
+    configuration, marker, repeat, load) → n texts; `load` of all rows, where one is stated.
     """
 
     files: tuple[str, ...]
@@ -522,7 +512,6 @@ class Records:
     texts: dict[str, list[str]]
     understood: Understood
     load: str | None = None
-    labels: dict[str, list[str]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.line)
@@ -569,13 +558,13 @@ class Records:
             line=self.line[rows],
             numbers={stem: values[rows] for stem, values in self.numbers.items()},
             texts=taken(self.texts, rows),
-            labels=taken(self.labels, rows),
         )
 
     @classmethod
     def stacked(cls, parts: Sequence[Records]) -> Records:
         """The rows of all parts, which have the same numbers in the same units."""
         sizes = [len(part.files) for part in parts]
+        stems = dict.fromkeys(stem for part in parts for stem in part.texts)
         first = np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
         return replace(
             parts[0],
@@ -583,18 +572,14 @@ class Records:
             file=np.concatenate([part.file for part in parts]) + first,
             line=np.concatenate([part.line for part in parts]),
             numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
-            texts=_stacked([(part.texts, len(part)) for part in parts]),
-            labels=_stacked([(part.labels, len(part)) for part in parts]),
+            texts={
+                s: [text for p in parts for text in p.texts.get(s, [""] * len(p))] for s in stems
+            },
         )
 
 
 def taken(texts: dict[str, list[str]], rows: IntArray) -> dict[str, list[str]]:
     return {stem: [own[i] for i in rows] for stem, own in texts.items()}
-
-
-def _stacked(parts: Sequence[tuple[dict[str, list[str]], int]]) -> dict[str, list[str]]:
-    stems = dict.fromkeys(stem for part, _ in parts for stem in part)
-    return {s: [text for part, n in parts for text in part.get(s, [""] * n)] for s in stems}
 
 
 # Units of the measurement table that import writes.
@@ -621,26 +606,27 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     """
     settings = source.text or TextSourceKeys()
     asked = mapping_file.wanted(where, source.columns or {}, source.optional or {})
-    text = read_lines(path, settings.encoding or "auto")
-    table = _table(text, settings, asked)
+    name = str(path)
+    lines, encoding = read_lines(path, settings.encoding or "auto")
+    table = _table(name, lines, settings, asked)
     if len(table.rows) > MAX_ROWS:
-        raise InputError(f"{text.source}: more than {MAX_ROWS:,} rows; thin the export out")
+        raise InputError(f"{name}: more than {MAX_ROWS:,} rows; thin the export out")
     hint = unit_in_comments(where, settings.unit_comment, table.comments)
-    markers = mapping_file.markers_of_row(text.source, asked, table.header)
+    markers = mapping_file.markers_of_row(name, asked, table.header)
     parts = [
-        _read(text, table, [c.of_marker(name) for c in asked], source, units, hint)
-        for name in markers or [""]
+        _read(name, encoding, table, [c.of_marker(marker) for c in asked], source, units, hint)
+        for marker in markers or [""]
     ]
     return _side_by_side(parts, markers) if markers else parts[0]
 
 
 def _read(
-    text: ForeignText, table: Rows, asked: Sequence[ColumnKey], source: SourceTable,
+    name: str, encoding: str, table: Rows, asked: Sequence[ColumnKey], source: SourceTable,
     units: UnitsTable, hint: str | None,
 ) -> Records:  # fmt: skip
-    settings, name = source.text or TextSourceKeys(), text.source
+    settings = source.text or TextSourceKeys()
     columns = mapping_file.resolve(name, asked, table.header, len(table.rows[0][1]), units, hint)
-    numeric = [c for c in columns if not c.target.is_text]
+    numeric = [c for c in columns if not c.is_text]
     cells = NumberCells(
         settings.decimal or "auto",
         settings.thousands or "none",
@@ -663,10 +649,10 @@ def _read(
         path=name,
         preset=source.preset,
         role=source.role or "both",
-        encoding=text.encoding,
+        encoding=encoding,
         layout=table.split_at if program else f"columns split at {mark}, {head}",
         decimal=cells.decimal,
-        columns=tuple((c.header, column(c.target.stem, c.unit), c.unit) for c in columns),
+        columns=tuple((c.header, column(c.stem, c.unit), c.unit) for c in columns),
         unused=tuple(n or f"column {i + 1}" for i, n in enumerate(table.header) if i not in used),
         rows=len(kept),
         ignored=tuple(sorted([*table.ignored, *ignored])),
@@ -674,7 +660,7 @@ def _read(
     line = np.array([number for number, _ in kept], dtype=np.int64)
     numbers, of = dict[str, Array](), dict[str, str]()
     for c, own in zip(numeric, np.array(values).reshape(len(kept), -1).T, strict=True):
-        stem = c.target.stem
+        stem = c.stem
         spread = stem.startswith("sigma_") and source.coverage_factor
         of[stem] = table_unit(stem, c.unit)
         found = convert(own, c.unit, of[stem]) / (spread or 1.0)
@@ -691,15 +677,15 @@ def _read(
 
 
 def _rows(
-    name: str, table: Rows, columns: Sequence[FileColumn], cells: NumberCells
+    name: str, table: Rows, columns: Sequence[ColumnKey], cells: NumberCells
 ) -> tuple[list[tuple[int, list[str]]], list[list[float]], list[tuple[int, str]]]:
-    numeric = [c for c in columns if not c.target.is_text]
+    numeric = [c for c in columns if not c.is_text]
     widest = max(columns, key=lambda c: max(c.index))
     kept, values, ignored = [], [], []
     for number, row in table.rows:
         if max(widest.index) >= len(row):
             raise InputError(
-                f"{name}, line {number}: {len(row)} columns, but {widest.target.key} "
+                f"{name}, line {number}: {len(row)} columns, but {widest.key} "
                 f"is column {max(widest.index) + 1} ({widest.header}); correct the line, "
                 "or pass over such lines with ignore in [source.text]"
             )
@@ -720,17 +706,17 @@ def _rows(
     return kept, values, ignored
 
 
-def _texts(rows: Sequence[list[str]], columns: Sequence[FileColumn]) -> dict[str, list[str]]:
+def _texts(rows: Sequence[list[str]], columns: Sequence[ColumnKey]) -> dict[str, list[str]]:
     """The texts by column; a load that is a bare size gets the unit in its header."""
-    loads = (re.search(UNIT_OF_LOAD, c.header) for c in columns if c.target.stem == "load")
+    loads = (re.search(UNIT_OF_LOAD, c.header) for c in columns if c.stem == "load")
     unit = next((found[1] for found in loads if found), "")
     texts = {}
-    for c in (c for c in columns if c.target.is_text):
-        glue = " " if c.target.stem == "time_text" else "::"
+    for c in (c for c in columns if c.is_text):
+        glue = " " if c.stem == "time_text" else "::"
         found = [glue.join(row[i].strip() for i in c.index) for row in rows]
-        if c.target.stem == "load":
+        if c.stem == "load":
             found = [f"{t} {unit}".strip() if re.fullmatch(r"[\d.,]+", t) else t for t in found]
-        texts[c.target.stem] = found
+        texts[c.stem] = found
     return texts
 
 
@@ -768,9 +754,11 @@ def likely_presets(path: Path) -> list[str]:
     return [name for name, n in rows.items() if n == max(rows.values())]
 
 
-def _table(text: ForeignText, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
+def _table(
+    source: str, lines: list[str], settings: TextSourceKeys, asked: Sequence[ColumnKey]
+) -> Rows:
     if settings.format in ("krl", "rapid"):
-        return program_rows(text, settings.format)
+        return program_rows(source, lines, settings.format)
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
     named = mapping_file.by_name(asked)
     places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
@@ -781,7 +769,7 @@ def _table(text: ForeignText, settings: TextSourceKeys, asked: Sequence[ColumnKe
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    table = table_rows(text, settings, is_header if named else None, is_data)
+    table = table_rows(source, lines, settings, is_header if named else None, is_data)
     if named and not table.header_line:
-        raise mapping_file.no_header(text.source, asked, table.rows[:SAMPLE])
+        raise mapping_file.no_header(source, asked, table.rows[:SAMPLE])
     return table

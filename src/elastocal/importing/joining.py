@@ -98,14 +98,13 @@ NAMED = "write pattern in [source.names]"
 
 
 def with_labels(where: str, records: Records, names: NamesTable | None) -> Records:
-    """The records with `labels` from their columns, and from their names where a pattern is given.
+    """The records with the texts of GROUPS, from columns and, where a pattern is given, from names.
 
     A group that a column gives too is taken from the column.  A name that no pattern matches is
     an error, or with unmatched = "ignore" passed over and listed.
     """
     names = names or NamesTable()
-    labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
-    named = records.texts.get("name")
+    named, found = records.texts.get("name"), dict[str, list[str]]()
     if names.pattern is not None and named is not None:
         found, bad = _labels_of_names(where, records, names, named)
         if bad:
@@ -117,8 +116,8 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
             ignored = tuple(sorted([*before.ignored, *reasons]))
             understood = replace(before, rows=len(keep), ignored=ignored)
             records = replace(records.take(keep), understood=understood)
-            labels, found = taken(labels, keep), taken(found, keep)
-        labels = found | labels
+            found = taken(found, keep)
+    labels = found | {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
     if names.markers and "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
     if names.in_order and "marker" not in labels:
@@ -137,7 +136,7 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
                     f"{records.where(i)}: {stem} {quoted(text)} cannot stand in a table; correct "
                     f"the name, or {NAMED}"
                 )
-    return replace(records, labels=labels)
+    return replace(records, texts=records.texts | labels)
 
 
 def _labels_of_names(
@@ -291,24 +290,17 @@ def _check_lengths(where: str, joints: JointsTable, n: int) -> None:
 
 
 def pooled(records: Sequence[Records]) -> Records:
-    first = records[0]
-    for other in records[1:]:
+    if any(r.load is not None for r in records):
+        records = [replace(r, texts=r.texts | {"load": _loads(r)}) for r in records]
+    first, *others = records
+    for other in others:
         _same("columns", first, other, set(first.numbers), set(other.numbers))
-        loads = {"load"} if first.load is not None or other.load is not None else set()
-        _same("labels", first, other, set(first.labels) - loads, set(other.labels) - loads)
-    loaded = any(r.load is not None or "load" in r.labels for r in records)
-    return Records.stacked([
-        replace(
-            r,
-            labels={s: texts for s, texts in r.labels.items() if s != "load"}
-            | ({"load": _loads(r)} if loaded else {}),
-        )
-        for r in records
-    ])  # fmt: skip
+        _same("labels", first, other, *({*GROUPS} & {*r.texts} for r in (first, other)))
+    return Records.stacked(records)
 
 
 def _loads(records: Records) -> list[str]:
-    named = records.labels.get("load")
+    named = records.texts.get("load")
     require(
         named is not None or records.load is not None,
         f"{records.source}: says no load, other files do; give load in its [[source]], or a "
@@ -467,13 +459,13 @@ _ADVICE = {
 
 def _obvious(points: Records, log: Records) -> str:
     """By name where names agree, by time where both have one, else by order."""
-    if "configuration" in points.labels and _keys(points.labels["configuration"], _names_of(log)):
+    if "configuration" in points.texts and _keys(points.texts["configuration"], _names_of(log)):
         return "name"
     return "time" if points.time is not None and log.time is not None else "order"
 
 
 def _names_of(log: Records) -> list[str]:
-    return log.labels.get("configuration") or (log.names if any(log.names) else [])
+    return log.texts.get("configuration") or (log.names if any(log.names) else [])
 
 
 def _key(name: str) -> str:
@@ -500,12 +492,12 @@ def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
 
 
 def _loads_apart(points: Records, log: Records) -> list[tuple[str, IntArray, IntArray]]:
-    if "load" not in points.labels:
+    if "load" not in points.texts:
         return [("", np.arange(len(points)), np.arange(len(log)))]
-    loads = np.array(points.labels["load"], dtype=object)
-    own = log.labels.get("load")
+    loads = np.array(points.texts["load"], dtype=object)
+    own = log.texts.get("load")
     parts = []
-    for load in dict.fromkeys(points.labels["load"]):
+    for load in dict.fromkeys(points.texts["load"]):
         rows = np.arange(len(log)) if own is None else np.flatnonzero(np.array(own, object) == load)
         parts.append((load, np.flatnonzero(loads == load), rows))
     return parts
@@ -516,10 +508,10 @@ def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray
     n = len(chosen)
     if per_pose is not None:
         return np.arange(n) // per_pose
-    if "configuration" in points.labels:
-        names = [points.labels["configuration"][i] for i in chosen]
+    if "configuration" in points.texts:
+        names = [points.texts["configuration"][i] for i in chosen]
         return np.cumsum([k > 0 and names[k] != names[k - 1] for k in range(n)])
-    markers = [points.labels["marker"][i] for i in chosen] if "marker" in points.labels else []
+    markers = [points.texts["marker"][i] for i in chosen] if "marker" in points.texts else []
     if len(set(markers)) < 2:
         return np.arange(n)
     visit, measured, codes = 0, set[str](), []
@@ -560,14 +552,14 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
 
 def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     names = _names_of(log)
-    for pool, has in ((log, bool(names)), (points, "configuration" in points.labels)):
+    for pool, has in ((log, bool(names)), (points, "configuration" in points.texts)):
         if not has:
             raise InputError(
                 f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
                 "configuration in [source.columns], and a pattern in [source.names]"
             )
     q, row = log.q, np.full(len(points), -1)
-    key = _keys(points.labels["configuration"], names) or _key
+    key = _keys(points.texts["configuration"], names) or _key
     unused: set[int] = set(range(len(log)))
     for _, chosen, rows in _loads_apart(points, log):
         known: dict[str, int] = {}
@@ -579,12 +571,12 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
                     f"{log.line[first]}; name visits apart, or say which load each belongs to"
                 )
         for i in chosen:
-            row[i] = known.get(key(points.labels["configuration"][i]), -1)
+            row[i] = known.get(key(points.texts["configuration"][i]), -1)
         used = {key(names[r]) for r in row[chosen] if r >= 0}
         unused -= {int(r) for r in rows if key(names[r]) in used}
     left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))
     spare = tuple(dict.fromkeys(log.shown(r) for r in sorted(unused)))
-    pairs = [(points.labels["configuration"][i], names[row[i]]) for i in range(len(row))]
+    pairs = [(points.texts["configuration"][i], names[row[i]]) for i in range(len(row))]
     told = next((f"{a} is {b}" for (a, b), r in zip(pairs, row, strict=True) if r >= 0), "")
     remarks = (f"by the numbers at the ends of the names ({told})",) if key is _number else ()
     return Joined("name", row, q[row], None, left_out, spare, remarks)

@@ -271,7 +271,9 @@ _QUANTITIES = _quantities()
 class ColumnKey:
     """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto").
 
-    `at`: where it stands in the file; `required`: it is of [source.columns], not [source.optional].
+    `at`: where the mapping has it; `required`: it is of [source.columns], not [source.optional].
+    Found in a file, it has its `index` among the cells of a row (several are joined, for texts),
+    the file's own name and its unit there.
     """
 
     key: str
@@ -280,6 +282,8 @@ class ColumnKey:
     is_text: bool = False
     at: Where = ""
     required: bool = True
+    index: tuple[int, ...] = ()
+    header: str = ""
 
     @property
     def parts(self) -> list[str | int]:
@@ -346,16 +350,6 @@ def column_key(where: str, key: str) -> ColumnKey:
 MOST_JOINTS = 64
 USUAL = {"length": "mm", "angle": "deg"}  # the quantities whose unit an option states
 EACH = "*"  # in a place of [source.columns]: the name of a marker
-
-
-@dataclass(frozen=True)
-class FileColumn:
-    """`index` into the cells of a row (several are joined, for texts), the file's own name."""
-
-    target: ColumnKey
-    index: tuple[int, ...]
-    header: str
-    unit: str
 
 
 def wanted(
@@ -473,14 +467,14 @@ def no_header(
 def resolve(
     source: str, asked: Sequence[ColumnKey], header: Sequence[str], width: int,
     units: UnitsTable, hint: str | None,
-) -> tuple[FileColumn, ...]:  # fmt: skip
+) -> tuple[ColumnKey, ...]:  # fmt: skip
     """Where each column stands, and in which unit.
 
     `header`: names of the columns, () without a header; `width`: cells of the first row;
     `units`: for columns whose key ends in _auto where neither the header nor `hint`, the unit
     that a comment of the file states, says one.
     """
-    columns: list[FileColumn] = []
+    columns: list[ColumnKey] = []
     for target in asked:
         joints = (target.numbered(i) for i in range(1, MOST_JOINTS + 1))
         for one in joints if target.is_template else (target,):
@@ -493,12 +487,12 @@ def resolve(
     return tuple(columns)
 
 
-def _no_unit(source: str, columns: Sequence[FileColumn]) -> InputError:
-    usual = {c: USUAL.get(q := c.target.default) or next(iter(FACTORS[q])) for c in columns}
-    keys = {c: f"{c.target.stem}_{unit}" for c, unit in usual.items()}
-    options = [option(f"{c.target.default}_unit", usual[c]) for c in columns
-               if c.target.default in USUAL]  # fmt: skip
-    by_key = [key for c, key in keys.items() if c.target.default not in USUAL]
+def _no_unit(source: str, columns: Sequence[ColumnKey]) -> InputError:
+    usual = {c: USUAL.get(q := c.default) or next(iter(FACTORS[q])) for c in columns}
+    keys = {c: f"{c.stem}_{unit}" for c, unit in usual.items()}
+    options = [option(f"{c.default}_unit", usual[c]) for c in columns
+               if c.default in USUAL]  # fmt: skip
+    by_key = [key for c, key in keys.items() if c.default not in USUAL]
     needed = list(dict.fromkeys(options))
     if by_key:
         needed.append(f"{listed(by_key)} in [source.columns]")
@@ -510,7 +504,7 @@ def _no_unit(source: str, columns: Sequence[FileColumn]) -> InputError:
     )
 
 
-def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> FileColumn | None:
+def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> ColumnKey | None:
     index, names = [], []
     for part in target.parts:
         if isinstance(part, int):
@@ -540,7 +534,7 @@ def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -
             )
         index.append(hits[0])
         names.append(header[hits[0]])
-    return FileColumn(target, tuple(index), " + ".join(names), target.unit)
+    return replace(target, index=tuple(index), header=" + ".join(names))
 
 
 def _named(part: str, target: ColumnKey) -> list[str]:
@@ -565,23 +559,22 @@ def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
     return []
 
 
-def _with_unit(source: str, column: FileColumn, units: UnitsTable, hint: str | None) -> FileColumn:
+def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | None) -> ColumnKey:
     """The column with its unit found out (AUTO where nothing says it), or compared with what the
     file says."""
-    target = column.target
     if target.is_text or target.unit == "":
-        return column
-    stated = split_unit(column.header)[1]
+        return target
+    stated = split_unit(target.header)[1]
     if stated is not None and not set(quantities(stated)) & set(target.quantities):
         stated = None  # "Roll m" of a header is no unit of an angle
     if target.unit != AUTO:
         if stated is not None and stated != target.unit:
             raise InputError(
-                f"{source}: column {quoted(column.header)} says {stated}, but the mapping has "
+                f"{source}: column {quoted(target.header)} says {stated}, but the mapping has "
                 f"{target.key}; write {target.stem}_{stated}, or correct the header"
             )
-        return column
+        return target
     told = known_unit(hint) if hint else None
     general = {"length": units.length, "angle": units.angle}.get(target.default)
     fitting = told if told and set(quantities(told)) & set(target.quantities) else None
-    return replace(column, unit=stated or fitting or general or AUTO)
+    return replace(target, unit=stated or fitting or general or AUTO)

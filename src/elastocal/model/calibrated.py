@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import ConfigDict, PlainValidator
 from pydantic_core import PydanticCustomError
 
-from elastocal.above import Saved
-from elastocal.arguments import checked_arguments
+from elastocal.above import Saved, checked_arguments
 from elastocal.cell.work_cell import Cell
 from elastocal.config import Table, checked, is_number, key, required
 from elastocal.errors import InputError, option, require

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.above import ByValue, DataFrame
-from elastocal.arguments import checked_arguments
+from elastocal.above import ByValue, DataFrame, checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
