@@ -21,9 +21,9 @@ from elastocal.planning.candidates import draw, shares_of
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import plan_forces, rows_of
+from elastocal.planning.information import Known, plan_forces, rows_of
 from elastocal.planning.plan import Plan
-from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
+from elastocal.planning.setup import FeasiblePool, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses, test_poses
 from elastocal.simulation import simulate, values_from
 

@@ -93,12 +93,12 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
 
     `command` is the command line that repeats the design.  Raises InputError as `beside` does.
     """
-    from elastocal.planning.plan import write_plan, write_plan_json
+    from elastocal.planning.plan import SCHEMA, write_plan
 
     summary = beside(path)
     write_plan(path, *plan.rows, forces=plan.stated_forces is not None)
     repeat = {"command": command, "backend": plan.model.backend_report()}
-    write_plan_json(summary, plan.to_json() | repeat)
+    write_json(summary, {"schema": SCHEMA, **plan.to_json(), **repeat})
 
 
 def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:

@@ -15,9 +15,8 @@ from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
-from elastocal.planning.information import PoseInformation, measured, next_number
+from elastocal.planning.information import Known, PoseInformation, measured, next_number
 from elastocal.planning.plan import predicted
-from elastocal.planning.setup import Known
 from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()

@@ -59,6 +59,7 @@ def cell(workspace: Workspace | None = None, model: Any = None, **design: Any) -
 def test_what_does_not_fit_is_told_with_key_found_and_remedy(bad: Cell, told: list[str]) -> None:
     with pytest.raises(InputError) as caught:
         check_cell(bad, kr270_chain())
+        target_poses.test_poses(bad, kr270_chain())
     assert not [part for part in told if part not in str(caught.value)], str(caught.value)
 
 
@@ -89,6 +90,7 @@ def test_degrees_do_not_fit_a_prismatic_joint(bad: Cell, told: str) -> None:
     chain = replace(chain, joints=(*chain.joints[:2], slide, *chain.joints[3:]))
     with pytest.raises(InputError, match=rf"joint3 \(q3\) is prismatic|{told}") as caught:
         check_cell(bad, chain)
+        target_poses.test_poses(bad, chain)
     assert "prismatic" in str(caught.value)
 
 

@@ -19,8 +19,8 @@ from elastocal.model.manipulator import Model
 from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.choices import Choice
+from elastocal.planning.information import Known
 from elastocal.planning.plan import Chosen
-from elastocal.planning.setup import Known
 
 CHAIN = kr270_chain()
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)

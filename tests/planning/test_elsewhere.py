@@ -12,9 +12,10 @@ from support.design_cells import plan_cell
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.information import Known
 from elastocal.planning.plan import Everywhere
 from elastocal.planning.relaxation import balanced, exact_plan, relax
-from elastocal.planning.setup import Known, Setup, set_up, share_within
+from elastocal.planning.setup import Setup, set_up, share_within
 from elastocal.planning.test_poses import ELSEWHERE, everywhere
 
 CHAIN = kr270_chain()

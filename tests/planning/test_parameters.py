@@ -16,8 +16,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.model.manipulator import Model
 from elastocal.planning import information as parameters
-from elastocal.planning.information import PoseInformation
-from elastocal.planning.setup import Known
+from elastocal.planning.information import Known, PoseInformation
 from elastocal.simulation import simulate
 
 CHAIN = kr270_chain()

@@ -32,7 +32,7 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.model.urdf import read_urdf
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.setup import Known
+from elastocal.planning.information import Known
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.simulation import expand_plan, simulate
 

@@ -17,8 +17,8 @@ from elastocal.model.manipulator import Model
 from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.choices import Choice, _minutes, _sizes, at_stops
+from elastocal.planning.information import Known
 from elastocal.planning.plan import TimedSize
-from elastocal.planning.setup import Known
 
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
 MOTION = Motion(speed=np.ones(6), dwell=10.0, reading=2.0, load_change=120.0, extra_time=0.0)

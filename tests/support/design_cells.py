@@ -19,7 +19,8 @@ from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.setup import Known, Setup, set_up
+from elastocal.planning.information import Known
+from elastocal.planning.setup import Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array
 

@@ -28,7 +28,7 @@ from elastocal.planning.candidates import Candidates, draw, shares_of
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import at_stops, nearest_first
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import PoseInformation, plan_forces
+from elastocal.planning.information import Known, PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Plan, TimedSize
 from elastocal.planning.relaxation import (
@@ -39,7 +39,7 @@ from elastocal.planning.relaxation import (
     prospects,
     relax,
 )
-from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
+from elastocal.planning.setup import FeasiblePool, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -113,8 +113,8 @@ class RelaxedPoint:
 
 @dataclass(frozen=True)
 class Choice:
-    """The search for places and loads; `work` is the model of the cell as it stands, whose test
-    poses `targets` (and `region`) are what every choice is judged by."""
+    """`work` is the model of the cell as it stands, whose test poses `targets` (and `region`) are
+    what every choice is judged by."""
 
     work: Model
     targets: TargetPoses
@@ -124,7 +124,6 @@ class Choice:
     progress: Progress
 
     def best(self) -> Chosen:
-        """The best places and loads found."""
         cell = self.work.cell
         where, freedom = cell.path or cell.name, cell.design.choose
         assert freedom is not None
@@ -175,12 +174,8 @@ class Choice:
             f"{cell.path or cell.name}: {len(sets)} choices of {most} of {len(heavy)} loads; state "
             f"fewer loads, up to {MOST_CHOICES} choices of them",
         )
-        points = []
-        for k, kept in enumerate(sets):
-            self.progress(f"choosing loads, {k + 1} of {len(sets)}")
-            hung = [i for i in range(len(given)) if i in kept or i not in heavy]
-            points.append(self.relaxed(_with_loads(cell, given[hung])))
-        return _least(points)
+        hung = ([i for i in range(len(given)) if i in k or i not in heavy] for k in sets)
+        return self._least("loads,", [_with_loads(cell, given[some]) for some in hung])
 
     def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
         from scipy.stats import qmc  # slow to import, and identify needs this module
@@ -188,13 +183,10 @@ class Choice:
         cell = self.work.cell if begun is None else begun.cell
         draws = qmc.Sobol(3 * len(boxes.names), rng=np.random.default_rng(self.seed))
         starts = [boxes.unit(boxes.places(cell)), *draws.random(STARTS)]
-        points = []
-        for k, unit in enumerate(starts):
-            self.progress(f"choosing places, start {k + 1} of {len(starts)}")
-            points.append(self.relaxed(boxes.placed(cell, boxes.at(unit))))
-        best = _least(points)
-        for k in range(ROUNDS if best is not None else 0):
-            assert best is not None
+        best = self._least("places, start", [boxes.placed(cell, boxes.at(s)) for s in starts])
+        for k in range(ROUNDS):
+            if best is None:
+                break
             unit, there = boxes.unit(boxes.places(best.cell)), self._moved(boxes, best)
             self.progress(f"choosing places, round {k + 1}")
             # All the way, or a part of it where the rules leave too little there.
@@ -207,6 +199,14 @@ class Choice:
             if gain < GAIN:
                 break
         return best
+
+    def _least(self, what: str, cells: list[Cell]) -> RelaxedPoint | None:
+        points = []
+        for k, cell in enumerate(cells):
+            self.progress(f"choosing {what} {k + 1} of {len(cells)}")
+            points.append(self.relaxed(cell))
+        found = (point for point in points if point is not None)
+        return min(found, key=lambda point: point.value, default=None)
 
     def _moved(self, boxes: Boxes, point: RelaxedPoint) -> Array:
         """The point (3 k,) of the unit cube that lowers Φ most at the weights of `point`."""
@@ -287,11 +287,6 @@ def applied(chosen: Chosen, cell: Cell) -> Cell:
 
 def _with_loads(cell: Cell, loads: Array) -> Cell:
     return replace(cell, design=replace(cell.design, loads=loads))
-
-
-def _least(points: list[RelaxedPoint | None]) -> RelaxedPoint | None:
-    found = [point for point in points if point is not None]
-    return min(found, key=lambda point: point.value, default=None)
 
 
 REPEATS = (1, 2, 3, 4, 6, 8, 12, 16, 24)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from itertools import count
 from typing import Literal, get_args
 
@@ -35,6 +35,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import (
     IDENTIFIED,
     Done,
+    Known,
     measured,
     next_number,
     plan_forces,
@@ -63,7 +64,6 @@ from elastocal.planning.search import EFFORTS, POOL, Search, Selection, ordered
 from elastocal.planning.setup import (
     OPEN,
     FeasiblePool,
-    Known,
     Setup,
     promised,
     set_up,
@@ -91,8 +91,8 @@ class DesignOptions:
     fixed: tuple[str, ...] = ()
     prior: GaussianPrior | None = None
     done: Measurements | None = None
-    curve: tuple[int, ...] = field(default=())
-    notes: tuple[str, ...] = field(default=())
+    curve: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
     pins: Pins | None = None
 
     def __post_init__(self) -> None:
@@ -165,11 +165,10 @@ class _Design:
             )
         if cell.design.candidates is None and cell.design.taught is None:
             cell = replace(cell, design=replace(cell.design, candidates=POOL))
-        self.checkpoint, self.progress = checkpoint, progress
+        self.checkpoint, self.progress, self.options = checkpoint, progress, options
         self.model = Model(cell, options.done.marker_names if options.done else ())
-        if self.model.shrunk.any():
-            self.model, options = self._without_functions(options)
-        self.model, self.options = self._without_conditions(options)
+        self.conditions: tuple[Model, tuple[str, ...]] | None = None
+        self._leave_out()
         # What the cell as it stands says of test poses and of measurements holds for others too.
         self.work: Model = self.model if first is None else first.work
         self.done: Done | None = None if first is None else first.done
@@ -183,43 +182,49 @@ class _Design:
         self.feasibility = Feasibility(self.cell, self.chain, None if pins is None else pins.struck)
         _check_home(self.cell, self.feasibility)
 
-    def _without_functions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
-        whole = self.model
-        functions = dict.fromkeys(p.effect for p in whole.parameters if p.shrunk)
-        self.warnings.append(
-            f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made for "
-            "the other parameters; to show functions too, measure many poses all over the joints' "
-            "ranges"
-        )
-        return _without(whole, tuple(functions), options)
-
-    def _without_conditions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
-        """Without effects of what a pose has only once it stands in an order."""
-        whole, self.conditions = self.model, None
-        effects = dict.fromkeys(c.name for c in whole.cell.model.effects)
-        needs = {name: OPEN & set(effect_of(name).needed(whole.cell)) for name in effects}
-        unknown = tuple(name for name in effects if "temperature" in needs[name])
-        late = tuple(name for name in effects if needs[name] and name not in unknown)
-        if options.done is not None:
-            unknown, late = (*unknown, *late), ()
+    def _leave_out(self) -> None:
+        """Smooth functions, and effects of what a pose has only once it stands in an order."""
+        functions = tuple(dict.fromkeys(p.effect for p in self.model.parameters if p.shrunk))
+        if functions:
+            self._drop(
+                functions,
+                f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made "
+                "for the other parameters; to show functions too, measure many poses all over the "
+                "joints' ranges",
+            )
+        cell = self.model.cell
+        effects = dict.fromkeys(c.name for c in cell.model.effects)
+        needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
+        open_ = tuple(name for name in effects if needs[name])
+        done = self.options.done is not None
+        unknown = tuple(name for name in open_ if done or "temperature" in needs[name])
         if unknown:
-            self.warnings.append(
+            self._drop(
+                unknown,
                 f"the plan is made for the other parameters and holds {listed(unknown)} at "
                 "nominal: what drives them is not known before; record times and temperatures, and "
                 f"ask for reference poses ({option('reference_every', '10')}), so that "
-                "identification can tell them"
+                "identification can tell them",
             )
-            whole, options = _without(whole, unknown, options)
-        if not late:
-            return whole, options
-        self.warnings.append(
-            f"poses are chosen for the other parameters, as time and order alone show "
-            f"{listed(late)}; the intervals count them, at the times and from the sides of "
-            "plan.csv: keep its order, and record times"
-        )
-        rest, fewer = _without(whole, late, options)
-        self.conditions = whole, options.fixed
-        return rest, fewer
+        late = tuple(name for name in open_ if name not in unknown)
+        if late:
+            self.conditions = self.model, self.options.fixed
+            self._drop(
+                late,
+                f"poses are chosen for the other parameters, as time and order alone show "
+                f"{listed(late)}; the intervals count them, at the times and from the sides of "
+                "plan.csv: keep its order, and record times",
+            )
+
+    def _drop(self, effects: tuple[str, ...], told: str) -> None:
+        self.warnings.append(told)
+        model = self.model
+        gone = {k for k, p in enumerate(model.parameters) if p.effect in effects}
+        meant = {name: set(model.meant_by(name)) for name in self.options.fixed}
+        fixed = tuple(name for name, of in meant.items() if not of or not of <= gone)
+        self.options = replace(self.options, fixed=fixed)
+        rest = tuple(c for c in model.cell.model.effects if c.name not in effects)
+        self.model = model.with_effects(rest)
 
     def run(self) -> Plan:
         plan = self._chosen()
@@ -249,9 +254,7 @@ class _Design:
             region, self.feasibility.seen if self.feasibility.partial else None, self.work,
         )  # fmt: skip
         self.warnings += setup.warnings
-        pinned = None
-        if pins is not None and len(pins.q):
-            pinned = setup.pool(pins.q, pinned_at)
+        pinned = setup.pool(pins.q, pinned_at) if pins is not None and len(pins.q) else None
         self.states: LoadStates | None = None
         if self.cell.design.load_states == "chosen":
             asked = setup.having(pinned)
@@ -343,14 +346,9 @@ class _Design:
         if len(lots) > 1:
             lots[1].removed_by[NO_LEVEL] = 0
         drawn = Candidates.join(lots)
-        counts = CandidateCounts(drawn.tried, drawn.feasible, drawn.removed_by)
-        return {
-            "q": drawn.q,
-            "group": drawn.group,
-            "names": np.array(names, dtype=np.str_),
-            "told": told,
-            "counts": json.dumps(asdict(counts)),
-        }
+        counts = asdict(CandidateCounts(drawn.tried, drawn.feasible, drawn.removed_by))
+        found = {"q": drawn.q, "group": drawn.group, "names": np.array(names, dtype=np.str_)}
+        return found | {"told": told, "counts": json.dumps(counts)}
 
     def _curve(self, setup: Setup, pool: FeasiblePool) -> tuple[PlanSize, ...]:
         if not self.options.curve:
@@ -516,16 +514,6 @@ class _Design:
             names.append(name)
             of_pose[q[i].tobytes()] = name, read[i] if same is None else before | read[i]
         return tuple(names)
-
-
-def _without(
-    model: Model, effects: tuple[str, ...], options: DesignOptions
-) -> tuple[Model, DesignOptions]:
-    rest = tuple(c for c in model.cell.model.effects if c.name not in effects)
-    gone = {k for k, p in enumerate(model.parameters) if p.effect in effects}
-    meant = {name: set(model.meant_by(name)) for name in options.fixed}
-    fixed = tuple(name for name, of in meant.items() if not of or not of <= gone)
-    return model.with_effects(rest), replace(options, fixed=fixed)
 
 
 def _check_home(cell: Cell, feasibility: Feasibility) -> None:

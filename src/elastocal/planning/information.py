@@ -13,6 +13,7 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
+from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
     JOINTS,
@@ -267,6 +268,26 @@ SAMPLE = 2000  # poses that show what is visible: more would not change a rank
 
 
 @dataclass(frozen=True)
+class Done:
+    """Measurements done: `x` (parameters,) the arm as identified so far, `information` (parameters,
+    parameters) in the parameters' units, `numbers` observed, `note` on where x comes from."""
+
+    x: Array
+    information: Array
+    numbers: int
+    note: str
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known before a plan: held parameters, a stated prior, measurements done."""
+
+    fixed: tuple[str, ...] = ()
+    prior: GaussianPrior | None = None
+    done: Done | None = None
+
+
+@dataclass(frozen=True)
 class Estimable:
     """`reduction` over all parameters (kept, dropped, mixing), `sizes` (parameters,) and
     `structure`: the reduction that any number of poses would come to.  What N poses show only below
@@ -281,40 +302,41 @@ class Estimable:
         return self.reduction.kept
 
 
-def minimal_set(
-    model: Model,
-    B: Array,
-    free: IntArray,
-    sizes: Array,
-    prior: Array,
-    stated: BoolArray,
-) -> Estimable:
+def estimable(
+    model: Model, known: Known, free: IntArray, B: Array, sizes: Array
+) -> tuple[Estimable, Array]:
     """A minimal complete set of the `free` parameters, as identification chooses it, from readings
-    with B (rows, parameters), whitened and scaled by `sizes` as the `prior` (parameters,
-    parameters) is; parameters with a `stated` prior (parameters,) are kept whatever the readings
-    show."""
-    B, known = B[:, free], prior[np.ix_(free, free)]
-    if known.any():
-        values, vectors = linalg.eigh(known)
-        B = np.vstack([B, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T])
-    B = np.vstack([B, SURE * np.eye(len(free))[stated[free]]])
-    structure, reduction = (
-        _reduced(model, B, free, sizes, threshold) for threshold in (0.0, WORTH_A_COLUMN)
-    )
-    if not len(reduction.kept):
+    with B (rows, parameters), whitened and scaled by `sizes`, and the information on it that is
+    known before (kept, kept), scaled.  What has a stated prior is kept whatever readings show."""
+    asked = model.cell.design.prior == "typical"
+    stated = np.array([asked and p.typical is not None for p in model.parameters], dtype=bool)
+    prior = np.diag(stated.astype(float))
+    if known.prior is not None:
+        P = known.prior.rows(model.names)[0] * sizes
+        prior += P.T @ P
+        stated |= np.isin(model.names, known.prior.names)
+    if known.done is not None:
+        prior += known.done.information * np.outer(sizes, sizes)
+    rows, before = [B[:, free]], prior[np.ix_(free, free)]
+    if before.any():
+        values, vectors = linalg.eigh(before)
+        rows.append(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T)
+    every = np.vstack([*rows, SURE * np.eye(len(free))[stated[free]]])
+    parameters = tuple(model.parameters[c] for c in free)
+
+    def reduced(threshold: float) -> Reduction:
+        local = reduce(every, np.ones(len(free)), parameters, sigma=1.0, threshold=threshold)
+        kept, dropped = free[local.kept], free[local.dropped]
+        mixing = local.mixing * sizes[kept][:, None] / sizes[dropped][None, :]
+        return Reduction(kept, dropped, mixing, free[local.invisible])
+
+    found = Estimable(reduced(WORTH_A_COLUMN), sizes, reduced(0.0))
+    if not len(found.columns):
         raise InsufficientDataError(
             f"{model.cell.path or model.cell.name}: no feasible pose shows any parameter of the "
             "model; state the load that will hang ([design] loads_N), or choose other effects"
         )
-    return Estimable(reduction, sizes, structure)
-
-
-def _reduced(model: Model, B: Array, free: IntArray, sizes: Array, threshold: float) -> Reduction:
-    parameters = tuple(model.parameters[c] for c in free)
-    local = reduce(B, np.ones(len(free)), parameters, sigma=1.0, threshold=threshold)
-    kept, dropped = free[local.kept], free[local.dropped]
-    mixing = local.mixing * sizes[kept][:, None] / sizes[dropped][None, :]
-    return Reduction(kept, dropped, mixing, free[local.invisible])
+    return found, prior[np.ix_(found.columns, found.columns)]
 
 
 def interest_of(model: Model, found: Estimable) -> IntArray:
@@ -382,18 +404,6 @@ def evenly(group: IntArray, each: int) -> IntArray:
 
 # Measurements already done: what they tell, so that a plan adds what they lack.
 
-
-@dataclass(frozen=True)
-class Done:
-    """`x` (parameters,) the arm as identified so far, `information` (parameters, parameters) in
-    the parameters' units, `numbers` observed, `note` on where x comes from."""
-
-    x: Array
-    information: Array
-    numbers: int
-    note: str
-
-
 IDENTIFIED = "the arm as identified from the measurements done"
 
 
@@ -407,10 +417,15 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
         note = IDENTIFIED
     except InsufficientDataError as error:
         x, note = model.nominal, f"the nominal arm, as the measurements do not suffice ({error})"
-    observed = observe(table, model.observe)
-    weights = observed_weights(model, observed, x)
-    B = weights.apply(model.regressor(table, x, None, observed).B)
+    B, _ = whitened(model, table, x)
     return Done(x, B.T @ B, len(B), note)
+
+
+def whitened(model: Model, table: Measurements, x: Array) -> tuple[Array, Array]:
+    """B (rows, parameters) of the readings by their stated noise, and as it is."""
+    observed = observe(table, model.observe)
+    B = model.regressor(table, x, None, observed).B
+    return observed_weights(model, observed, x).apply(B), B
 
 
 def next_number(labels: Iterable[str]) -> int:

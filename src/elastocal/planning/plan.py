@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,12 +14,12 @@ from elastocal.above import Result
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
+from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
-from elastocal.planning.information import Estimable
+from elastocal.planning.information import Estimable, readings_at
 from elastocal.tables import column, csv_text
-from elastocal.text import json_text
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.
@@ -102,15 +102,10 @@ UNITS = {"revolute": "deg", "prismatic": "mm"}
 
 
 def plan_table(
-    execution: Execution,
-    configurations: Sequence[str],
-    level: IntArray,
-    kinds: Sequence[str],
-    forces: Array | None = None,
-    seen: Mapping[str, BoolArray] | None = None,
-    carried: Array | None = None,
-    counts: IntArray | None = None,
-) -> tuple[Measurements, dict[str, list[str]]]:
+    execution: Execution, configurations: Sequence[str], level: IntArray, kinds: Sequence[str],
+    forces: Array | None = None, seen: Mapping[str, BoolArray] | None = None,
+    carried: Array | None = None, counts: IntArray | None = None,
+) -> tuple[Measurements, dict[str, list[str]]]:  # fmt: skip
     """An execution as the table that is read of its plan, sorted by pose, side of approach and load
     state, and its columns beside: level, order and notes.
 
@@ -121,79 +116,56 @@ def plan_table(
     and 7-.  With `seen`, which markers are read of each pose in each load state (N, L), there is a
     row for each; with `counts` (N, L) note_readings says how often each is read.
     """
-    rows = _visits(execution.stops, by_load=forces is not None)
-    sides = ("", "")
-    if any(stop.side for stop in execution.stops) or execution.motion.both_directions:
-        sides = ("+", "-")
-    marker = None
+    visits: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
+    for place, stop in enumerate(execution.stops, start=1):
+        load = -1 if forces is None else stop.load
+        key = (stop.again > 0, stop.pose, stop.again, stop.side, load)
+        visits.setdefault(key, []).append((place, stop))
+    rows = [visits[key] for key in sorted(visits)]
+    marker = np.zeros(len(rows), dtype=np.int64)
     if seen is not None:
-        read = np.array(
-            [[each[stop.pose, stop.load] for each in seen.values()] for (_, stop), *_ in rows]
-        )
-        of, marker = np.nonzero(read)
+        read = [[each[stop.pose, stop.load] for each in seen.values()] for (_, stop), *_ in rows]
+        of, marker = np.nonzero(np.array(read))
         rows = [rows[k] for k in of]
-    first = [row[0][1] for row in rows]
+    first, n = [row[0][1] for row in rows], len(rows)
+    two = execution.motion.both_directions or any(stop.side for stop in execution.stops)
+    names = [stop.name(configurations) + ("+", "-")[stop.side] * two for stop in first]
+    labels = tuple(dict.fromkeys(names))
     approach = [stop.approach for stop in first if stop.approach is not None]
     times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
     time = np.array([sum(each) / len(each) for each in times if each])
-    names = [stop.name(configurations) + sides[stop.side] for stop in first]
-    labels, n = tuple(dict.fromkeys(names)), len(names)
     # As the digits of the file say it.
     q = [
         to_si(np.round(in_unit(values, kind), DIGITS), UNITS[kind])
         for values, kind in zip(np.array([stop.q for stop in first]).T, kinds, strict=True)
     ]
-    table = Measurements(
-        source="plan",
-        row=np.arange(2, n + 2),
-        q=np.column_stack(q),
+    force = np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]]
+    own = (DEFAULT_MARKER,) if seen is None else tuple(seen)
+    table = replace(
+        readings_at(np.column_stack(q), np.arange(n), force, marker, own),
         configuration=np.array([labels.index(name) for name in names]),
         configuration_labels=labels,
-        repeat=np.zeros(n, dtype=np.int64),
-        marker=np.zeros(n, dtype=np.int64) if marker is None else marker,
-        marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
-        force=np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]],
         approach=np.array(approach, dtype=float) if approach else None,
         time=np.round(time, 3) if len(time) else None,
         joint_kinds=tuple(kinds),
     )
+
+    def nth(told: Callable[[int, Stop], str], i: int) -> list[str]:
+        return [told(*row[i]) if i < len(row) else "" for row in rows]
+
+    most = range(max(map(len, rows)))
     beside = {"level": [str(level[stop.pose]) for stop in first]}
-    beside["order"] = [str(row[0][0]) for row in rows]
-    return table, beside | _notes(rows, forces is None, carried, counts)
-
-
-Visit = list[tuple[int, Stop]]  # stops in one row of the table, with their places in the order
-
-
-def _visits(stops: Sequence[Stop], by_load: bool) -> list[Visit]:
-    found: dict[tuple[int, ...], Visit] = {}
-    for k, stop in enumerate(stops, start=1):
-        key = (stop.again > 0, stop.pose, stop.again, stop.side, stop.load if by_load else -1)
-        found.setdefault(key, []).append((k, stop))
-    return [found[key] for key in sorted(found)]
-
-
-def _notes(
-    rows: list[Visit], loads: bool, carried: Array | None, counts: IntArray | None
-) -> dict[str, list[str]]:
-    most = range(max(len(row) for row in rows))
-    notes = {
-        f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
-        for i in most[1:]
-    }
-    names = [] if carried is None else [load_name(force) for force in carried]
-    if loads and carried is not None and carried.any():
-        notes |= {
-            "note_load" + (f"_{i + 1}" if i else ""): [
-                names[row[i][1].load] if i < len(row) else "" for row in rows
-            ]
-            for i in most
-        }
-    if counts is not None and names:
-        first = [row[0][1] for row in rows]
-        notes["note_load"] = [names[stop.load] for stop in first]
-        notes["note_readings"] = [str(counts[stop.pose, stop.load]) for stop in first]
-    return notes
+    for i in most:
+        beside[f"note_order_{i + 1}" if i else "order"] = nth(lambda k, _: str(k), i)
+    hung = [] if carried is None else [load_name(load) for load in carried]
+    if counts is not None and hung:
+        beside["note_load"] = nth(lambda _, stop: hung[stop.load], 0)
+        beside["note_readings"] = nth(lambda _, stop: str(counts[stop.pose, stop.load]), 0)
+    elif forces is None and carried is not None and carried.any():
+        for i in most:
+            name = "note_load" + (f"_{i + 1}" if i else "")
+            beside[name] = nth(lambda _, stop: hung[stop.load], i)
+    return table, beside
 
 
 def load_name(force: Array) -> str:
@@ -232,18 +204,11 @@ def in_unit(values: Array, kind: str) -> Array:
     return np.degrees(values) if kind == "revolute" else values * 1e3
 
 
-def write_plan_json(path: str | Path, summary: Mapping[str, Any]) -> None:
-    """Write plan.json of schema elastocal/plan/1, whole or not at all."""
-    atomic_write_text(path, json_text({"schema": SCHEMA, **summary}) + "\n")
-
-
 # The frozen result of a design: poses in order, what they promise, how far from the best.
 
 
 @dataclass(frozen=True)
 class CandidateCounts:
-    """How many poses were tried, how many the cell allows, and which rule removed the others."""
-
     tried: int
     feasible: int
     removed_by: dict[str, int]
@@ -323,11 +288,11 @@ class Everywhere:
         (n, p, p), and what a drift leaves of the plan's (p, p)."""
         if own is None or elsewhere is None:
             return None
-        chance = [float(np.median([remaining_rms(R, m) for m in random])) for R in (own, elsewhere)]
+        of = own, elsewhere
+        chance = [float(np.median([remaining_rms(R, m) for m in random])) for R in of]
         at, beyond = (value if np.isfinite(value) else None for value in chance)
-        errors = (remaining_rms(R, K) for K in (M, left) for R in (own, elsewhere))
-        still, still_beyond, drifting, drifting_beyond = errors
-        return cls(still, still_beyond, at, beyond, drifting, drifting_beyond, share, cap)
+        e = [remaining_rms(R, K) for K in (M, left) for R in of]
+        return cls(e[0], e[1], at, beyond, e[2], e[3], share, cap)
 
 
 def remaining_rms(R: Array, M: Array) -> float:
@@ -407,13 +372,6 @@ class Chosen:
     candidates: int
     share: tuple[float | None, float]
 
-    def to_json(self) -> dict[str, Any]:
-        return {
-            "cell": self.keys,
-            "relaxed": {"before": self.before, "after": self.after, "candidates": self.candidates},
-            "feasible": {"before": self.share[0], "after": self.share[1]},
-        }
-
     @property
     def keys(self) -> dict[str, dict[str, Any]]:
         at = {name: place[1].tolist() for name, place in self.places.items()}
@@ -441,17 +399,6 @@ class LoadStates:
     why: str
     crossed: float | None = None
     chosen: float | None = None
-
-    def to_json(self, forces: Array, readings: IntArray, unit: str) -> dict[str, Any]:
-        counts = np.count_nonzero(readings, axis=0).tolist()
-        stops = zip(forces.tolist(), counts, strict=True)
-        return {
-            "used": self.used,
-            "why": self.why,
-            "unit": unit,
-            "relaxed": {"all": self.crossed, "chosen": self.chosen},
-            "stops": [{"load_N": force, "poses": n} for force, n in stops],
-        }
 
 
 @dataclass(frozen=True)
@@ -568,9 +515,12 @@ class Plan(Result):
 
     @property
     def rows(self) -> tuple[Measurements, dict[str, list[str]]]:
+        names, seen = self.model.cell.tool.markers, self.seen
         return plan_table(
             self.execution, self.configurations, self.group + 1, self.model.chain.kinds,
-            self.stated_forces, self._read, self.forces, None if self.crossed else self.readings,
+            self.stated_forces,
+            None if seen is None else dict(zip(names, np.moveaxis(seen, 2, 0), strict=True)),
+            self.forces, None if self.crossed else self.readings,
         )  # fmt: skip
 
     @property
@@ -578,16 +528,14 @@ class Plan(Result):
         """Is every pose read in every load state?"""
         return bool((self.readings > 0).all())
 
+    @property
+    def read_in(self) -> IntArray:
+        """How many poses are read in each load state (L,)."""
+        return np.count_nonzero(self.readings, axis=0)
+
     def loads(self, k: int) -> str:
         """The load states in which pose k is read."""
         return ", ".join(load_name(force) for force in self.forces[self.readings[k] > 0])
-
-    @property
-    def _read(self) -> dict[str, BoolArray] | None:
-        """Which markers are read of each pose in each load state, where not all are."""
-        if self.seen is None:
-            return None
-        return dict(zip(self.model.cell.tool.markers, np.moveaxis(self.seen, 2, 0), strict=True))
 
     def markers(self, k: int) -> str:
         """The markers to be read of pose k, those in brackets under some of the loads only."""
@@ -605,12 +553,11 @@ class Plan(Result):
     @property
     def group_names(self) -> tuple[str, ...]:
         """The levels as people read them: "joint2 at -25.24°"."""
-        if self.level_joint is None:
+        if (joint := self.level_joint) is None:
             return ("poses",)
-        revolute = self.model.chain.kinds[int(self.level_joint.removeprefix("joint")) - 1]
-        if revolute == "revolute":
-            return tuple(f"{self.level_joint} at {np.degrees(v):.6g}°" for v in self.levels)
-        return tuple(f"{self.level_joint} at {v * 1e3:.6g} mm" for v in self.levels)
+        kind = self.model.chain.kinds[joint_index(joint)]
+        unit = "°" if kind == "revolute" else " mm"
+        return tuple(f"{joint} at {in_unit(np.array(v), kind):.6g}{unit}" for v in self.levels)
 
     @property
     def stated_forces(self) -> Array | None:
@@ -628,37 +575,37 @@ class Plan(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The plan as numbers and texts; the file adds its schema."""
-        c = self.certificate
+        bounds = asdict(self.certificate)
+        del bounds["bound_continuum"]
+        told = {"pool_is": "certified on the pool", "continuum_is": "estimated on the continuum"}
         return {
             "criterion": self.criterion,
             "value": self.reported,
             "unit": self.unit,
             "n_poses": len(self.q),
             "candidates": asdict(self.candidates),
-            "certificate": {
-                "efficiency_pool": c.efficiency_pool,
-                "bound_pool": self.bound_reported,
-                "efficiency_continuum": c.efficiency_continuum,
-                "pool": c.pool,
-                "pool_is": "certified on the pool",
-                "continuum_is": "estimated on the continuum",
-                "searched": c.searched,
-                "ascents": c.ascents,
-                "starts": list(c.starts),
-            },
+            "certificate": bounds | told | {"bound_pool": self.bound_reported},
             "random_plans": _numbers(self.chance),
             "everywhere": _numbers(self.everywhere),
             "gain": _numbers(self.gain),
-            "chosen": None if self.chosen is None else self.chosen.to_json(),
-            "load_states": (
-                None
-                if self.states is None
-                else self.states.to_json(self.forces, self.readings, self.unit)
-            ),
+            "chosen": (c := self.chosen) and {
+                "cell": c.keys,
+                "relaxed": {"before": c.before, "after": c.after, "candidates": c.candidates},
+                "feasible": {"before": c.share[0], "after": c.share[1]},
+            },
+            "load_states": (s := self.states) and {
+                "used": s.used,
+                "why": s.why,
+                "unit": self.unit,
+                "relaxed": {"all": s.crossed, "chosen": s.chosen},
+                "stops": [
+                    {"load_N": force, "poses": n}
+                    for force, n in zip(self.forces.tolist(), self.read_in.tolist(), strict=True)
+                ],
+            },
             "drift": _numbers(self.execution.drift),
             "predicted": [
-                {"name": p.name, "std": p.std, "unit": p.unit, "ci95_half_width": p.half_width,
-                 "combined_with": list(p.combined_with)}
+                {("ci95_half_width" if k == "half_width" else k): v for k, v in asdict(p).items()}
                 for p in self.predicted
             ],
             "poses": [

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import optimize
 
 from elastocal.errors import InsufficientDataError, option
-from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
 from elastocal.model.manipulator import Model
@@ -25,16 +23,16 @@ from elastocal.planning.criteria import (
 )
 from elastocal.planning.execution import Execution
 from elastocal.planning.information import (
-    Done,
     Estimable,
+    Known,
     PoseInformation,
     Sight,
+    estimable,
     evenly,
     interest_of,
     marker_sigmas,
-    minimal_set,
-    observed_weights,
     sample_of,
+    whitened,
     why,
 )
 from elastocal.planning.plan import Plan, Scheduled, predicted, remaining_rms
@@ -53,15 +51,6 @@ from elastocal.units import Array, BoolArray, IntArray, Progress
 # Everything a design knows before it chooses: parameters, criterion, information known before.
 
 WORTH_TELLING = 1e-7  # m
-
-
-@dataclass(frozen=True)
-class Known:
-    """What is known before a plan: held parameters, a stated prior, measurements done."""
-
-    fixed: tuple[str, ...] = ()
-    prior: GaussianPrior | None = None
-    done: Done | None = None
 
 
 @dataclass(frozen=True)
@@ -172,20 +161,17 @@ def set_up(
     """
     spec = model.cell.design
     x = model.nominal if known.done is None else known.done.x
-    every = np.arange(len(model.parameters))
+    free, every = fixed_and_free(model, known.fixed), np.arange(len(model.parameters))
     raw = PoseInformation(model, x, every, np.ones(len(every)), sight)
     some = q[sample_of(model, q)]
     table = raw.rows(some)
     sizes = model.sizes(model.regressor(table, x, None, observe(table, model.observe)).B)
-    prior, stated = known_before(model, known, sizes)
-    free = fixed_and_free(model, known.fixed)
     # Some poses, which weigh as much as those of the plan.
     B = raw.blocks(some).reshape(-1, len(sizes)) * sizes * np.sqrt(n_poses / len(some))
-    found = minimal_set(model, B, free, sizes, prior, stated)
+    found, prior = estimable(model, known, free, B, sizes)
     kept = found.columns
     information = replace(raw, columns=kept, sizes=sizes[kept])
-    # A sentence per free parameter that no feasible pose shows at all.
-    warnings = _unseen(model, found, [int(i) for i in found.structure.invisible if i in free])
+    warnings = _unseen(model, found, found.structure.invisible.tolist())
     # The unit of [design] combination: that of its parameters, "" where they differ.
     units = {p.unit for p in model.parameters if p.name in spec.combination}
     setup = Setup(
@@ -197,7 +183,7 @@ def set_up(
             n_poses=n_poses, names=information.names, sizes=information.sizes,
         ),
         None,
-        prior[np.ix_(kept, kept)],
+        prior,
         warnings,
         information.everything,
     )  # fmt: skip
@@ -213,7 +199,13 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
     both = targets if region is None else targets.with_others(region, share)
     x = information.x + (at_work.nominal - model.nominal)
     rows, told = known_rows(model, at_work, both, x, found)
-    told += _held(model, found, remaining_bias(rows, both.weight, found))
+    held = [model.names[c] for c in found.structure.kept if c not in found.columns]
+    if held and (bias := remaining_bias(rows, both.weight, found)) >= WORTH_TELLING:
+        told += (
+            f"so many poses show less of {listed(held)} than their noise; identification holds "
+            f"what it cannot see, and typical deviations of that move the test points by "
+            f"{bias * 1e6:.3g} µm rms, which the criterion does not count",
+        )
     inputs = replace(setup.inputs, A=on_kept(model, rows[:T], found), weights=targets.weight)
     beyond = None
     if region is not None:
@@ -249,21 +241,6 @@ def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...
     )
 
 
-def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Information known before (parameters, parameters), scaled by `sizes`, and of which
-    parameters (parameters,) a size is known and asked to be counted."""
-    asked = model.cell.design.prior == "typical"
-    counted = np.array([asked and p.typical is not None for p in model.parameters], dtype=bool)
-    information = np.diag(counted.astype(float))
-    if known.prior is not None:
-        P = known.prior.rows(model.names)[0] * sizes
-        information += P.T @ P
-        counted |= np.isin(model.names, known.prior.names)
-    if known.done is not None:
-        information += known.done.information * np.outer(sizes, sizes)
-    return information, counted
-
-
 def _combination(model: Model, found: Estimable) -> Array | None:
     wanted = model.cell.design.combination
     if not wanted:
@@ -278,17 +255,6 @@ def _combination(model: Model, found: Estimable) -> Array | None:
             f"{model.names[lost[1]]}; {why(model, found, lost[1])}"
         )
     return np.asarray((a * found.sizes)[found.columns])
-
-
-def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
-    held = [model.names[c] for c in found.structure.kept if c not in found.columns]
-    if bias < WORTH_TELLING or not held:
-        return ()
-    return (
-        f"so many poses show less of {listed(held)} than their noise; identification holds what it "
-        f"cannot see, and typical deviations of that move the test points by {bias * 1e6:.3g} µm "
-        "rms, which the criterion does not count",
-    )
 
 
 # The weight of what lies elsewhere, from the price that the test poses may pay for it.
@@ -366,14 +332,12 @@ def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, kno
     rows = expand_plan(plan.table(), tuple(model.cell.tool.markers), spec.repeats)
     x = model.nominal
     table = marker_sigmas(model.cell, simulate(model, rows, x, 0, noise=False))
-    observed = observe(table, model.observe)
-    at = model.regressor(table, x, None, observed)
-    sizes = model.sizes(at.B)
-    B = observed_weights(model, observed, x).apply(at.B) * sizes
-    prior, stated = known_before(model, known, sizes)
-    found = minimal_set(model, B, fixed_and_free(model, known.fixed), sizes, prior, stated)
+    B, raw = whitened(model, table, x)
+    sizes = model.sizes(raw)
+    found, prior = estimable(model, known, fixed_and_free(model, known.fixed), B * sizes, sizes)
     kept = found.columns
-    M = B[:, kept].T @ B[:, kept] + prior[np.ix_(kept, kept)]
+    B = B[:, kept] * sizes[kept]
+    M = B.T @ B + prior
     own = np.isin([model.names[c] for c in kept], without.names)
     shown = predicted(model, found, M, len(B))
     names = dict.fromkeys(p.effect for p in model.parameters if p.name not in without.names)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice
-from elastocal.cell.plan_wishes import TargetBox, TargetPath
+from elastocal.cell.plan_wishes import TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.config import place
 from elastocal.errors import InputError, InsufficientDataError, require
@@ -36,18 +37,32 @@ LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a 
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:
-    """Numbers of joints and joint values of [design]."""
-    _check_levels(cell, chain)
-    _check_motion(cell, chain)
-    for k, pose in enumerate(cell.design.test_poses):
-        key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
-        check_posture(cell, chain, key, pose.q, pose.degrees)
+    where, motion = cell.path or cell.name, cell.design.motion
+    lower, upper = joint_limits(cell, chain)
+    for joint, values in cell.design.levels.items():
+        i, split = joint_index(joint), cell.model.compliance_levels.get(joint)
+        for value in values:
+            found = f"{where}: [design.levels] has {joint} at {told(chain, i, value)}"
+            require(
+                lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
+                f"{found}, beyond its limits, {told(chain, i, lower[i])} to "
+                f"{told(chain, i, upper[i])}; correct the level or the limits",
+            )
+            require(
+                split is None or min(abs(value - s) for s in split) <= LEVEL_TOLERANCE,
+                f"{found}, which is none of its levels in [model.compliance_levels]; give both "
+                "the same levels",
+            )
+    if motion.speed is not None:
+        key = "design.motion.speed_" + ("deg_per_s" if motion.degrees else "si")
+        _check_numbers(cell, chain, key, motion.speed, motion.degrees, one=motion.degrees)
+    if motion.home is not None:
+        key = f"design.motion.home_{'deg' if motion.degrees else 'si'}"
+        _check_posture(cell, chain, key, motion.home, motion.degrees)
 
 
-def check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
-    _check_count(cell, chain, key, q)
-    if degrees:
-        _check_revolute(cell, chain, key)
+def _check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
+    _check_numbers(cell, chain, key, q, degrees)
     if (beyond := beyond_limits(cell, chain, q)) is not None:
         raise InputError(
             f"{cell.path or cell.name}: key {key}: {beyond[1]}; correct the posture or the limits"
@@ -55,8 +70,7 @@ def check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -
 
 
 def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
-    """Which joint (0-based) of the posture q (n,) lies beyond its limits, and a sentence on it;
-    None for none."""
+    """Which joint (0-based) of the posture q (n,) lies beyond its limits, and a sentence on it."""
     lower, upper = joint_limits(cell, chain)
     beyond = np.flatnonzero((q < lower - LIMIT_SLACK) | (q > upper + LIMIT_SLACK))
     if not len(beyond):
@@ -67,55 +81,21 @@ def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
     return j, f"{name} at {at} is beyond its limits, {low} to {high}"
 
 
-def _check_count(cell: Cell, chain: Chain, key: str, found: Sized, one: bool = False) -> None:
-    n = chain.n_joints
-    if len(found) != n and not (one and len(found) == 1):
-        raise InputError(
-            f"{cell.path or cell.name}: key {key} has {len(found)} numbers, but robot "
-            f"'{chain.name}' has {n} joints; give {n} numbers{' or one for all' if one else ''}"
+def _check_numbers(
+    cell: Cell, chain: Chain, key: str, found: Sized, degrees: bool, one: bool = False
+) -> None:
+    n, where = chain.n_joints, cell.path or cell.name
+    require(
+        len(found) == n or (one and len(found) == 1),
+        f"{where}: key {key} has {len(found)} numbers, but robot '{chain.name}' has {n} joints; "
+        f"give {n} numbers{' or one for all' if one else ''}",
+    )
+    for k, kind in enumerate(chain.kinds if degrees else ()):
+        require(
+            kind != "prismatic",
+            f"{where}: key {key} gives degrees, but joint{k + 1} ({chain.joints[k].name}) is "
+            f"prismatic; use {key.replace('deg_per_s', 'si').replace('_deg', '_si')}, in rad and m",
         )
-
-
-def _check_revolute(cell: Cell, chain: Chain, key: str) -> None:
-    sliding = [k for k, kind in enumerate(chain.kinds) if kind == "prismatic"]
-    if sliding:
-        other = key.replace("deg_per_s", "si").replace("_deg", "_si")
-        raise InputError(
-            f"{cell.path or cell.name}: key {key} gives degrees, but joint{sliding[0] + 1} "
-            f"({chain.joints[sliding[0]].name}) is prismatic; use {other}, in rad and m"
-        )
-
-
-def _check_levels(cell: Cell, chain: Chain) -> None:
-    lower, upper = joint_limits(cell, chain)
-    for joint, values in cell.design.levels.items():
-        i = joint_index(joint)
-        split = cell.model.compliance_levels.get(joint)
-        for value in values:
-            require(
-                lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
-                f"{cell.path or cell.name}: [design.levels] has {joint} at "
-                f"{told(chain, i, value)}, beyond its limits, {told(chain, i, lower[i])} to "
-                f"{told(chain, i, upper[i])}; correct the level or the limits",
-            )
-            require(
-                split is None or min(abs(value - s) for s in split) <= LEVEL_TOLERANCE,
-                f"{cell.path or cell.name}: [design.levels] has {joint} at "
-                f"{told(chain, i, value)}, which is none of its levels in "
-                "[model.compliance_levels]; give both the same levels",
-            )
-
-
-def _check_motion(cell: Cell, chain: Chain) -> None:
-    motion = cell.design.motion
-    unit = "deg" if motion.degrees else "si"
-    if motion.speed is not None:
-        key = "design.motion.speed_" + ("deg_per_s" if motion.degrees else "si")
-        _check_count(cell, chain, key, motion.speed, one=motion.degrees)
-        if motion.degrees:
-            _check_revolute(cell, chain, key)
-    if motion.home is not None:
-        check_posture(cell, chain, f"design.motion.home_{unit}", motion.home, motion.degrees)
 
 
 # A table of test poses: a machining path in joints, or in positions of the tool's point.
@@ -123,6 +103,7 @@ def _check_motion(cell: Cell, chain: Chain) -> None:
 TAKEN = ("q", "position", "rotation", "quaternion", "force")
 WEIGHT = Family("weight", "weights", {"weight": NO_UNIT})
 MOST_POSES = 10_000
+Spec = TargetPose | TargetPath | TargetBox | None
 
 
 def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> Layout:
@@ -152,76 +133,6 @@ def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> L
     return Layout(columns, (), numbers)
 
 
-# Places of the data's frame reached by the arm, in postures that the work cell allows.
-
-FEW, MANY = 16, 256  # postures per place; many where the work cell allows none of few
-WRONG_UNIT = 1e5  # mm
-
-
-def working_loads(cell: Cell) -> Array:
-    """The forces (L, 3) N of the design's loads that are not zero, or none but zero."""
-    loads = cell.design.loads
-    loaded = np.zeros((0, 3)) if loads is None else loads[(loads != 0).any(axis=1)]
-    return loaded if len(loaded) else np.zeros((1, 3))
-
-
-def _reached(
-    cell: Cell, chain: Chain, position: Array, rotation: Array | None, point: Array,
-    force: Array | None, weight: Array, stated: bool, rules: Feasibility | None, seed: int,
-    source: str, missed: Callable[[int, str], str],
-) -> TargetPoses:  # fmt: skip
-    """Test poses with the `point` (3,) of the flange at places (T, 3) m of the data's frame, the
-    flange at `rotation` (T, 3, 3), None for any, under `force` (T, 3) N or, None, the cell's loads:
-    each the first posture found that the rules allow; where they allow none of many, the first."""
-
-    def postures(some: IntArray, count: int) -> Postures:
-        return inverse_kinematics(
-            chain, position[some], joint_limits(cell, chain),
-            rotation=None if rotation is None else rotation[some], point=point,
-            T_data_base=data_base(cell), near=cell.design.motion.home, postures=count, seed=seed,
-        )  # fmt: skip
-
-    loads, stuck = working_loads(cell), np.arange(len(position))
-    found = postures(stuck, FEW)
-    for t in found.out_of_reach[:1]:
-        far = f"{how_near(found, t)} ({len(found.out_of_reach)} of {len(position)} places)"
-        raise InputError(missed(int(t), far))
-    q, told = found.q[:, 0].copy(), f"{len(position)} {source}"
-    under = [np.broadcast_to(load, position.shape) for load in loads] if force is None else [force]
-    for count in (FEW, MANY):
-        if rules is None or not len(stuck):
-            break
-        found = found if count == FEW else postures(stuck, count)
-        T, K, n = found.q.shape
-        allowed = found.reached.copy()
-        for load in under:
-            verdict = rules.check(found.q.reshape(T * K, n), np.repeat(load[stuck], K, 0), False)
-            allowed &= np.asarray(verdict.ok).reshape(T, K)
-        some = allowed.any(axis=1)
-        q[stuck[some]] = found.q[some, allowed[some].argmax(axis=1)]
-        stuck = stuck[~some]
-    if rules is not None and len(stuck):
-        told += f" ({len(stuck)} of them in no posture that the work cell allows)"
-    return TargetPoses.of(q, force, weight, point, stated, loads, told)
-
-
-def how_near(found: Postures, t: int) -> str:
-    distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])
-    # A place missed by this much is given in another unit than its column says.
-    near = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
-    also = f" and {turn:.3g}° from its rotation" if turn > 0.01 else ""
-    return f"the arm gets no nearer than {near}{also}"
-
-
-def remedy(cell: Cell) -> str:
-    if cell.model.nominal.base_position is None:
-        return (
-            "move it, or state where the arm stands in the data's frame ([model.nominal] "
-            "base_position_m, base_rpy_deg)"
-        )
-    return "move it, or check base_position_m and base_rpy_deg of [model.nominal], and [limits]"
-
-
 # The test poses: where position must be right, under which load, at which point of the tool.
 
 # Where the user states none: fewer, and the plan serves just these, and harms what is between them.
@@ -234,29 +145,10 @@ DRAWN, LOT = 4096, 512
 
 @dataclass(frozen=True)
 class TargetPoses(NewPoses):
-    """T test poses, of `point` (T, 3) m in the flange frame, `stated` (T,) by the user or else the
-    default."""
+    """Of `point` (T, 3) m in the flange frame, `stated` (T,) by the user or else the default."""
 
     point: Array
     stated: BoolArray
-
-    @classmethod
-    def of(
-        cls, q: Array, force: Array | None, weight: Array, point: Array, stated: bool, loads: Array,
-        source: str,
-    ) -> TargetPoses:  # fmt: skip
-        """Poses q (n, joints) of one source; those without a `force` (n, 3) of their own are taken
-        under each of the `loads` (L, 3), which share their weight (n,)."""
-        each = 1 if force is not None else len(loads)
-        n = each * len(q)
-        return cls(
-            np.repeat(q, each, axis=0),
-            np.tile(loads, (len(q), 1)) if force is None else np.asarray(force),
-            np.repeat(weight / each, each),
-            source,
-            np.broadcast_to(point, (n, 3)),
-            np.full(n, stated),
-        )
 
     @classmethod
     def together(cls, groups: Sequence[TargetPoses], source: str) -> TargetPoses:
@@ -281,25 +173,19 @@ def test_poses(
     together, or 100 poses drawn over the joint limits.  A pose without a force of its own is taken
     under each of the design's loads that is not zero, which share its weight.  Places are reached
     by the posture nearest to home, or the middle of the joint ranges, that the rules allow."""
-    spec, loads = cell.design, working_loads(cell)
-    point = _point_of(cell)
+    spec, of = cell.design, _Sources(cell, chain, feasibility, seed)
     groups = []
     for k, pose in enumerate(spec.test_poses):
         key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
-        check_posture(cell, chain, key, pose.q, pose.degrees)
-        own = point if pose.point is None else pose.point
-        force = None if pose.force is None else pose.force[None]
-        weight, stated = np.array([pose.weight]), pose.point is not None
-        groups.append(TargetPoses.of(pose.q[None], force, weight, own, stated, loads, ""))
+        _check_posture(cell, chain, key, pose.q, pose.degrees)
+        groups.append(of.poses(pose.q[None], "", pose, weight=np.array([pose.weight])))
     sources = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
-    if spec.test_path is not None:
-        groups.append(_along_path(cell, chain, spec.test_path, point, feasibility, seed))
-    if spec.test_box is not None:
-        groups.append(_in_box(cell, chain, spec.test_box, point, feasibility, seed))
-    if not groups:
-        groups.append(_drawn(cell, chain, point, feasibility, seed))
-    sources += [g.source for g in groups if g.source]
-    return TargetPoses.together(groups, ", ".join(sources))
+    groups += [] if spec.test_path is None else [of.path(spec.test_path)]
+    groups += [] if spec.test_box is None else [of.box(spec.test_box)]
+    groups = groups or [of.drawn(DEFAULT_COUNT)]
+    return TargetPoses.together(
+        groups, ", ".join([*sources, *(g.source for g in groups if g.source)])
+    )
 
 
 def where_used(model: Model) -> NewPoses | None:
@@ -312,122 +198,190 @@ def everywhere(
 ) -> TargetPoses | None:
     """Postures drawn over the joint limits that the rules allow, under each of the cell's loads:
     what an arm may be used for besides the test poses.  None where none was found."""
-    point = _point_of(cell)
-    try:
-        group = _drawn(cell, chain, point, feasibility, seed + APART, ELSEWHERE)
-    except InsufficientDataError:
-        return None
-    return TargetPoses.together([group], "")
+    with suppress(InsufficientDataError):
+        group = _Sources(cell, chain, feasibility, seed + APART).drawn(ELSEWHERE)
+        return TargetPoses.together([group], "")
+    return None
 
 
-def _point_of(cell: Cell) -> Array:
-    if cell.tool.load_point.any() or not cell.tool.markers:
-        return cell.tool.load_point
-    return np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
+# Postures per place; many where the work cell allows none of few.
+FEW, MANY = 16, 256
+WRONG_UNIT = 1e5  # mm
 
 
-def _along_path(
-    cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Feasibility | None, seed: int
-) -> TargetPoses:
-    """The poses of a table: q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw …
-    where the rotation is prescribed; force_x_N … and weight may be added."""
-    raw = read_table(spec.file, lambda header: _layout(str(spec.file), header, chain.kinds))
-    columns, n, loads = raw.layout.columns, len(raw.row), working_loads(cell)
-    require(
-        n <= MOST_POSES,
-        f"{raw.source}: {n} poses; a path takes at most {MOST_POSES}; thin it out: neighbouring "
-        "poses say the same",
-    )
-    weight = np.ones((n, 1))
-    if (stated_weight := raw.si(WEIGHT.name)) is not None:
-        weight = stated_weight
-        raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
-    stated = spec.point is not None
-    point = point if spec.point is None else spec.point
-    force = raw.si("force")
-    if force is None and spec.force is not None:
-        force = np.broadcast_to(spec.force, (n, 3))
-    q, position, turn = raw.si("q"), raw.si("position"), rotation_column(raw)
-    if q is not None:
-        for i, posture in enumerate(q):
-            if (beyond := beyond_limits(cell, chain, posture)) is not None:
+@dataclass(frozen=True)
+class _Sources:
+    """What every source of test poses is read, reached or drawn by."""
+
+    cell: Cell
+    chain: Chain
+    rules: Feasibility | None
+    seed: int
+
+    @property
+    def loads(self) -> Array:
+        """The forces (L, 3) N of the design's loads that are not zero, or none but zero."""
+        loads = self.cell.design.loads
+        loaded = np.zeros((0, 3)) if loads is None else loads[(loads != 0).any(axis=1)]
+        return loaded if len(loaded) else np.zeros((1, 3))
+
+    def point(self, spec: Spec = None) -> Array:
+        tool = self.cell.tool
+        if spec is not None and spec.point is not None:
+            return spec.point
+        if tool.load_point.any() or not tool.markers:
+            return tool.load_point
+        return np.asarray(np.mean(list(tool.markers.values()), axis=0))
+
+    def poses(
+        self, q: Array, source: str, spec: Spec = None, force: Array | None = None,
+        weight: Array | None = None,
+    ) -> TargetPoses:  # fmt: skip
+        """Poses q (n, joints) of one source with their own `force` (n, 3), else that of the `spec`,
+        else under each of the loads, which share the `weight` (n,)."""
+        if force is None and spec is not None and spec.force is not None:
+            force = np.broadcast_to(spec.force, (len(q), 3))
+        each = len(self.loads) if force is None else 1
+        n = each * len(q)
+        return TargetPoses(
+            np.repeat(q, each, axis=0),
+            np.tile(self.loads, (len(q), 1)) if force is None else force,
+            np.repeat((np.ones(len(q)) if weight is None else weight) / each, each),
+            source,
+            np.broadcast_to(self.point(spec), (n, 3)),
+            np.full(n, spec is not None and spec.point is not None),
+        )
+
+    def path(self, spec: TargetPath) -> TargetPoses:
+        """The poses of a table: q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw …
+        where the rotation is prescribed; force_x_N … and weight may be added."""
+        file = str(spec.file)
+        raw = read_table(spec.file, lambda header: _layout(file, header, self.chain.kinds))
+        columns, n, weight = raw.layout.columns, len(raw.row), raw.si(WEIGHT.name)
+        require(
+            n <= MOST_POSES,
+            f"{raw.source}: {n} poses; a path takes at most {MOST_POSES}; thin it out: "
+            "neighbouring poses say the same",
+        )
+        if weight is not None:
+            raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
+            weight = weight[:, 0]
+        force, q, position = raw.si("force"), raw.si("q"), raw.si("position")
+        turn, source = rotation_column(raw), f"{n} of {spec.file.name}"
+        for i, posture in enumerate([] if q is None else q):
+            if (beyond := beyond_limits(self.cell, self.chain, posture)) is not None:
                 where = raw.where(i, columns["q"][beyond[0]].header)
                 raise InputError(f"{where}: {beyond[1]}; correct the path or the limits")
-        source = f"{n} of {spec.file.name}"
-        return TargetPoses.of(q, force, weight[:, 0], point, stated, loads, source)
-    assert position is not None  # _layout: joints or positions
-    rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()
 
-    def missed(t: int, near: str) -> str:
-        headers = ", ".join(column.header for column in columns["position"])
-        return (
-            f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place is out of reach, "
-            f"{near}; {remedy(cell)}"
-        )
+        def missed(t: int) -> tuple[str, str]:
+            headers = ", ".join(column.header for column in columns["position"])
+            at = f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place"
+            return at, ""
 
-    source = f"of {spec.file.name}"
-    return _reached(
-        cell, chain, position, rotation, point, force, weight[:, 0], stated, rules, seed, source,
-        missed,
-    )  # fmt: skip
+        if q is None:
+            assert position is not None  # _layout: joints or positions
+            rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()
+            q, more = self.reached(position, rotation, spec, force, missed)
+            source += more
+        return self.poses(q, source, spec, force, weight)
 
+    def box(self, box: TargetBox) -> TargetPoses:
+        position = box.lower + (box.upper - box.lower) * self.sobol(3, box.count)
+        turned = box.rotation
+        rotation = None if turned is None else np.broadcast_to(turned, (box.count, 3, 3))
 
-def _in_box(
-    cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Feasibility | None, seed: int
-) -> TargetPoses:
-    stated = box.point is not None
-    point = point if box.point is None else box.point
-    position = box.lower + (box.upper - box.lower) * _sobol(3, box.count, seed)
-    each = (box.count, 3)
-    force = None if box.force is None else np.broadcast_to(box.force, each)
-    rotation = None if box.rotation is None else np.broadcast_to(box.rotation, (*each, 3))
+        def missed(t: int) -> tuple[str, str]:
+            x, y, z = position[t]
+            at = f"[design.test_box]: the place [{x:.3f}, {y:.3f}, {z:.3f}] m in it"
+            free = "" if turned is None else "leave out rpy_deg, "
+            return f"{self.cell.path or self.cell.name}: {at}", f"make the box smaller, {free}"
 
-    def missed(t: int, near: str) -> str:
-        x, y, z = position[t]
-        turned = "" if box.rotation is None else "leave out rpy_deg, "
-        return (
-            f"{cell.path or cell.name}: [design.test_box]: the place [{x:.3f}, {y:.3f}, {z:.3f}] m "
-            f"in it is out of reach, {near}; make the box smaller, {turned}{remedy(cell)}"
-        )
+        q, more = self.reached(position, rotation, box, None, missed)
+        return self.poses(q, f"{box.count} in [design.test_box]{more}", box)
 
-    weight, source = np.ones(box.count), "in [design.test_box]"
-    return _reached(
-        cell, chain, position, rotation, point, force, weight, stated, rules, seed, source, missed
-    )
+    def reached(
+        self, position: Array, rotation: Array | None, spec: TargetPath | TargetBox,
+        force: Array | None, missed: Callable[[int], tuple[str, str]],
+    ) -> tuple[Array, str]:  # fmt: skip
+        """Postures (T, n) with the point at places (T, 3) m of the data's frame, the flange at
+        `rotation` (T, 3, 3), None for any, each the first one found that the rules allow under
+        `force` (T, 3) N, else that of the spec, else all loads; where they allow none of many, the
+        first, and what to say of it."""
+        cell, stuck = self.cell, np.arange(len(position))
+        q = np.zeros((len(position), self.chain.n_joints))
+        under = [force] if force is not None else [
+            np.broadcast_to(load, position.shape)
+            for load in (self.loads if spec.force is None else [spec.force])
+        ]  # fmt: skip
+        for count in (FEW, MANY):
+            found = inverse_kinematics(
+                self.chain, position[stuck], joint_limits(cell, self.chain),
+                rotation=None if rotation is None else rotation[stuck], point=self.point(spec),
+                T_data_base=data_base(cell), near=cell.design.motion.home, postures=count,
+                seed=self.seed,
+            )  # fmt: skip
+            if count == FEW:
+                for t in found.out_of_reach[:1]:
+                    raise InputError(self._far(found, int(t), *missed(int(t))))
+                q = found.q[:, 0].copy()
+            if self.rules is None:
+                return q, ""
+            T, K, n = found.q.shape
+            allowed = found.reached.copy()
+            for load in under:
+                each = np.repeat(load[stuck], K, axis=0)
+                allowed &= self.rules.check(found.q.reshape(T * K, n), each, False).ok.reshape(T, K)
+            some = allowed.any(axis=1)
+            q[stuck[some]] = found.q[some, allowed[some].argmax(axis=1)]
+            stuck = stuck[~some]
+            if not len(stuck):
+                return q, ""
+        return q, f" ({len(stuck)} of them in no posture that the work cell allows)"
 
-
-def _drawn(
-    cell: Cell, chain: Chain, point: Array, rules: Feasibility | None, seed: int,
-    most: int = DEFAULT_COUNT,
-) -> TargetPoses:  # fmt: skip
-    low, high = finite_ranges(chain, *joint_limits(cell, chain))
-    count = most if rules is None else DRAWN
-    q = low + (high - low) * _sobol(chain.n_joints, count, seed)
-    for name, levels in cell.model.compliance_levels.items():
-        # Elsewhere the model has no compliance for that joint.
-        q[:, joint_index(name)] = np.resize(levels, count)
-    if rules is not None:
-        found = [q[:0]]
-        for part in np.split(q, range(LOT, count, LOT)):
-            found.append(part[rules.feasible(part, working_loads(cell))])
-            if sum(map(len, found)) >= most:
-                break
-        q = np.concatenate(found)[:most]
-        if not len(q):
-            raise InsufficientDataError(
-                f"{cell.path or cell.name}: the cell states no test poses, and its rules allow "
-                f"none of {count} postures drawn over the joint limits; state "
-                "[[design.test_pose]], or relax the rules of [workspace]"
+    def _far(self, found: Postures, t: int, at: str, remedy: str) -> str:
+        distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])
+        # A place missed by this much is given in another unit than its column says.
+        near = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
+        also = f" and {turn:.3g}° from its rotation" if turn > 0.01 else ""
+        check = "check base_position_m and base_rpy_deg of [model.nominal], and [limits]"
+        if self.cell.model.nominal.base_position is None:
+            check = (
+                "state where the arm stands in the data's frame ([model.nominal] base_position_m, "
+                "base_rpy_deg)"
             )
-    source = f"{len(q)} drawn over the joint limits (the cell states none)"
-    return TargetPoses.of(q, None, np.ones(len(q)), point, False, working_loads(cell), source)
+        return (
+            f"{at} is out of reach, the arm gets no nearer than {near}{also} "
+            f"({len(found.out_of_reach)} of {len(found.q)} places); {remedy}move it, or {check}"
+        )
 
+    def drawn(self, most: int) -> TargetPoses:
+        cell, chain, rules = self.cell, self.chain, self.rules
+        low, high = finite_ranges(chain, *joint_limits(cell, chain))
+        count = most if rules is None else DRAWN
+        q = low + (high - low) * self.sobol(chain.n_joints, count)
+        for name, levels in cell.model.compliance_levels.items():
+            # Elsewhere the model has no compliance for that joint.
+            q[:, joint_index(name)] = np.resize(levels, count)
+        if rules is not None:
+            found = [q[:0]]
+            for part in np.split(q, range(LOT, count, LOT)):
+                found.append(part[rules.feasible(part, self.loads)])
+                if sum(map(len, found)) >= most:
+                    break
+            q = np.concatenate(found)[:most]
+            if not len(q):
+                raise InsufficientDataError(
+                    f"{cell.path or cell.name}: the cell states no test poses, and its rules allow "
+                    f"none of {count} postures drawn over the joint limits; state "
+                    "[[design.test_pose]], or relax the rules of [workspace]"
+                )
+        return self.poses(q, f"{len(q)} drawn over the joint limits (the cell states none)")
 
-def _sobol(dimension: int, count: int, seed: int) -> Array:
-    from scipy.stats import qmc  # slow to import, seldom asked for
+    def sobol(self, dimension: int, count: int) -> Array:
+        from scipy.stats import qmc  # slow to import, seldom asked for
 
-    sampler = qmc.Sobol(dimension, scramble=True, seed=seed)
-    return np.asarray(sampler.random_base2(int(np.ceil(np.log2(count))))[:count])
+        sampler = qmc.Sobol(dimension, scramble=True, seed=self.seed)
+        return np.asarray(sampler.random_base2(int(np.ceil(np.log2(count))))[:count])
 
 
 # Where position must be right: A_t, how the parameters move the tool at the test poses.
@@ -446,35 +400,39 @@ def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool 
     """
     by_marker = ~targets.stated & fitted_markers(model)
     bodies = targets.stated & carried
-    n, T = len(model.cell.tool.markers), len(targets.q)
-    A = np.zeros((T, n if by_marker.any() else 1, 3, len(model.parameters)))
-    if (which := np.flatnonzero(by_marker)).size:
-        A[which] = _marker_rows(model, targets, which, x)[0] / np.sqrt(n)
-    if (which := np.flatnonzero(bodies)).size:
-        B, R = _marker_rows(model, targets, which, x)
-        J = R[:, None] @ _carrying(model.cell, targets.point[which]) @ R[:, None].swapaxes(-1, -2)
-        A[which, 0] = np.einsum("tmij,tmjp->tip", J, B)
-    if (which := np.flatnonzero(~by_marker & ~bodies)).size:
-        points, code = np.unique(targets.point[which], axis=0, return_inverse=True)
-        names = tuple(f"test point {k + 1}" for k in range(len(points)))
-        arm = _with_points(model, dict(zip(names, points, strict=True)))
-        table = _table(targets, which, code.ravel(), names)
-        A[which, 0] = arm.regressor(table, x).B.reshape(len(which), 3, -1)
+    lone = ~by_marker & ~bodies
+    own, T = len(model.cell.tool.markers), len(targets.q)
+    points, code = np.unique(targets.point[lone], axis=0, return_inverse=True)
+    arm = _with_points(model, points)
+
+    def table(which: BoolArray, marker: IntArray) -> Measurements:
+        pose = np.repeat(np.flatnonzero(which), len(marker) // which.sum())
+        n, names = len(pose), tuple(arm.cell.tool.markers)
+        # The arm as it is at first, its joints come from either side.
+        return replace(
+            readings_at(targets.q, pose, targets.force[pose], marker, names, "test poses"),
+            position=np.zeros((n, 3)),
+            rotation=np.zeros((n, 3)),
+            time=np.zeros(n),
+            approach=np.zeros((n, targets.q.shape[1])),
+        )
+
+    A = np.zeros((T, own if by_marker.any() else 1, 3, len(model.parameters)))
+    if lone.any():
+        rows = arm.regressor(table(lone, own + code.ravel()), x).B
+        A[lone, 0] = rows.reshape(lone.sum(), 3, -1)
+    for which in (by_marker, bodies):
+        if not which.any():
+            continue
+        every = table(which, np.tile(np.arange(own), which.sum()))
+        B = arm.regressor(every, x).B.reshape(which.sum(), own, 3, -1)
+        if which is by_marker:
+            A[which] = B / np.sqrt(own)
+        else:
+            R = arm.flange_poses(every, x)[::own, None, :3, :3]
+            J = R @ _carrying(model.cell, targets.point[which]) @ R.swapaxes(-1, -2)
+            A[which, 0] = np.einsum("tmij,tmjp->tip", J, B)
     return A.reshape(T, -1, len(model.parameters))
-
-
-def _marker_rows(
-    model: Model, targets: TargetPoses, which: IntArray, x: Array
-) -> tuple[Array, Array]:
-    """∂(position of each marker)/∂X (T, M, 3, parameters) at some of the test poses, and how the
-    flange is turned there (T, 3, 3)."""
-    markers = tuple(model.cell.tool.markers)
-    own = replace(model.cell.model, observe="position")
-    arm = Model.assembled(model.chain, replace(model.cell, model=own))
-    n, T = len(markers), len(which)
-    table = _table(targets, np.repeat(which, n), np.tile(np.arange(n), T), markers)
-    turned = arm.flange_poses(replace(table, rotation=np.zeros((n * T, 3))), x)[::n, :3, :3]
-    return arm.regressor(table, x).B.reshape(T, n, 3, -1), turned
 
 
 def fitted_markers(model: Model) -> bool:
@@ -503,21 +461,8 @@ def _carrying(cell: Cell, point: Array) -> Array:
     return np.eye(3) / len(places) + cross[:, None] @ turned[None]
 
 
-def _table(
-    targets: TargetPoses, pose: IntArray, marker: IntArray, names: tuple[str, ...]
-) -> Measurements:
-    n, force = len(pose), targets.force[pose]
-    # The arm as it is at first, its joints come from either side.
-    return replace(
-        readings_at(targets.q, pose, force, marker, names, "test poses"),
-        position=np.zeros((n, 3)),
-        time=np.zeros(n),
-        approach=np.zeros((n, targets.q.shape[1])),
-    )
-
-
-def _with_points(model: Model, points: dict[str, Array]) -> Model:
-    """The same arm with the test points as markers whose place on the flange is known."""
+def _with_points(model: Model, points: Array) -> Model:
+    """The same arm with test points (k, 3) as markers whose place on the flange is known."""
     cell = model.cell
     # Effects act where they do on the model as it is, without the test points.
     effects = tuple(
@@ -530,7 +475,8 @@ def _with_points(model: Model, points: dict[str, Array]) -> Model:
         )
     )
     spec = replace(cell.model, effects=effects, observe="position")
-    tool = replace(cell.tool, markers=cell.tool.markers | points)
+    named = {f"test point {k + 1}": point for k, point in enumerate(points)}
+    tool = replace(cell.tool, markers=cell.tool.markers | named)
     return Model.assembled(model.chain, replace(cell, model=spec, tool=tool))
 
 

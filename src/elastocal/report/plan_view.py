@@ -270,8 +270,6 @@ def plan_lines(plan: Plan) -> Told:
 
 
 def _chosen_lines(plan: Plan) -> Told:
-    """What was chosen besides the poses, in which load states they are measured, and what that is
-    worth."""
     c, s, unit = plan.chosen, plan.states, f" {plan.unit}" if plan.unit else ""
 
     def at(place: Any) -> str:
@@ -303,10 +301,9 @@ def _chosen_lines(plan: Plan) -> Told:
         )
     text = f"every pose in every load state, as {s.why}"
     if s.used != "all":
-        counts = (plan.readings > 0).sum(axis=0)
         text = listed(
             f"{say.counted(int(n), 'pose')} {'' if name == 'unloaded' else 'under '}{name}"
-            for n, name in zip(counts, map(load_name, plan.forces), strict=True)
+            for n, name in zip(plan.read_in, map(load_name, plan.forces), strict=True)
             if n
         )
     yield "Loads", f"{text}{worth}."
