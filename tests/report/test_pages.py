@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import html
+import itertools
 import json
 import re
 from dataclasses import replace
@@ -250,3 +251,24 @@ def test_writing_is_whole_or_not_at_all_and_names_what_was_read(
     with pytest.raises(InputError, match="cannot be written"):
         write_page(case.result, tmp_path / "full.html")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "r.html"]
+
+
+@pytest.mark.parametrize("largest", [1.66e3, 270.0, 1.9e4])
+@pytest.mark.parametrize("ratio", [1.3, 5.0, 40.0])
+def test_lengths_along_an_axis_do_not_overlap(largest, ratio):
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    rows = [
+        (f"step {k}", v, (0.9 * v, 1.1 * v), "") for k, v in enumerate((largest / ratio, largest))
+    ]
+    shown = figures.rows_of_dots("errors", "Errors", rows, "error", lengths=True)
+    figure = Figure(figsize=(shown.width, shown.height), layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    shown.draw(figure)
+    canvas.draw()
+    axis = figure.axes[0].xaxis
+    boxes = [t.get_window_extent() for t in axis.get_ticklabels() if t.get_text()]
+    boxes = sorted((b for b in boxes if b.width), key=lambda b: b.x0)
+    assert len(boxes) > 2
+    assert all(b.x1 < c.x0 for b, c in itertools.pairwise(boxes))

@@ -455,7 +455,7 @@ def compensate(
     if shown and output is not None:
         say(
             f"Next: Run {output.name} and measure some. 95 % of the targets should be reached "
-            "within within95_um, measurement noise excluded."
+            "within its column within95_um, measurement noise excluded."
         )
 
 

@@ -275,7 +275,10 @@ def ordered(
     plan, execution = order.reachable()
     if order.gone:
         plan, execution = order.polished(plan, execution)
-        warnings.append(f"{order.gone} better poses were left out, as no free move reaches them")
+        told = "one better pose was" if order.gone == 1 else f"{order.gone} better poses were"
+        warnings.append(
+            f"{told} left out: no free move reaches {'it' if order.gone == 1 else 'them'}"
+        )
     if execution.one_sided:
         told = ", ".join(str(k + 1) for k in execution.one_sided)
         warnings.append(f"approached from one side only, as the other is blocked: {told}")

@@ -189,9 +189,10 @@ def rows_of_dots(
 
 
 def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     axes.margins(x=0.18)  # with room for texts
+    axes.xaxis.set_major_locator(MaxNLocator(5))  # "1.25 mm" is long
     if lengths and min(known, default=0) > 0 and max(known) > WIDE_RANGE * min(known):
         axes.set_xscale("log")
         dense = (1.0, 2.0, 5.0) if max(known) < DENSE * min(known) else (1.0, 3.0)
