@@ -52,7 +52,7 @@ def test_the_posterior_is_that_of_ridge_regression(seed, kept):
     assert np.allclose(found.step, np.linalg.solve(normal, C.T @ e), rtol=1e-9)
     assert np.allclose(found.cofactor, np.linalg.inv(normal), rtol=1e-8)
     hat = C @ np.linalg.solve(normal, C.T)
-    assert np.isclose(found.effective, np.trace(hat))
+    assert np.isclose(found.effective.sum(), np.trace(hat))
     assert np.allclose(np.diag(C @ found.cofactor @ C.T), np.diag(hat))
     share = np.diag(found.cofactor * prior @ found.cofactor) / np.diag(found.cofactor)
     assert np.allclose(found.prior_share, share)

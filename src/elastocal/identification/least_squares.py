@@ -281,12 +281,14 @@ def moved(x: Array, columns: IntArray, step: Array) -> Array:
 def fit(
     problem: Problem, columns: IntArray, x: Array, sizes: Array, *, known: PriorRows | None = None,
     among: IntArray | None = None, max_steps: int = 60, tolerance: float = TOLERANCE,
+    at: Evaluation | None = None,
 ) -> Fit:  # fmt: skip
     """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
     other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
 
     `sizes` (parameters,) scale the variables.  `among` are columns of which those fitted are a
-    choice: the fit leaves their R factor too, which else would take another pass.
+    choice: the fit leaves their R factor too, which else would take another pass.  `at` is the
+    evaluation of these at x, where it is known.
 
     On R factors, with the cost and the gradient of all rows, until a step promises less than
     `tolerance` of the cost.  Every step starts from the residual of the
@@ -300,7 +302,9 @@ def fit(
     u = np.zeros(len(columns))
     if objective.limits is not None:  # the nearest that is allowed
         u = minimise(np.eye(len(u)), u, objective.limits).x
-    found = descend(objective, u, tolerance, max_steps)
+    if at is not None and among is not None:
+        at = at.chosen(columns, among, size)
+    found = descend(objective, u, tolerance, max_steps, at)
     at, values = found.at, moved(x, columns, size * found.u)
     if known is not None:
         values[columns] = known.on_bounds(values[columns], size)

@@ -14,22 +14,15 @@ exactly under the model, the smooth functions as random as their prior says.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy import linalg, sparse, special
+from scipy import sparse, special
 
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.least_squares import (
-    EXHAUSTED,
-    Fit,
-    PriorRows,
-    Problem,
-    descend,
-    moved,
-    objective_of,
-)
-from elastocal.identification.least_squares import SETTLED as REASON
+from elastocal.identification.least_squares import Fit, PriorRows, Problem
+from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
@@ -44,15 +37,21 @@ from elastocal.identification.outliers import FALSE_ALARM, NoiseAndOutliers, set
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.smooth_functions import (
     LinearRows,
+    Posterior,
     Scales,
-    ShrunkPosterior,
     SmoothPart,
 )
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, choose, is_placed
+from elastocal.identification.solve import (
+    WORTH_A_COLUMN,
+    Reduction,
+    Solution,
+    choose,
+    free_r_factor,
+    is_placed,
+)
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Part,
-    Partition,
     RFactor,
     each,
     evaluate,
@@ -134,161 +133,54 @@ def sized_of(model: Model, free: IntArray) -> IntArray:
 
 @dataclass(frozen=True)
 class JointFit:
-    """The minimum of readings and prior together: values x (parameters,), residual (rows,) there.
+    """The minimum of readings and prior together: the ordinary columns that the `reduction` keeps,
+    then those of the functions that take part; `linear` is the linear problem there."""
 
-    `columns` are the ordinary ones kept, then those of the functions that take part.  `free` is
-    the linear problem with all free ordinary columns.
-    """
-
-    problem: Problem
-    parts: Partition
-    functions: Functions
+    found: Fit
     reduction: Reduction
-    x: Array
-    residual: Array
     scales: Scales
-    posterior: ShrunkPosterior
-    free: LinearRows
-    converged: bool
-    steps: int
+    linear: LinearRows
 
-    @property
-    def columns(self) -> IntArray:
-        own = self.functions.columns[self.posterior.own]
-        return np.concatenate([self.reduction.kept, own])
+    @cached_property
+    def posterior(self) -> Posterior:
+        return self.linear.posterior(self.scales)
 
     @property
     def sigma(self) -> float:
         """Of a whitened row."""
         return float(np.sqrt(self.scales.variance))
 
-    def linear(self, scales: Scales) -> tuple[JointFit, Array]:
-        """The posterior of other sizes, the model linearised at this x, and the step (parameters,)
-        to its minimum."""
-        kept = np.searchsorted(self.problem.free, self.reduction.kept)
-        posterior, f = self.free.only(kept).posterior(scales), self.functions
-        # α is a step; b counts from nominal.
-        step, b = np.zeros(len(self.x)), np.zeros(len(f.columns))
-        step[self.reduction.kept] = posterior.step[: posterior.ordinary]
-        b[posterior.own] = posterior.step[posterior.ordinary :]
-        step[f.columns] = f.nominal + b - self.x[f.columns]
-        return replace(self, scales=scales, posterior=posterior), step
+    def whitened(self, part: Part) -> tuple[Array, Array]:
+        """Q (rows, columns), whose squares are by how much of the noise the fit varies at the
+        readings of a part, and their residual (rows,)."""
+        found, apply = self.found, part.weights.apply
+        at = regressor(found.problem.model, part, found.x, found.columns)
+        return apply(at.B @ self.posterior.half), apply(at.residual)
 
+    def standardised(self, others: Part | None = None) -> Array:
+        """Residuals (rows,) free of the fit's part in them, in m or rad: of the fit's own readings,
+        configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1 − QQᵀ."""
+        parts, side = self.found.problem.parts, -1
+        if others is not None:
+            columns = len(self.found.columns)
+            parts, side = partition(others.observations, others.weights, columns), 1
+        standard = np.empty(len(parts.observed.value))
 
-def joint_fit(
-    problem: Problem, sizes: Array, functions: Functions, x: Array, reduction: Reduction,
-    scales: Scales | None = None, *, choosing: bool = True,
-) -> JointFit:  # fmt: skip
-    """The fit to readings and prior from x.
+        def one(part: Part) -> None:
+            (Q, e), own = self.whitened(part), part.observations
+            labels = own.configuration if side < 0 else np.arange(len(own.lead))
+            for rows in same_size(np.repeat(labels, own.size)):
+                gap = np.eye(rows.shape[1]) + side * Q[rows] @ Q[rows].transpose(0, 2, 1)
+                values, axes = np.linalg.eigh(gap)
+                turned = (e[rows][:, None] @ axes) / np.sqrt(np.maximum(values, ALONE))[:, None]
+                e[rows] = (turned @ axes.transpose(0, 2, 1))[:, 0]
+            if part.weights.whiten is not None:
+                e = sparse.linalg.spsolve(part.weights.whiten.tocsc(), e)
+            standard[part.rows] = e
 
-    The sizes of the functions are estimated on the way, from `scales` on; which ordinary parameters
-    are fitted is chosen anew beside them, from `reduction` on, unless `choosing` is False.
-
-    Raises ElastocalError where the start has poses without equilibrium.
-    """
-    model, among = problem.model, np.concatenate([problem.free, functions.columns])
-    every = replace(problem, free=among)
-    x, steps = _started(problem, functions, x, reduction), 0
-    if scales is not None:
-        gone = functions.columns[(scales.scale == 0)[functions.group]]
-        x[gone] = model.nominal[gone]
-    at = evaluate(model, every.parts, x, among)
-    for left in reversed(range(CHOICES if scales is None else 1)):
-        free = functions.rows(at.wide or at.r_factor, x)
-        scales = free.only(np.searchsorted(problem.free, reduction.kept)).scales(scales)
-        again = _chosen(problem, sizes, free, scales) if choosing else reduction
-        if not np.array_equal(again.kept, reduction.kept):
-            reduction, x = again, _started(problem, functions, x, again)
-            at = evaluate(model, every.parts, x, among)
-            free = functions.rows(at.r_factor, x)
-            if left:
-                continue
-        reduction = reduction.seen(problem.free, free.factor.R, sizes)
-        posterior = free.only(np.searchsorted(problem.free, reduction.kept)).posterior(scales)
-        own = functions.columns[posterior.own]
-        columns = np.concatenate([reduction.kept, own])
-        P = np.diag(posterior.prior) @ np.eye(len(own), len(columns), len(reduction.kept))
-        known = PriorRows(P, P[:, len(reduction.kept) :] @ model.nominal[own])
-        objective = objective_of(every, columns, x, sizes, known, among)
-        assert objective.evaluate_last is not None
-        objective = replace(objective, evaluate=objective.evaluate_last)
-        begun = Evaluation(at.residual, at.wide or at.r_factor)
-        begun = begun.chosen(columns, among, sizes[columns])
-        # While there is another choice, a single step.
-        most = 2 if left else STEPS
-        found = descend(objective, np.zeros(len(columns)), SETTLED / len(at.residual), most, begun)
-        x, at, steps = moved(x, columns, sizes[columns] * found.u), found.at, found.evaluations
-    assert scales is not None
-    free = functions.rows(at.wide or at.r_factor, x)
-    posterior = free.only(np.searchsorted(problem.free, reduction.kept)).posterior(scales)
-    return JointFit(
-        problem, every.parts, functions, reduction, x, at.residual, scales, posterior, free,
-        found.converged, steps,
-    )  # fmt: skip
-
-
-def _chosen(problem: Problem, sizes: Array, free: LinearRows, scales: Scales) -> Reduction:
-    marginal = free.posterior(scales).marginal
-    return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), WORTH_A_COLUMN)
-
-
-def _started(problem: Problem, functions: Functions, x: Array, reduction: Reduction) -> Array:
-    """x with what is not fitted at its start, and its share moved over; other functions nominal."""
-    kept, dropped = reduction.kept, reduction.dropped
-    moved = x.copy()
-    moved[kept] += reduction.mixing @ (x[dropped] - problem.x0[dropped])
-    moved[dropped] = problem.x0[dropped]
-    out = problem.model.shrunk.copy()
-    out[functions.columns] = False
-    moved[out] = problem.x0[out]
-    return moved
-
-
-# What each configuration says beside the others.
-
-
-def crossed(fit: JointFit, step: Array | None = None) -> tuple[Array, Array]:
-    """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite where
-    there is none), and leverage (rows,) of each.
-
-    `step` (parameters,) leads from the fit's x to the minimum of the model linearised there,
-    where x itself is none.
-    """
-    half = linalg.lapack.dtrtri(fit.posterior.R)[0]
-    return held_out_by_parts(fit.problem.model, fit.parts, fit.x, fit.columns, half, step)
-
-
-def standardised(fit: JointFit, others: Part | None) -> Array:
-    """Residuals (rows,) free of the fit's part in them, in m or rad: of the fit's own readings,
-    configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1 − QQᵀ."""
-    parts, side = fit.parts, -1
-    if others is not None:
-        parts, side = partition(others.observations, others.weights, len(fit.columns)), 1
-    found, size = np.empty(len(parts.observed.value)), parts.observed.size
-
-    def one(part: Part) -> None:
-        at, own = regressor(fit.problem.model, part, fit.x, fit.columns), part.observations
-        e = part.weights.apply(at.residual)
-        Q, standard = _triangular(fit.posterior.R, part.weights.apply(at.B)), np.empty(len(e))
-        labels = own.configuration if side < 0 else np.arange(len(own.lead))
-        for rows in same_size(np.repeat(labels, size)):
-            gap = np.eye(rows.shape[1]) + side * Q[rows] @ Q[rows].transpose(0, 2, 1)
-            values, vectors = np.linalg.eigh(gap)
-            turned = (vectors.transpose(0, 2, 1) @ e[rows][..., None])[..., 0]
-            turned /= np.sqrt(np.maximum(values, ALONE))
-            standard[rows] = (vectors @ turned[..., None])[..., 0]
-        if part.weights.whiten is not None:
-            standard = sparse.linalg.spsolve(part.weights.whiten.tocsc(), standard)
-        found[part.rows] = standard
-
-    for _ in each(parts, one):
-        pass
-    return found
-
-
-def _triangular(R: Array, B: Array) -> Array:
-    solved = linalg.solve_triangular(R, B.T, trans="T", check_finite=False)
-    return np.ascontiguousarray(solved.T)
+        for _ in each(parts, one):
+            pass
+        return standard
 
 
 # The course: fit, noise and faulty readings in turn, then what else may change.
@@ -313,9 +205,9 @@ def fit_smooth(
         fit, noise, good = search.settled(~faulty)
         fit, cross = search.without_those_that_harm(fit)
         held = rms_3d(cross[0], size)
-        tried.append((not fit.converged, held, search, (fit, cross, noise, good)))
+        tried.append((not fit.found.converged, held, search, (fit, cross, noise, good)))
         # A prior that leads astray predicts worse than the ordinary parameters alone.
-        if not len(sized) or (fit.converged and held <= rms_3d(sound.heldout, size)):
+        if not len(sized) or (fit.found.converged and held <= rms_3d(sound.heldout, size)):
             break
     _, _, search, parts = min(tried, key=lambda course: course[:2])
     return search.result(*parts)
@@ -373,6 +265,78 @@ class _Course:
             part = replace(part, weights=weights_of(noise, self.readings.take(good)))
         return part if not good.all() else replace(part, observations=self.observed)
 
+    def joint(
+        self, problem: Problem, x: Array, reduction: Reduction, scales: Scales | None = None, *,
+        choosing: bool = True,
+    ) -> JointFit:  # fmt: skip
+        """The fit to readings and prior from x.
+
+        The sizes of the functions are estimated on the way, from `scales` on; which ordinary
+        parameters are fitted is chosen anew beside them, from `reduction` on, unless `choosing` is
+        False.  Raises ElastocalError where the start has poses without equilibrium.
+        """
+        f, sizes, ordinary = self.functions, self.every.sizes, self.sound.problem.free
+        among, x = np.append(ordinary, f.columns), self._started(x, reduction)
+        problem = replace(problem, free=among)
+        if scales is not None:
+            gone = f.columns[(scales.scale == 0)[f.group]]
+            x[gone] = self.model.nominal[gone]
+        at = evaluate(self.model, problem.parts, x, among)
+        for left in reversed(range(CHOICES if scales is None else 1)):
+            free = f.rows(at.r_factor, x)
+            scales = free.only(np.searchsorted(ordinary, reduction.kept)).scales(scales)
+            again = self._chosen(free, scales) if choosing else reduction
+            if not np.array_equal(again.kept, reduction.kept):
+                reduction, x = again, self._started(x, again)
+                at = evaluate(self.model, problem.parts, x, among)
+                free = f.rows(at.r_factor, x)
+                if left:
+                    continue
+            reduction = reduction.seen(ordinary, free.factor.R, sizes)
+            posterior = free.only(np.searchsorted(ordinary, reduction.kept)).posterior(scales)
+            own = f.columns[posterior.own]
+            known = PriorRows(posterior.P, posterior.of_own @ self.model.nominal[own])
+            # While there is another choice, a single step.
+            found = least_squares(
+                problem, np.append(reduction.kept, own), x, sizes, known=known, among=among,
+                max_steps=2 if left else STEPS, tolerance=SETTLED / len(at.residual), at=at,
+            )  # fmt: skip
+            x, at = found.x, Evaluation(found.residual, free_r_factor(problem, found))
+        assert scales is not None
+        linear = f.rows(at.r_factor, x).only(np.searchsorted(ordinary, reduction.kept))
+        return JointFit(found, reduction, scales, linear)
+
+    def _chosen(self, free: LinearRows, scales: Scales) -> Reduction:
+        problem, sizes = self.sound.problem, self.every.sizes
+        marginal, sigma = free.posterior(scales).marginal, float(np.sqrt(scales.variance))
+        return choose(problem, sizes, marginal, sigma, WORTH_A_COLUMN)
+
+    def _started(self, x: Array, reduction: Reduction) -> Array:
+        """x with what is not fitted at its start, and its share moved over; other functions
+        nominal."""
+        kept, dropped, x0 = reduction.kept, reduction.dropped, self.sound.problem.x0
+        moved, out = x.copy(), self.model.shrunk.copy()
+        moved[kept] += reduction.mixing @ (x[dropped] - x0[dropped])
+        moved[dropped] = x0[dropped]
+        out[self.functions.columns] = False
+        moved[out] = x0[out]
+        return moved
+
+    def crossed(self, fit: JointFit, scales: Scales | None = None) -> tuple[Array, Array]:
+        """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
+        where there is none), and leverage (rows,) of each; with other `scales` of the model
+        linearised at the fit."""
+        found, f, posterior, step = fit.found, self.functions, fit.posterior, None
+        if scales is not None:
+            posterior, k = fit.linear.posterior(scales), fit.linear.ordinary
+            # α is a step; b counts from nominal.
+            step, b = np.zeros(len(found.x)), np.zeros(len(f.columns))
+            step[fit.reduction.kept], b[posterior.own] = np.split(posterior.step, [k])
+            step[f.columns] = f.nominal + b - found.x[f.columns]
+        columns = np.append(fit.reduction.kept, f.columns[posterior.own])
+        model, parts = found.problem.model, found.problem.parts
+        return held_out_by_parts(model, parts, found.x, columns, posterior.half, step)
+
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
         """Fit, noise and good readings that agree with each other."""
         noise: NoiseFit | None = None
@@ -384,14 +348,13 @@ class _Course:
             problem = replace(
                 self.sound.problem, observations=part.observations, weights=part.weights
             )
-            fit = joint_fit(problem, self.every.sizes, self.functions, x, reduction, scales)
-            x, reduction, scales = fit.x, fit.reduction, fit.scales
+            fit = self.joint(problem, x, reduction, scales)
+            x, reduction, scales = fit.found.x, fit.reduction, fit.scales
             still, level = abs(scales.variance - level) < STILL, scales.variance
-            self.standard[fitted] = standardised(fit, None).reshape(shape)
+            self.standard[fitted] = fit.standardised().reshape(shape)
             if not fitted.all():
-                self.standard[~fitted] = standardised(fit, self.chosen(noise, ~fitted)).reshape(
-                    shape
-                )
+                rest = fit.standardised(self.chosen(noise, ~fitted))
+                self.standard[~fitted] = rest.reshape(shape)
             before, kind = good, None if noise is None else noise.kind
             noise, good = self.judged(noise, good, k)
             good = self.corroborated(fit, noise, fitted, good)
@@ -432,8 +395,7 @@ class _Course:
         if len(suspects) < 2:
             return good | self.alike
         rest = self.chosen(noise, np.isin(np.arange(len(good)), suspects))
-        B = regressor(self.model, rest, fit.x, fit.columns).B
-        Q = _triangular(fit.posterior.R, rest.weights.apply(B)).reshape(len(suspects), -1)
+        Q = fit.whitened(rest)[0].reshape(len(suspects), -1)
         Q = Q / np.linalg.norm(Q, axis=1, keepdims=True)
         e, own = self.standard[suspects], rest.observations.configuration
         length, apart = np.linalg.norm(e, axis=1), np.linalg.norm(e[:, None] - e[None], axis=2)
@@ -445,13 +407,13 @@ class _Course:
     def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, tuple[Array, Array]]:
         """Without the functions that the readings do not show, or that predict held-out
         configurations worse than none; the least supported is tried first."""
-        size, scales, cross = self.observed.size, fit.scales, crossed(fit)
+        size, scales, cross = self.observed.size, fit.scales, self.crossed(fit)
         for g in np.argsort(scales.gain[: len(self.functions.groups)]):
             if not scales.scale[g] or scales.gain[g] > CERTAIN:
                 continue
             scale = scales.scale.copy()
             scale[g] = 0.0
-            there = crossed(*fit.linear(replace(scales, scale=scale)))
+            there = self.crossed(fit, replace(scales, scale=scale))
             shown = scales.gain[g] > LEAST_GAIN
             if shown and rms_3d(there[0], size) > rms_3d(cross[0], size):
                 continue
@@ -460,29 +422,24 @@ class _Course:
             scales, cross = replace(scales, scale=scale), there
         if (scales.scale > 0).all():
             return fit, cross
-        fit = joint_fit(
-            fit.problem, self.every.sizes, self.functions, fit.x, fit.reduction, scales,
-            choosing=False,
-        )  # fmt: skip
-        return fit, crossed(fit)
+        found = fit.found
+        fit = self.joint(found.problem, found.x, fit.reduction, scales, choosing=False)
+        return fit, self.crossed(fit)
 
     def result(
         self, fit: JointFit, cross: tuple[Array, Array], noise: NoiseFit | None, good: BoolArray
     ) -> tuple[MethodResult, FunctionPrior]:
-        posterior, columns, f, r = fit.posterior, fit.columns, fit.functions, fit.reduction
-        whitened = fit.problem.weights.apply(fit.residual)
-        found = Fit(
-            fit.x, fit.residual, whitened, posterior.marginal, fit.converged,
-            REASON if fit.converged else EXHAUSTED, fit.steps, fit.problem, columns,
-            self.every.sizes,
-        )  # fmt: skip
+        posterior, f, r, found = fit.posterior, self.functions, fit.reduction, fit.found
+        columns, x = found.columns, found.x
+        problem = replace(found.problem, free=self.sound.problem.free)
         mixing = np.vstack([r.mixing, np.zeros((len(posterior.own), len(r.dropped)))])
         solution = replace(
-            self.sound, problem=fit.problem, fit=found, held=cross[0],
+            self.sound, problem=problem, held=cross[0], nominal_rms=self.every.nominal_rms,
+            fit=replace(found, problem=problem, r_factor=posterior.marginal, wide=None),
             reduction=replace(r, kept=columns, mixing=mixing, with_prior=f.columns),
-            nominal_rms=self.every.nominal_rms,
         )  # fmt: skip
-        spare = max(len(whitened) - posterior.effective, 1.0)
+        effective = float(posterior.effective.sum())
+        spare = max(len(found.whitened) - effective, 1.0)
         # The noise's variance is known as well as the readings that the fit has left over say.
         dof = spare / np.maximum(1 - posterior.prior_share, 1e-3) ** 2
         dof[: posterior.ordinary] = spare
@@ -492,32 +449,33 @@ class _Course:
         )
         matrix = posterior.variance * posterior.cofactor
         covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
-        intervals = Intervals(covariance, covariance.interval(fit.x[columns], LEVEL))
+        intervals = Intervals(covariance, covariance.interval(x[columns], LEVEL))
         shares = zip(columns.tolist(), posterior.prior_share.tolist(), strict=True)
         method = self.options.resolved
         if not self.estimating:
-            method = "ols" if fit.problem.weights.kind == "none" else "wls"
+            method = "ols" if problem.weights.kind == "none" else "wls"
         result = MethodResult(
             method, solution, intervals, noise, good, leverage=cross[1], standard=self.standard,
             prior_share={self.model.names[c]: s for c, s in shares if c in f.sized},
-            effective=round(posterior.effective), warnings=self._warnings(fit),
+            effective=round(effective), warnings=self._warnings(fit),
             smooth=self._parts(fit, covariance.matrix),
         )  # fmt: skip
         own = f.columns[posterior.own]
         names, nominal = tuple(self.model.names[c] for c in own), f.nominal[posterior.own]
-        prior = GaussianPrior.independent(names, nominal, fit.sigma / posterior.prior)
-        stands = float((((fit.x[own] - nominal) * posterior.prior) ** 2).sum())
+        prior = GaussianPrior.independent(names, nominal, fit.sigma / np.diag(posterior.of_own))
+        stands = float(((posterior.of_own @ (x[own] - nominal)) ** 2).sum())
         return result, FunctionPrior(prior, fit.sigma, spare, stands)
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
-        f, paid = fit.functions, np.zeros(len(fit.functions.columns))
-        paid[fit.posterior.own] = fit.posterior.effective_of
+        f, posterior, x = self.functions, fit.posterior, fit.found.x
+        paid = np.zeros(len(f.columns))
+        paid[posterior.own] = posterior.effective[posterior.ordinary :]
         return tuple(
             SmoothPart(
                 group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),
-                fit.x[group.columns], np.zeros((group.columns.size,) * 2),
-                _followed(fit.problem.observations, group),
-            ).refitted(fit.x, fit.columns, covariance)
+                x[group.columns], np.zeros((group.columns.size,) * 2),
+                _followed(fit.found.problem.observations, group),
+            ).refitted(x, fit.found.columns, covariance)
             for g, group in enumerate(f.groups)
         )  # fmt: skip
 

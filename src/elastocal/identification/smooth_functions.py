@@ -15,10 +15,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
-from elastocal.engine.mixed import Products, Standardised, climb
+from elastocal.engine.mixed import Products, climb
 from elastocal.identification.covariance import root_of, t_quantile
+from elastocal.identification.knowledge import share_of_prior
 from elastocal.identification.weighted_problem import RFactor
 from elastocal.model.manipulator import SmoothGroup
 from elastocal.units import Array, IntArray
@@ -72,10 +72,6 @@ class LinearRows:
     def ordinary(self) -> int:
         return self.factor.columns - len(self.std)
 
-    @property
-    def n_groups(self) -> int:
-        return int(self.group.max(initial=-1)) + 1
-
     @cached_property
     def products(self) -> Products:
         """Those of B_s and e with the ordinary columns projected out."""
@@ -87,7 +83,11 @@ class LinearRows:
     def scales(self, start: Scales | None = None) -> Scales:
         """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
         at the `start` stays so."""
-        alive = np.ones(self.n_groups, dtype=bool) if start is None else start.scale > 0
+        alive = (
+            np.ones(self.group.max(initial=-1) + 1, dtype=bool)
+            if start is None
+            else start.scale > 0
+        )
         own = np.flatnonzero(alive[self.group])
         group = np.unique(self.group[own], return_inverse=True)[1].ravel()
         whole = self.products
@@ -132,78 +132,69 @@ class LinearRows:
         gain[alive] = at.left_out([np.flatnonzero(group == g) for g in range(n)])
         return Scales(scale, float(np.exp(2 * theta[0])), gain)
 
-    def posterior(self, scales: Scales) -> ShrunkPosterior:
-        """The estimate and its covariance under these scales."""
-        k, root = self.ordinary, np.sqrt(scales.scale / scales.variance)[self.group] * self.std
-        own = np.flatnonzero(root > 0)
-        root, whole = root[own], self.products
-        at = Standardised.of(whole.M[np.ix_(own, own)], whole.z[own], root)
-        R = self.factor.augmented[:k]
-        # UᵀU = B_sᵀB_s + σ²/Λ, ordinary columns projected out.
-        U = at.L.T / root
-        R = np.block([[R[:, :k], R[:, k + own]], [np.zeros((len(own), k)), U]])
-        z, rows = self.factor.augmented[:k, -1], self.factor.rows
-        return ShrunkPosterior(R, z, root * at.b, k, own, 1 / root, scales.variance, rows)
+    def posterior(self, scales: Scales) -> Posterior:
+        k, std = self.ordinary, np.sqrt(scales.scale / scales.variance)[self.group] * self.std
+        own = np.flatnonzero(std > 0)
+        P = np.eye(len(own), k + len(own), k) / std[own, None]
+        rows = self.factor.of_columns(np.append(np.arange(k), k + own))
+        prior = RFactor(np.column_stack([P, np.zeros(len(own))]), 0)
+        return Posterior(rows.merged(prior), own, P, scales.variance)
 
 
 @dataclass(frozen=True)
-class ShrunkPosterior:
+class Posterior:
     """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
 
-    `R` (columns, columns) is upper triangular, RᵀR the normal matrix of readings and prior in
-    units of σ; z (ordinary,) its right side and b (own,) the shrunk parameters' estimate, from
-    nominal.  `own` index those that take part, `prior` (own,) is σ over their standard deviations.
+    `r_factor` is that of readings and prior rows P (own, columns) together, in units of σ, the
+    shrunk ones counted from nominal; `own` index those that take part.
     """
 
-    R: Array
-    z: Array
-    b: Array
-    ordinary: int
+    r_factor: RFactor
     own: IntArray
-    prior: Array
+    P: Array
     variance: float
-    rows: int
+
+    @property
+    def ordinary(self) -> int:
+        return self.r_factor.columns - len(self.own)
+
+    @property
+    def of_own(self) -> Array:
+        """P of the shrunk ones (own, own), diagonal."""
+        return self.P[:, self.ordinary :]
 
     @cached_property
+    def half(self) -> Array:
+        return self.r_factor.half
+
+    @property
     def step(self) -> Array:
-        """α and b (columns,).  Raises LinAlgError where ordinary columns depend on each other."""
-        k = self.ordinary
-        alpha = linalg.solve_triangular(self.R[:k, :k], self.z - self.R[:k, k:] @ self.b)
-        return np.concatenate([alpha, self.b])
+        """α and b (columns,)."""
+        return self.half @ self.r_factor.projected
 
-    @cached_property
+    @property
     def marginal(self) -> RFactor:
         """R of the ordinary columns with the shrunk ones taken for noise,
-        RᵀR/σ² = B_fᵀ(σ² + B_sΛB_sᵀ)⁻¹B_f; without a residual."""
-        k = self.ordinary
-        Y = linalg.solve_triangular(self.R[k:, k:], self.R[:k, k:].T, trans="T")
-        L = linalg.cholesky(np.eye(k) + Y.T @ Y, lower=True)
-        own = linalg.solve_triangular(L, self.R[:k, :k], lower=True)
-        augmented = np.zeros((k + 1, k + 1))
-        augmented[:k, :k] = linalg.qr(own, mode="r")[0]
-        return RFactor(augmented, self.rows)
+        RᵀR/σ² = B_fᵀ(σ² + B_sΛB_sᵀ)⁻¹B_f."""
+        last = np.roll(np.arange(self.r_factor.columns), len(self.own))
+        rows = self.r_factor.of_columns(last)
+        return RFactor(rows.augmented[len(self.own) :, len(self.own) :], rows.rows)
 
     @cached_property
     def cofactor(self) -> Array:
         """Covariance over σ²."""
-        half, _ = linalg.lapack.dtrtri(self.R)
-        return np.asarray(half @ half.T)
-
-    @cached_property
-    def prior_share(self) -> Array:
-        """Share of each estimate's information that is the prior's, 0 to 1."""
-        passed = self.cofactor[self.ordinary :] * self.prior[:, None]
-        return np.asarray((passed**2).sum(axis=0) / np.diag(self.cofactor))
-
-    @cached_property
-    def effective_of(self) -> Array:
-        """How many parameters' worth of each shrunk one the readings determine, 0 to 1."""
-        return np.asarray(1 - self.prior**2 * np.diag(self.cofactor)[self.ordinary :])
+        return self.half @ self.half.T
 
     @property
-    def effective(self) -> float:
-        """The same of all parameters together: the trace of the hat matrix."""
-        return self.ordinary + float(self.effective_of.sum())
+    def prior_share(self) -> Array:
+        """Share of each estimate's information that is the prior's, 0 to 1."""
+        return share_of_prior(self.cofactor, self.P)
+
+    @cached_property
+    def effective(self) -> Array:
+        """How many parameters' worth of each (columns,) the readings determine, 0 to 1: their sum
+        is the trace of the hat matrix."""
+        return np.asarray(1 - (self.P**2).sum(axis=0) * np.diag(self.cofactor))
 
 
 # What an identification says of a smooth function: its size, and how sure.
