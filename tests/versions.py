@@ -28,7 +28,7 @@ SLICE = (
     "tests/cli/test_verbs.py", "tests/cli/test_compensate.py",
     "tests/identification/test_linear.py",
     "tests/model/test_agreement_with_pinocchio.py", "tests/planning/test_design_flow.py",
-    "tests/studies/test_study_dataset.py", "tests/model/test_mjcf.py",
+    "tests/studies/test_study_results.py", "tests/model/test_mjcf.py",
     "tests/export/test_mjcf_in_place.py",
 )  # fmt: skip
 TOOLS = ("pytest", "hypothesis", "statsmodels", "rtb-data", "example-robot-data", "setuptools")

@@ -1,10 +1,13 @@
-"""elastocal init writes a cell that plans and simulates at once."""
+"""What init and design print to go on with is run as it stands."""
 
+import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
 import pytest
+from support.design_commands import design, elastocal, write_cell
 from support.mjcf_text import write_arm
 from typer.testing import CliRunner
 
@@ -63,3 +66,16 @@ def test_an_arm_is_drawn_by_its_cell_and_seed_alone(arms):
         drawn = {n: v for n, v in truths[0].items() if n.endswith("compliance")}
         # None below zero; none at zero but what turns about an axis that no load is off.
         assert min(drawn.values()) > 1e-8, drawn
+
+
+def test_a_plan_is_tried_as_told(tmp_path):
+    cell, data = write_cell(tmp_path), tmp_path / "data.csv"
+    told = design(cell, "--poses", "4")
+    (line,) = re.findall(r"To try it without an arm: elastocal (.*)", told.stdout)
+    words = line.replace("data.csv", str(data)).split()
+    assert words[-4:] == ["--load", "0", "0", "-2600"]
+    assert "every reading is unloaded" in elastocal(*words[:-4]).stderr
+    done = elastocal(*words)  # as printed: what `identify` can use
+    assert done.exit_code == 0 and "Warning" not in done.stderr, done.output
+    with data.open(encoding="utf-8", newline="") as handle:
+        assert {float(row["force_z_N"]) for row in csv.DictReader(handle)} == {0.0, -2600.0}

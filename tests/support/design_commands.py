@@ -86,10 +86,5 @@ def planned(cell: Path, *extra: object, output: str = "plan.csv") -> dict[str, A
     return found
 
 
-def deviations(plan: dict[str, Any]) -> dict[str, float]:
-    """Predicted standard deviations by parameter."""
-    return {p["name"]: p["std"] for p in plan["predicted"]}
-
-
 def everything_in(folder: Path) -> list[str]:
     return sorted(os.listdir(folder))
