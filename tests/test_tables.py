@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.errors import InputError
-from elastocal.tables import NO_UNIT, Family, csv_text, layout_of_columns, match_columns, read_table
+from elastocal.tables import NO_UNIT, Family, check_columns, csv_text, match_columns, read_table
 from elastocal.text import cell_text
 
 FAMILIES = {
@@ -26,8 +26,8 @@ FAMILIES = {
 
 def read(text, **options):
     def choose(header):
-        present = match_columns("t.csv", header, FAMILIES)
-        return layout_of_columns("t.csv", present, FAMILIES, [("place",)], "this table needs")
+        found = match_columns("t.csv", header, FAMILIES)
+        return check_columns("t.csv", found, FAMILIES, [("place",)], "this table needs")
 
     return read_table("t.csv", choose, what="list", text=text, **options)
 

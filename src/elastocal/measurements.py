@@ -18,7 +18,7 @@ from elastocal import tables
 from elastocal.above import DataFrame, Result, checked_arguments, later
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer, open_input, read_text
-from elastocal.tables import NO_UNIT, Family, Labels, Layout, RawTable, column
+from elastocal.tables import NO_UNIT, Columns, Family, Labels, RawTable, column
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
@@ -460,31 +460,31 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
     return {family.name: family for family in known}
 
 
-def layout_of(
+def columns_of(
     source: str,
     header: Sequence[str],
     joint_kinds: Sequence[str],
     observe: str,
     extra: Sequence[Family] = (),
-) -> Layout:
+) -> Columns:
     """What the columns of a table mean.
 
     `joint_kinds`: "revolute" or "prismatic" per joint; `observe` decides what must be there;
     `extra`: families that this table may have besides.
     """
     known = families(joint_kinds) | {family.name: family for family in extra}
-    present = tables.match_columns(
+    found = tables.match_columns(
         source,
         header,
         known,
         lambda text: observe in PLANS and (text in PLAN_ONLY or text.startswith(BESIDE_COMMANDS)),
         lambda text: _wrong_joint(text, header, known),
     )
-    stated = observe != "targets" or "q" in present  # targets need no joints, perhaps no positions
-    if joint_kinds and stated and len(present.get("q", {})) != len(joint_kinds):
+    stated = observe != "targets" or "q" in found  # targets need no joints, perhaps no positions
+    if joint_kinds and stated and len(found.get("q", ())) != len(joint_kinds):
         raise InputError(f"{source}: {_wrong_count(header, known['q'])}")
     needed_by = f'observe = "{observe}" in the cell file needs'
-    return tables.layout_of_columns(source, present, known, REQUIRED[observe], needed_by, EXCLUSIVE)
+    return tables.check_columns(source, found, known, REQUIRED[observe], needed_by, EXCLUSIVE)
 
 
 def _wrong_joint(text: str, header: Sequence[str], known: Mapping[str, Family]) -> str | None:
@@ -535,18 +535,18 @@ def read_measurements(
     Raises InputError that names file, line, column and the offending text.
     """
 
-    def choose(header: Sequence[str]) -> Layout:
+    def choose(header: Sequence[str]) -> Columns:
         planned = {"configuration", "level", "order"} <= set(header)
         if planned and observe not in ("plan", "targets") and not any(map(READING.match, header)):
             raise InputError(
                 f"{path}: this is a plan, which has no readings yet; give the measurements of its "
                 f"poses (a new plan takes poses of this one by {option('keep')})"
             )
-        return layout_of(str(path), header, joint_kinds, observe)
+        return columns_of(str(path), header, joint_kinds, observe)
 
     raw = tables.read_table(path, choose, text=text)
     n = len(raw.row)
-    found = {name: _values(raw, name) for name in raw.layout.columns}
+    found = {name: _values(raw, name) for name in raw.columns}
     # A plan without the column is of all markers.
     marker = _marker(raw, marker_names if observe not in PLANS or "marker" in raw.labels else ())
     configuration = raw.labels.get("configuration")
@@ -598,7 +598,7 @@ RULES: dict[str, tuple[Callable[[Array], np.ndarray], str]] = {
 
 def _values(raw: RawTable, family: str) -> Array | None:
     """The numbers of a family (n, k) in SI units, where they keep its rule; None for labels."""
-    if raw.layout.columns[family][0].header in raw.labels:
+    if raw.columns[family][0].is_label:
         return None
     values = raw.si(family)
     if values is not None and family in RULES:

@@ -244,11 +244,16 @@ class Family:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a file: its header, the stem of that, and its unit, "" where there is none."""
+    """A column of a file: its header, the stem of that, and its unit, "" where there is none.
+
+    `is_label`: texts instead of numbers; `may_be_blank`: its cells may be empty.
+    """
 
     header: str
     stem: str
     unit: str
+    is_label: bool = False
+    may_be_blank: bool = False
 
 
 def column(stem: str, unit: str) -> str:
@@ -256,23 +261,9 @@ def column(stem: str, unit: str) -> str:
     return f"{stem}_{unit}" if unit else stem
 
 
-@dataclass(frozen=True)
-class Layout:
-    """`columns`: the families present, each with its columns in the order of its stems.
-
-    `labels`, `numbers`: the headers of the columns of texts and of numbers; `blanks`: of those
-    whose cells may be empty.
-    """
-
-    columns: Mapping[str, tuple[Column, ...]]
-    labels: tuple[str, ...]
-    numbers: tuple[str, ...]
-    blanks: frozenset[str] = frozenset()
-
-
-ChooseLayout = Callable[[Sequence[str]], Layout]
-# The columns found so far: family → stem → column.
-Present = dict[str, dict[str, Column]]
+# The columns of a table by their families, each in the order of its stems.
+Columns = Mapping[str, tuple[Column, ...]]
+Choose = Callable[[Sequence[str]], Columns]  # by the header
 
 
 def match_columns(
@@ -281,7 +272,7 @@ def match_columns(
     known: Mapping[str, Family],
     passed_over: Callable[[str], bool] = lambda text: False,
     explain: Callable[[str], str | None] = lambda text: None,
-) -> Present:
+) -> Columns:
     """Which column of a header is which of the `known` families.
 
     `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
@@ -293,7 +284,7 @@ def match_columns(
         for stem, units in family.units.items()
         for unit in units
     }
-    present: Present = {}
+    present: dict[str, dict[str, Column]] = {}
     for text in header:
         if text.startswith(IGNORED) or passed_over(text):
             continue
@@ -311,63 +302,55 @@ def match_columns(
                     f"{source}: columns {other.header} and {text} mix units; give all "
                     f"{family.meaning} in one unit"
                 )
-        found[stem] = Column(text, stem, unit)
-    return present
+        found[stem] = Column(text, stem, unit, family.is_label, stem in family.optional)
+    return {
+        name: tuple(found[stem] for stem in known[name].units if stem in found)
+        for name, found in present.items()
+    }
 
 
-def layout_of_columns(
+def check_columns(
     source: str,
-    present: Present,
+    columns: Columns,
     known: Mapping[str, Family],
     needed: Sequence[Sequence[str]] = (),
     needed_by: str = "",
     exclusive: Sequence[tuple[str, str]] = (),
-) -> Layout:
-    """The layout of a table with these columns.
+) -> Columns:
+    """These columns, where they make a table: no family is there in part.
 
     `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
     needs"); `exclusive`: pairs of families that say the same.
     """
-    for name, found in present.items():
-        family, unit = known[name], next(iter(found.values())).unit
+    for name, found in columns.items():
+        family, unit, stems = known[name], found[0].unit, [c.stem for c in found]
         absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
-                  for s in family.required if s not in found]  # fmt: skip
+                  for s in family.required if s not in stems]  # fmt: skip
         if absent:
             raise InputError(
-                f"{source}: {listed(c.header for c in found.values())} without {listed(absent)}; "
+                f"{source}: {listed(c.header for c in found)} without {listed(absent)}; "
                 f"the table needs all columns of the {family.meaning}"
                 f"{'' if (name,) in needed else ', or none'}"
             )
     for one, other in exclusive:
-        if one in present and other in present:
-            pair = [next(iter(present[name].values())).header for name in (one, other)]
+        if one in columns and other in columns:
+            pair = [columns[name][0].header for name in (one, other)]
             raise InputError(
                 f"{source}: {pair[0]} … and {pair[1]} … say the same in two ways "
                 f"({known[one].meaning}, {known[other].meaning}); keep one"
             )
     for choices in needed:
-        if not any(name in present for name in choices):
+        if not any(name in columns for name in choices):
             wanted = " or ".join(
                 ",".join(known[name].columns(stem)[0] for stem in known[name].required)
                 for name in choices
             )
-            there = listed((c.header for cs in present.values() for c in cs.values()), 12)
+            there = listed((c.header for found in columns.values() for c in found), 12)
             raise InputError(
                 f"{source}: the columns {wanted} are missing, which {needed_by}; found "
                 f"{there or 'no known column'}"
             )
-    columns = {
-        name: tuple(found[stem] for stem in known[name].units if stem in found)
-        for name, found in present.items()
-    }
-
-    every = [(known[name], c) for name, cs in columns.items() for c in cs]
-    return Layout(
-        columns,
-        labels=tuple(c.header for family, c in every if family.is_label),
-        numbers=tuple(c.header for family, c in every if not family.is_label),
-        blanks=frozenset(c.header for family, c in every if c.stem in family.optional),
-    )
+    return columns
 
 
 def _check_names(source: str, header: Sequence[str]) -> None:
@@ -453,7 +436,7 @@ class RawTable:
     source: str
     noun: str
     row: IntArray
-    layout: Layout
+    columns: Columns
     numbers: Mapping[str, Array]
     labels: Mapping[str, Labels]
 
@@ -463,7 +446,7 @@ class RawTable:
 
     def column(self, family: str, stem: str) -> Column | None:
         """The column of a stem, None where the file has none."""
-        found = self.layout.columns.get(family, ())
+        found = self.columns.get(family, ())
         return next((column for column in found if column.stem == stem), None)
 
     def text(self, i: int, header: str) -> str:
@@ -473,11 +456,11 @@ class RawTable:
 
     def si(self, family: str) -> Array | None:
         """The columns of a family side by side (n, k) in SI units, None where there are none."""
-        if family not in self.layout.columns:
+        if family not in self.columns:
             return None
         with np.errstate(over="ignore"):
             values = np.column_stack(
-                [to_si(self.numbers[c.header], c.unit) for c in self.layout.columns[family]]
+                [to_si(self.numbers[c.header], c.unit) for c in self.columns[family]]
             )
         self.check(family, ~np.isinf(values), "too large to be a number here")
         return values
@@ -487,7 +470,7 @@ class RawTable:
         if good.all():
             return
         i, k = (int(v) for v in np.argwhere(~good)[0])
-        header = self.layout.columns[family][k].header
+        header = self.columns[family][k].header
         raise InputError(
             f"{self.where(i, header)}: {rule}; found {self.numbers[header][i]:.6g}; correct or "
             f"drop the {self.noun}"
@@ -495,12 +478,15 @@ class RawTable:
 
     def check_labels(self) -> None:
         """Raises InputError for the first label that is empty or has control characters."""
-        for header, labels in self.labels.items():
+        for column in (c for own in self.columns.values() for c in own if c.is_label):
+            labels = self.labels[column.header]
             for code, name in enumerate(labels.names):
-                if not is_label(name) and (name or header not in self.layout.blanks):
+                if not is_label(name) and (name or not column.may_be_blank):
                     i = int(np.argmax(labels.codes == code))
                     what = f"{quoted(name)} has control characters" if name else "empty cell"
-                    raise InputError(f"{self.where(i, header)}: {what}; write a name or number")
+                    raise InputError(
+                        f"{self.where(i, column.header)}: {what}; write a name or number"
+                    )
 
 
 # Sources
@@ -511,7 +497,7 @@ PARQUET = (".parquet", ".pq")
 
 def read_table(
     path: str | Path,
-    choose: ChooseLayout,
+    choose: Choose,
     *,
     what: str = "measurement table",
     comments: bool = False,
@@ -543,23 +529,25 @@ def read_table(
 
 
 def _read(
-    source: str, noun: str, header: Sequence[str], rows: Iterator[Row], choose: ChooseLayout,
-    commas: bool,
+    source: str, noun: str, header: Sequence[str], rows: Iterator[Row],
+    choose: Choose, commas: bool,
 ) -> RawTable:  # fmt: skip
     """The columns that `choose` picks; `commas`: decimal commas may be used."""
-    layout = choose(header)
-    columns = {i: name for i, name in enumerate(header) if name in layout.numbers}
+    chosen = choose(header)
+    every = [column for family in chosen.values() for column in family]
+    pieces: dict[str, list[Array]] = {c.header: [] for c in every if not c.is_label}
+    labels: dict[str, list[str]] = {c.header: [] for c in every if c.is_label}
+    blanks = {c.header for c in every if c.may_be_blank}
+    columns = {i: name for i, name in enumerate(header) if name in pieces}
     found: list[int] = []
-    pieces: dict[str, list[Array]] = {name: [] for name in layout.numbers}
-    labels: dict[str, list[str]] = {name: [] for name in layout.labels}
     marks: dict[str, str] = {}
     while some := list(islice(rows, ROWS_AT_ONCE)):
         found += [number for number, _ in some]
         by_column = zip(*(cells for _, cells in some), strict=True)
         texts = dict(zip(header, by_column, strict=True))
-        plain = {name: _plain_numbers(texts[name]) for name in layout.numbers}
+        plain = {name: _plain_numbers(texts[name]) for name in pieces}
         unclear = commas or any(numbers is None for numbers in plain.values())
-        known = (columns, commas, layout.blanks, marks, noun)
+        known = (columns, commas, blanks, marks, noun)
         if unclear and (problem := first_bad_cell(source, some, *known)):
             raise problem
         for name, numbers in plain.items():
@@ -568,7 +556,7 @@ def _read(
             read += texts[name]
     values = {name: np.concatenate(read) for name, read in pieces.items()}
     coded = {name: Labels.of(read) for name, read in labels.items()}
-    return RawTable(source, noun, np.array(found, dtype=np.int64), layout, values, coded)
+    return RawTable(source, noun, np.array(found, dtype=np.int64), chosen, values, coded)
 
 
 PLAIN = re.compile(r"(?:[ \t]*[+-]?[0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]+)?[ \t]*\n)*")

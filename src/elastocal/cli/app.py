@@ -39,6 +39,7 @@ from elastocal.errors import (
     explained,
     flag_of,
     options_as_flags,
+    require,
 )
 from elastocal.files import check_ending
 from elastocal.screen import complain, interrupts, progress_line, safe_console, say
@@ -173,48 +174,12 @@ def _ended(error: BaseException) -> int:
     return 2
 
 
-def console(stderr: bool = False) -> Console:
-    return safe_console(stderr=stderr)
-
-
 # The files that a command reads and writes: checked before the work, written after it.
 
 
 def repeated() -> str:
     """The command line that repeats this run, as results name it."""
     return shlex.join(["elastocal", *sys.argv[1:]])
-
-
-def check_outputs(*asked: tuple[Path | None, str]) -> list[Path]:
-    """The outputs asked for, each with the endings that it may have, between blanks; one that
-    cannot be written, or is named as something else, is refused before the work starts."""
-    wanted = [(path, endings.split()) for path, endings in asked if path is not None]
-    for path, endings in wanted:
-        folder = path.absolute().parent
-        if path.is_dir():
-            raise InputError(f"{path} is a directory; name a file to write")
-        if not folder.is_dir():
-            raise InputError(f"{path}: the folder {folder} does not exist; create it first")
-        if not os.access(folder, os.W_OK):
-            raise InputError(f"{path}: no permission to write in {folder}")
-        if endings:
-            check_ending(path, endings)
-    return [path for path, _ in wanted]
-
-
-def check_apart(written: list[Path], read: Iterable[Path | None], cell: Cell | None = None) -> None:
-    """Refuse to write over an input or a file that the `cell` names, or two outputs into one."""
-    # Not Path.resolve, which raises RuntimeError where links go round in a circle.
-    inputs = {os.path.realpath(path) for path in read if path is not None}
-    inputs |= set() if cell is None else {os.path.realpath(path) for path in files_of(cell)}
-    taken: set[str] = set()
-    for path in written:
-        real = os.path.realpath(path)
-        if real in inputs:
-            raise InputError(f"{path} is read and would be written over; name another output")
-        if real in taken:
-            raise InputError(f"{path}: two outputs of the same name; name another one")
-        taken.add(real)
 
 
 def files_of(cell: Cell) -> list[Path]:
@@ -278,14 +243,36 @@ class Run:
         self.written: list[Path] = []
 
     def writes(self, *asked: tuple[Path | None, str]) -> None:
-        """The outputs asked for, each with its endings; refused before the work where one cannot
-        be written or is named as something else."""
-        self.written = check_outputs(*asked)
+        """The outputs asked for, each with the endings that it may have, between blanks; one that
+        cannot be written, or is named as something else, is refused before the work starts."""
+        for path, endings in asked:
+            if path is None:
+                continue
+            folder = path.absolute().parent
+            require(not path.is_dir(), f"{path} is a directory; name a file to write")
+            told = f"{path}: the folder {folder} does not exist; create it first"
+            require(folder.is_dir(), told)
+            told = f"{path}: no permission to write in {folder}"
+            require(os.access(folder, os.W_OK), told)
+            if endings:
+                check_ending(path, endings.split())
+        self.written = [path for path, _ in asked if path is not None]
 
     def reads(self, *paths: Path | None, cell: Cell | None = None) -> list[Path]:
-        """The inputs that are given, none of which, nor a file of the cell, is written over."""
-        check_apart(self.written, paths, cell)
-        return [path for path in paths if path is not None]
+        """The inputs that are given.  Refused is to write over one of them or a file that the
+        `cell` names, or two outputs into one."""
+        given = [path for path in paths if path is not None]
+        # Not Path.resolve, which raises RuntimeError where links go round in a circle.
+        inputs = {*map(os.path.realpath, [*given, *(() if cell is None else files_of(cell))])}
+        taken: set[str] = set()
+        for path in self.written:
+            real = os.path.realpath(path)
+            told = f"{path} is read and would be written over; name another output"
+            require(real not in inputs, told)
+            told = f"{path}: two outputs of the same name; name another one"
+            require(real not in taken, told)
+            taken.add(real)
+        return given
 
     def progress(self) -> AbstractContextManager[Callable[[str], None]]:
         """Tells on stderr what is done, where the user wants to know."""
@@ -298,7 +285,7 @@ class Run:
         if self.json:
             say(json_text(content()))
             return False
-        show(console())
+        show(safe_console())
         for path in self.written if files else ():
             say(f"wrote {path}")
         return True

@@ -22,13 +22,12 @@ from elastocal.cli.app import (
     Run,
     Seed,
     command,
-    console,
     files_of,
     repeated,
     whole_numbers,
 )
 from elastocal.errors import InputError, require
-from elastocal.screen import interrupt_check, say
+from elastocal.screen import interrupt_check, safe_console, say
 from elastocal.text import json_text, listed
 
 if TYPE_CHECKING:
@@ -138,11 +137,9 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     screen.print('In the cell: [model] effects = ["joint_offset", "backlash:joint2"].')
 
 
-# init and effects: how to begin, and what there is to fit.
+# design: a plan of poses.
 
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
-
-
 CURVE = "--curve takes numbers of poses, as in 10,15,20"
 
 
@@ -517,7 +514,7 @@ def import_(
     if run.json:
         say(json_text(_understood(found, output)))
     elif preview:
-        screen = console()
+        screen = safe_console()
         print_blocks(screen, import_blocks(found, screen.width))
     else:
         for warning in found.warnings:
@@ -554,10 +551,7 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
         "files": [
             {
-                "file": observed.path, "preset": observed.preset, "role": observed.role,
-                "encoding": observed.encoding, "layout": observed.layout,
-                "decimal": observed.decimal,
-                "rows": observed.rows, "unused": list(observed.unused),
+                **vars(observed),
                 "columns": [
                     {"from": name, "to": to, "unit": unit} for name, to, unit in observed.columns
                 ],

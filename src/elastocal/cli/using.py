@@ -36,7 +36,6 @@ from elastocal.screen import complain, progress_line, say
 from elastocal.text import listed
 
 if TYPE_CHECKING:
-    from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.correction_table import CorrectionGrid, CorrectionTable
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
@@ -412,7 +411,12 @@ def compensate(
         box (X0,Y0,Z0,X1,Y1,Z1): Grid over this box in mm in the base frame, not over the joints.
         rotation (RX,RY,RZ): Rotation vector of the tool in --box, in degrees.
     """
-    from elastocal.compensation.compensate import one_target
+    from elastocal.compensation.compensate import (
+        check_reached,
+        commands_csv,
+        one_target,
+        summary,
+    )
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
@@ -434,9 +438,12 @@ def compensate(
         wanted = targets if target is None else one_target(target, asked["frame"], force)
         if wanted is not None:
             found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
-            content["commands"], text = _commands(found, output is None, partial)
+            if not partial:
+                check_reached(found)
+            kinds = found.chain.kinds
+            content["commands"] = summary(found, kinds, commands=output is None)
             if output is not None:
-                texts[output] = text
+                texts[output] = commands_csv(found, kinds)
         if table is not None and lines is not None:
             from elastocal.compensation.correction_table import correction_table
             from elastocal.model.calibrated import tool_point
@@ -531,21 +538,9 @@ def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) 
     return box_grid(corners[:3], corners[3:], counts, turned)
 
 
-def _commands(found: Compensation, listed: bool, partial: bool) -> tuple[dict[str, Any], str]:
-    """Summary of the commands, with each of them where `listed`, and their table as CSV.
-
-    Raises InsufficientDataError where rows are not reached and `partial` does not allow for that.
-    """
-    from elastocal.compensation.compensate import check_reached, commands_csv, summary
-
-    if not partial:
-        check_reached(found)
-    kinds = found.chain.kinds
-    return summary(found, kinds, commands=listed), commands_csv(found, kinds)
-
-
 def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[dict[str, Any], str]:
-    """Summary of the correction table, and the table as CSV; refused as `_commands` is."""
+    """Summary of the correction table, and the table as CSV; refused where points are not
+    reached and `partial` does not allow for that."""
     import numpy as np
 
     from elastocal.compensation.compensate import (

@@ -484,7 +484,7 @@ class Understood:
     the file's other columns; `ignored`: (line, reason) of everything passed over.
     """
 
-    path: str
+    file: str
     preset: str | None
     role: str
     encoding: str
@@ -646,7 +646,7 @@ def _read(
     mark = {"tab": "tabs", "space": "blanks"}.get(table.split_at, f"{table.split_at!r}")
     program = table.split_at in ("KRL", "RAPID")
     understood = Understood(
-        path=name,
+        file=name,
         preset=source.preset,
         role=source.role or "both",
         encoding=encoding,

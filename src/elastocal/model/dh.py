@@ -32,10 +32,10 @@ from elastocal.model.rigid import nominal_flanges
 from elastocal.tables import (
     NO_UNIT,
     Column,
+    Columns,
     Family,
-    Layout,
     RawTable,
-    layout_of_columns,
+    check_columns,
     match_columns,
     read_table,
 )
@@ -132,11 +132,9 @@ def dh_number(table: RawTable, i: int, family: str, stem: str) -> float:
 def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str) -> RawTable:
     named = {family.name: family for family in known}
 
-    def choose(header: Sequence[str]) -> Layout:
-        present = match_columns(str(path), header, named, explain=partial(_meant, known, what))
-        return layout_of_columns(
-            str(path), present, named, [(n,) for n in needed], f"a {what} needs"
-        )
+    def choose(header: Sequence[str]) -> Columns:
+        found = match_columns(str(path), header, named, explain=partial(_meant, known, what))
+        return check_columns(str(path), found, named, [(n,) for n in needed], f"a {what} needs")
 
     return read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
 
@@ -278,7 +276,7 @@ def _limits(table: RawTable, i: int, kind: JointKind) -> tuple[float, float]:
             )
     lower, upper = (dh_number(table, i, own, side) for side in ENDS)
     if lower >= upper:
-        where = table.where(i, *(column.header for column in table.layout.columns[own]))
+        where = table.where(i, *(column.header for column in table.columns[own]))
         raise InputError(f"{where}: lower is not below upper; check the limits")
     return (-np.inf if math.isnan(lower) else lower, np.inf if math.isnan(upper) else upper)
 

@@ -16,7 +16,7 @@ from elastocal.config import place
 from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.identification.prediction import NewPoses
 from elastocal.identification.solve import Reduction
-from elastocal.measurements import NUMBERED, Measurements, families, layout_of, rotation_column
+from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -27,7 +27,7 @@ from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import told
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, readings_at, why
-from elastocal.tables import NO_UNIT, Family, Layout, read_table
+from elastocal.tables import NO_UNIT, Columns, Family, read_table
 from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -106,12 +106,12 @@ MOST_POSES = 10_000
 Spec = TargetPose | TargetPath | TargetBox | None
 
 
-def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> Layout:
+def _columns(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> Columns:
     in_joints = any((m := NUMBERED.fullmatch(text)) and m[1] == "q" for text in header)
     kinds = joint_kinds if in_joints else ()
-    layout = layout_of(source, header, kinds, "plan", extra=(WEIGHT,))
-    columns = {n: cs for n, cs in layout.columns.items() if n in (*TAKEN, WEIGHT.name)}
-    for name, family in layout.columns.items():
+    every = columns_of(source, header, kinds, "plan", extra=(WEIGHT,))
+    columns = {n: cs for n, cs in every.items() if n in (*TAKEN, WEIGHT.name)}
+    for name, family in every.items():
         if name not in columns and name != "configuration":
             raise InputError(
                 f"{source}: column {quoted(family[0].header)} has no meaning in a path; drop it, "
@@ -129,8 +129,7 @@ def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> L
             f"{source}: the columns {joints}_deg … or x_mm,y_mm,z_mm are missing; a path needs "
             f"the joints or the positions of its poses; found {listed(header, 12)}"
         )
-    numbers = tuple(column.header for family in columns.values() for column in family)
-    return Layout(columns, (), numbers)
+    return columns
 
 
 # The test poses: where position must be right, under which load, at which point of the tool.
@@ -256,8 +255,8 @@ class _Sources:
         """The poses of a table: q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw …
         where the rotation is prescribed; force_x_N … and weight may be added."""
         file = str(spec.file)
-        raw = read_table(spec.file, lambda header: _layout(file, header, self.chain.kinds))
-        columns, n, weight = raw.layout.columns, len(raw.row), raw.si(WEIGHT.name)
+        raw = read_table(spec.file, lambda header: _columns(file, header, self.chain.kinds))
+        columns, n, weight = raw.columns, len(raw.row), raw.si(WEIGHT.name)
         require(
             n <= MOST_POSES,
             f"{raw.source}: {n} poses; a path takes at most {MOST_POSES}; thin it out: "

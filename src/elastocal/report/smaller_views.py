@@ -331,7 +331,7 @@ def left_out(found: Imported) -> list[str]:
     for observed in found.understood:
         if n := len(observed.ignored):
             rows = listed((f"line {line} ({reason})" for line, reason in observed.ignored), 8)
-            lines.append(f"{observed.path}: passed over {say.counted(n, 'line')}: {rows}")
+            lines.append(f"{observed.file}: passed over {say.counted(n, 'line')}: {rows}")
     if (joined := found.joined) is not None:
         for told, names in (("left out, without joint values: %d points", joined.left_out),
                             ("poses without a point: %d", joined.unused)):  # fmt: skip
@@ -348,7 +348,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
         preset = f"preset {seen.preset}, " if seen.preset else ""
         decimals = ", decimal commas" if seen.decimal == "," else ""
         yield say.Heading(
-            f"{seen.path}: {say.counted(seen.rows, 'row')} of {ROLES[seen.role]} "
+            f"{seen.file}: {say.counted(seen.rows, 'row')} of {ROLES[seen.role]} "
             f"({preset}{seen.encoding}, {seen.layout}{decimals})"
         )
         rows = [(name, column, unit or "–") for name, column, unit in seen.columns]
