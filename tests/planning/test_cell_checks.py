@@ -53,7 +53,6 @@ def cell(workspace: Workspace | None = None, model: Any = None, **design: Any) -
             cell(test_poses=(TargetPose(HOME), TargetPose(HIGH, degrees=True))),
             ["q_deg of [[design.test_pose]] no. 2: joint2", "at 10°", "correct the posture"],
         ),
-        (cell(test_poses=(TargetPose(HOME[:1]),)), ["q_si of [[design.test_pose]] no. 1 has 1"]),
     ],
 )
 def test_what_does_not_fit_is_told_with_key_found_and_remedy(bad: Cell, told: list[str]) -> None:

@@ -62,7 +62,6 @@ def work_cell(**design_: Any) -> Cell:
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
 LEVELS = {"joint2": (-0.5, -1.2, -2.0)}
 CELLS: dict[str, Callable[[], Cell]] = {
-    "UR10, geometry": lambda: packaged("UR10", GEOMETRY, poses=12, candidates=200),
     "7 axes, D": lambda: packaged(
         "iiwa14", ("base_frame", "joint_compliance", "marker_position"),
         loads=LIGHT, poses=8, candidates=150, criterion="D",
@@ -75,10 +74,6 @@ CELLS: dict[str, Callable[[], Cell]] = {
         loads=DOWN[None], poses=5, candidates=100,
         motion=Motion(home=HOME, both_directions=True, overshoot=0.05),
     ),
-    "full poses, A": lambda: plan_cell(
-        FEW, "pose", loads=BOTH, poses=6, candidates=120, criterion="A",
-        interest=("joint_compliance",),
-    ),
 }  # fmt: skip
 CHAINS: dict[str, tuple[Callable[[], Chain], Callable[[Chain], Cell]]] = {
     "scara, E": (
@@ -90,10 +85,6 @@ CHAINS: dict[str, tuple[Callable[[], Chain], Callable[[Chain], Cell]]] = {
                            levels={"joint2": (-0.2, 0.1, 0.3)}, per_level=(1, 3, 1)),
     ),
 }  # fmt: skip
-LONG = ("UR10, geometry", "full poses, A")
-ALL = [
-    pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in (*CELLS, *CHAINS)
-]
 
 
 @lru_cache
@@ -186,10 +177,18 @@ def what_is_predicted_is_the_inverse_of_the_information(
     std = np.sqrt(np.diag(V)) * setup.information.sizes
     assert np.allclose([p.std for p in plan.predicted], std, rtol=1e-5)
     assert all(r.loss >= 1 - 1e-9 for r in plan.reasons)
-    assert len(plan.reasons) == len(plan.q)
+    for q, reason in zip(plan.q, plan.reasons, strict=True):
+        B = setup.information.blocks(q[None])[0]
+        less = np.linalg.inv((M - B.T @ B) / np.outer(scale, scale)) / np.outer(scale, scale)
+        growth = dict(
+            zip(setup.information.names, np.sqrt(np.diag(less) / np.diag(V)), strict=True)
+        )
+        for name, factor in reason.serves:
+            assert factor == pytest.approx(growth[name], rel=1e-3) or np.isinf(factor)
+        assert all(f >= 1.005 for _, f in reason.serves)
 
 
-@pytest.mark.parametrize("name", ALL)
+@pytest.mark.parametrize("name", [*CELLS, *CHAINS])
 def test_a_plan_is_allowed_free_and_worth_what_it_says(name: str) -> None:
     found = planned(name)
     every_pose_is_allowed_in_every_state(*found)
@@ -198,30 +197,11 @@ def test_a_plan_is_allowed_free_and_worth_what_it_says(name: str) -> None:
     what_is_predicted_is_the_inverse_of_the_information(*found)
 
 
-@pytest.mark.long
-def test_quick_plans_of_a_whole_geometry_are_certified_on_the_continuum() -> None:
-    effects = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
-    cell = plan_cell(effects, "position", loads=BOTH, poses=30, candidates=None)
-    c = design(cell, DesignOptions("quick")).certificate
-    assert c.efficiency_continuum is not None and c.efficiency_pool is not None
-    assert 0.85 < c.efficiency_continuum <= c.efficiency_pool
-
-
-@pytest.mark.parametrize("make", [plan_cell, pytest.param(work_cell, marks=pytest.mark.long)])
-def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
-    make: Callable[..., Cell],
-) -> None:
-    n = 40 if make is plan_cell else 150
-    plans = {
-        effort: design(make(loads=DOWN[None], poses=4, candidates=n), DesignOptions(effort))
-        for effort in ("quick", "normal")
-    }
-    normal = plans["normal"]
-    assert normal.value <= plans["quick"].value
+def test_normal_effort_polishes_off_the_pool_and_is_no_worse() -> None:
+    cell = plan_cell(loads=DOWN[None], poses=4, candidates=40)
+    quick, normal = (design(cell, DesignOptions(effort)) for effort in ("quick", "normal"))
+    assert normal.value <= quick.value
     assert normal.polished > 0
-    rules = Feasibility(normal.model.cell, normal.model.chain)
-    for force in BOTH:
-        assert rules.check(normal.q, force).ok.all()
 
 
 # --- what the cell says and the plan heeds -----------------------------------------------------

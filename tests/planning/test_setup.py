@@ -1,4 +1,5 @@
-"""What a plan is worth, against the covariance that identification gives to its readings."""
+"""What a plan is worth, by the covariance that identification gives to its readings, and which
+parameters it can make certain."""
 
 from __future__ import annotations
 
@@ -10,36 +11,36 @@ import pytest
 from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import (
+    FULL,
     any_cell,
     as_table,
     plan_cell,
     scara,
     setup_of,
-    sliding_chain,
     spread,  # fmt: skip
 )
-from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Nominal, PolarNoise
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
+from elastocal.errors import InputError, InsufficientDataError
+from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.options import Options
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.chain import Chain
-from elastocal.model.dh import read_dh
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.model.urdf import read_urdf
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.information import Known
+from elastocal.planning.information import Known, PoseInformation, interest_of
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])
 POLAR = PolarNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
-POSES = random_poses(CHAIN, 100, seed=1)
+POSES = random_poses(CHAIN, 120, seed=1)
+SIDEWAYS = np.array([0.0, 1500.0, 0.0])
 SAGGING = {
     "link_gravity": True,
     "nominal": Nominal(joint_compliance=COMPLIANCE, gravity_compensator=COMPENSATOR),
@@ -85,51 +86,27 @@ def remaining_error(cell: Cell, chain: Chain, q: NDArray, targets: TargetPoses) 
     return float(np.einsum("t,tij->", targets.weight, moved**2))
 
 
-def dh_chain(folder: Any) -> Chain:
-    """A Puma-like arm by its DH table."""
-    file = folder / "dh.csv"
-    rows = ["0,0,0,1.5708", "0,0,0.4318,0", "0,0.15,0.02,-1.5708", "0,0.43,0,1.5708",
-            "0,0,0,-1.5708", "0,0.06,0,0"]  # fmt: skip
-    file.write_text("theta0_rad,d_m,a_m,alpha_rad\n" + "\n".join(rows) + "\n", encoding="utf-8")
-    return read_dh(file)
-
-
 SMALL = BOTH / 50
 FEW = ("base_frame", "joint_offset", "joint_compliance")
-CASES: dict[str, tuple[Any, Any]] = {
-    "deflections": (CHAIN, lambda c: plan_cell(loads=DOWN[None], repeats=3)),
+CASES: dict[str, tuple[Chain, Cell]] = {
     "deflections of a sagging arm": (
-        CHAIN, lambda c: plan_cell(loads=DOWN[None], model=SAGGING, noise=POLAR)
+        CHAIN, plan_cell(loads=DOWN[None], model=SAGGING, noise=POLAR, repeats=3)
     ),
-    "positions, polar": (CHAIN, lambda c: plan_cell(FEW, "position", POLAR, loads=BOTH)),
+    "positions, polar": (CHAIN, plan_cell(FEW, "position", POLAR, loads=BOTH)),
     "compensator": (
-        CHAIN,
-        lambda c: plan_cell((*FEW, "gravity_compensator"), "position", model=SAGGING, loads=BOTH),
+        CHAIN, plan_cell((*FEW, "gravity_compensator"), "position", model=SAGGING, loads=BOTH)
     ),
-    "full poses": (CHAIN, lambda c: plan_cell(FEW, "pose", loads=BOTH)),
-    "scara": (scara(), lambda c: any_cell(c, FEW, loads=SMALL)),
-    "sliding joints": (sliding_chain(), lambda c: any_cell(c, FEW, loads=SMALL)),
+    "full poses": (CHAIN, plan_cell(FEW, "pose", loads=BOTH)),
+    "scara": (scara(), any_cell(scara(), FEW, loads=SMALL)),
     "distances": (
-        CHAIN,
-        lambda c: plan_cell(("joint_compliance", "distance_sensor"), "distance", loads=BOTH),
+        CHAIN, plan_cell(("joint_compliance", "distance_sensor"), "distance", loads=BOTH)
     ),
-    "7 axes, deflections": (
-        "Panda", lambda c: any_cell(c, ("joint_compliance",), observe="deflection", loads=SMALL)
-    ),
-    "DH": (None, lambda c: any_cell(c, FEW, loads=SMALL)),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_value_is_what_identification_would_leave_at_the_test_poses(
-    case: str, tmp_path: Any
-) -> None:
-    chain, make = CASES[case]
-    if isinstance(chain, str):
-        path, flange = packaged_urdf(chain)
-        chain = read_urdf(path, flange=flange)
-    chain = chain or dh_chain(tmp_path)
-    cell = make(chain)
+def test_the_value_is_what_identification_would_leave_at_the_test_poses(case: str) -> None:
+    chain, cell = CASES[case]
     q = TABLE_2 if chain is CHAIN else spread(chain, 15, 2)
     poses = [TargetPose(p, weight=1.0 + k) for k, p in enumerate(spread(chain, 3, 3))]
     cell = replace(cell, design=replace(cell.design, test_poses=tuple(poses)))
@@ -163,3 +140,114 @@ def test_a_prior_of_an_unknown_parameter_is_refused() -> None:
     prior = GaussianPrior.independent(("joint9.compliance",), [0.0], [1.0])
     with pytest.raises(InputError, match=r"joint9\.compliance.*did you mean"):
         setup_of(plan_cell(loads=DOWN[None]), POSES, known=Known(prior=prior))
+
+
+# --- which parameters --------------------------------------------------------------------------
+
+
+def test_a_vertical_load_does_not_show_the_compliance_of_a_vertical_joint() -> None:
+    setup = setup_of(plan_cell(loads=DOWN[None]), POSES)
+    assert setup.information.names == tuple(f"joint{i}.compliance" for i in range(2, 7))
+    assert len(setup.warnings) == 1
+    assert "no feasible pose shows joint1.compliance" in setup.warnings[0]
+    slanted = setup_of(plan_cell(loads=np.array([DOWN, SIDEWAYS])), POSES)
+    assert len(slanted.information.names) == 6
+    assert slanted.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("chain", "cell"),
+    [
+        (CHAIN, plan_cell((*FULL, "marker_orientation"), "pose", loads=BOTH)),
+        (CHAIN, plan_cell(("distance_sensor", *FULL), "distance", loads=BOTH, criterion="D")),
+        (scara(), any_cell(scara(), FULL, loads=BOTH / 20)),
+    ],
+    ids=["full poses", "distances", "scara"],
+)
+def test_the_kept_parameters_are_as_many_as_the_readings_determine(chain: Any, cell: Cell) -> None:
+    """As many as the rank of all B; what is dropped moves the readings as its mixing says."""
+    q = spread(chain, 120, 2)
+    setup = setup_of(cell, q, chain)
+    model, r, sizes = setup.information.model, setup.found.reduction, setup.found.sizes
+    n = len(model.names)
+    B = PoseInformation(model, model.nominal, np.arange(n), sizes).blocks(q).reshape(-1, n)
+    unit = B / np.maximum(np.linalg.norm(B, axis=0), 1e-300)
+    ranks = [np.linalg.matrix_rank(b, tol=1e-8 * np.sqrt(len(B))) for b in (unit, unit[:, r.kept])]
+    assert len(r.kept) == ranks[0] == ranks[1] < n
+    off = B[:, r.dropped] - B[:, r.kept] / sizes[r.kept] @ r.mixing * sizes[r.dropped]
+    assert np.abs(off).max() < 1e-6 * np.abs(B).max()
+
+
+# --- what counts --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("interest", "counted"),
+    [
+        ((), lambda p: p.effect not in ("base_frame", "marker_position")),
+        (("joint3", "base.x"), lambda p: p.where == "joint3" or p.name == "base.x"),
+    ],
+)
+def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any) -> None:
+    cell = plan_cell(FULL, "position", loads=BOTH, criterion="A", interest=interest)
+    setup = setup_of(cell, POSES)
+    model, kept = setup.information.model, setup.found.columns
+    chosen = interest_of(model, setup.found)
+    expected = [k for k, c in enumerate(kept) if counted(model.parameters[c])]
+    assert chosen.tolist() == expected
+    V = np.linalg.inv(setup.gathered(setup.information.blocks(TABLE_2)))
+    assert setup.value(TABLE_2) == pytest.approx(np.trace(V[np.ix_(chosen, chosen)]), rel=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("interest", "error", "told"),
+    [
+        ("joint2.complience", InputError, ["did you mean 'joint2.compliance'", "interest"]),
+        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "fixed=['joint1"]),
+        (
+            "joint1.offset",
+            InsufficientDataError,
+            ["no set of poses separates", "base.rz", "fixed=["],
+        ),
+        ("joint4.compliance", InsufficientDataError, ["is held", "drop it from `fixed`"]),
+    ],
+)
+def test_interest_in_what_cannot_be_known_is_answered(
+    interest: str, error: type[Exception], told: list[str]
+) -> None:
+    effects = ("base_frame", "joint_offset", "joint_compliance")
+    cell = plan_cell(effects, "position", loads=BOTH, criterion="D", interest=(interest,))
+    with pytest.raises(error) as caught:
+        setup_of(cell, POSES, known=Known(fixed=("joint4.compliance",)))
+    assert interest in str(caught.value)
+    assert not [part for part in told if part not in str(caught.value)], str(caught.value)
+
+
+def test_a_combination_has_the_variance_of_its_terms() -> None:
+    terms = {"joint2.compliance": 1.0, "joint3.compliance": -2.0}
+    cell = plan_cell(loads=DOWN[None], criterion="c", combination=terms)
+    setup = setup_of(cell, POSES)
+    V = np.linalg.inv(setup.gathered(setup.information.blocks(TABLE_2)))
+    V = V * np.outer(setup.information.sizes, setup.information.sizes)
+    expected = V[0, 0] - 4 * V[0, 1] + 4 * V[1, 1]
+    assert setup.value(TABLE_2) == pytest.approx(expected, rel=1e-9)
+    assert setup.criterion.reported(setup.value(TABLE_2)) == pytest.approx(
+        (np.sqrt(expected), "rad/(N*m)")
+    )
+
+
+def test_a_plan_estimates_what_identification_will() -> None:
+    """Of fifteen poses both keep the same parameters; joint 6's offset, which only the load point
+    tells from the markers, is below the noise and held by both."""
+    cell = plan_cell(
+        ("base_frame", "joint_offset", "joint_compliance", "marker_position"),
+        "position",
+        loads=BOTH,
+    )
+    setup = setup_of(cell, TABLE_2, n_poses=len(TABLE_2))
+    model = setup.information.model
+    rows = setup.information.rows(TABLE_2)
+    data = simulate(model, rows, model.nominal, 3)
+    result = identify(model, data, Options(method="wls", faulty="keep"))
+    assert set(setup.information.names) == set(result.determined)
+    assert "joint6.offset" not in setup.information.names

@@ -46,9 +46,6 @@ def places(found: TargetPoses) -> NDArray:
     return np.einsum("tij,tj->ti", T[:, :3, :3], found.point) + T[:, :3, 3]
 
 
-# --- poses of the cell ---------------------------------------------------------------------
-
-
 def test_stated_poses_come_with_their_force_point_and_share() -> None:
     q = random_poses(CHAIN, 2, seed=1)
     own, force = np.array([0.0, 0.1, 0.0]), np.array([1.0, 2.0, 3.0])
@@ -60,16 +57,6 @@ def test_stated_poses_come_with_their_force_point_and_share() -> None:
     np.testing.assert_allclose(found.weight, [0.75, 0.25])
     np.testing.assert_array_equal(found.point, [own, POINT])
     assert "2 of [[design.test_pose]]" in found.source
-
-
-def test_a_pose_beyond_the_limits_is_refused() -> None:
-    q = random_poses(CHAIN, 1, seed=1)[0]
-    q[1] = 0.5
-    with pytest.raises(InputError, match=r"q_si of \[\[design.test_pose\]\] no. 1: joint2"):
-        poses_of(cell_of(test_poses=(TargetPose(q),)))
-
-
-# --- a path --------------------------------------------------------------------------------
 
 
 def path_cell(folder: Path, text: str, nominal: Nominal | None = None, **options: Any) -> Cell:
@@ -85,15 +72,13 @@ def csv(header: str, rows: NDArray) -> str:
 JOINTS = ",".join(f"q{i}_deg" for i in range(1, 7))
 
 
-@pytest.mark.parametrize("turned", ["free", "vector", "quaternion"])
+@pytest.mark.parametrize("turned", ["free", "quaternion"])
 def test_a_path_of_places_is_reached_where_the_arm_stands(tmp_path: Path, turned: str) -> None:
     T = placement([0.5, -2.0, 0.3], Rotation.from_euler("z", 2.0))
     flange = T @ nominal_flanges(CHAIN, random_poses(CHAIN, 8, seed=3))
     position = flange[:, :3, :3] @ POINT + flange[:, :3, 3]
     rotation = Rotation.from_matrix(flange[:, :3, :3])
     header, columns = "x_mm,y_mm,z_mm", [position * 1e3]
-    if turned == "vector":
-        header, columns = header + ",rx_deg,ry_deg,rz_deg", [*columns, rotation.as_rotvec(True)]
     if turned == "quaternion":
         w_first = np.roll(rotation.as_quat(), 1, axis=1)
         header, columns = header + ",qw,qx,qy,qz", [*columns, w_first]
@@ -111,21 +96,16 @@ GOOD = "0,-90,90,0,30,0"
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", ["empty file"]),
-        (f"{JOINTS}\n", ["no rows"]),
         (f"{JOINTS},weight\n{GOOD},1\n{GOOD},0", ["line 3, column weight", "must be positive"]),
         (f"{JOINTS}\n{GOOD}\n0,1,90,0,30,0", ["line 3, column q2_deg: joint2", "at 1° is beyond"]),
-        ("q1_deg,q2_deg\n0,0", ["2 joint columns", "6 joints"]),
         ("weight\n1", ["q1_deg … or x_mm,y_mm,z_mm are missing"]),
         (f"{JOINTS},x_mm,y_mm,z_mm\n{GOOD},1,1,1", ["two ways", "keep the joints or"]),
-        (f"{JOINTS},rx_deg,ry_deg,rz_deg\n{GOOD},1,1,1", ["say the same in two ways", "rx_deg"]),
         ("x_mm,y_mm,z_mm,repeat\n1,1,1,1", ["'repeat' has no meaning in a path"]),
-        ("x_mm,y_mm,z_mm,wieght\n1,1,1,1", ["unknown column 'wieght'"]),
-        ("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1500,0,1000,1,1,0,0", ["line 2, column qw", "norm"]),
         (
             "x_mm,y_mm,z_mm\n1500,0,1000\n9000,0,1000",
             ["line 3, columns x_mm, y_mm, z_mm: the place is out of reach", "(1 of 2", "base_pos"],
         ),
+        (JOINTS + f"\n{GOOD}" * 10_001, ["10001 poses; a path takes at most 10000"]),
         ("x_m,y_m,z_m\n1500,0,1000", ["line 2", "out of reach", "no nearer than 1799", "unit?"]),
     ],
 )
@@ -137,9 +117,6 @@ def test_what_is_wrong_with_a_path_is_told_with_its_place(
     message = str(caught.value)
     assert "path.csv" in message
     assert not [part for part in told if part not in message], message
-
-
-# --- a box ---------------------------------------------------------------------------------
 
 
 def test_a_box_is_filled_with_reached_places() -> None:
@@ -154,23 +131,12 @@ def test_a_box_is_filled_with_reached_places() -> None:
 
 def test_a_box_out_of_reach_is_told_with_a_place_and_a_remedy() -> None:
     box = TargetBox(LOWER, np.array([1.7, 0.3, 30.0]), 8)
-    with pytest.raises(InputError) as caught:
+    told = r"\[design.test_box\]: the place \[1\..* out of reach, .* mm \(.*smaller, move it"
+    with pytest.raises(InputError, match=told):
         poses_of(cell_of(test_box=box))
-    message = str(caught.value)
-    for part in (
-        "[design.test_box]: the place [1.",
-        "out of reach",
-        "mm (",
-        "make the box smaller",
-    ):
-        assert part in message
-    assert "leave out rpy_deg" not in message
     with pytest.raises(InputError, match=r"leave out rpy_deg, move it, or check base_position_m"):
         nominal = Nominal(base_position=np.zeros(3))
         poses_of(cell_of(nominal=nominal, test_box=replace(box, rotation=np.eye(3))))
-
-
-# --- what the work cell allows -------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -214,9 +180,6 @@ def test_places_without_an_allowed_posture_are_told() -> None:
     assert "(8 of them in no posture" in other_load.source
 
 
-# --- none, several -------------------------------------------------------------------------
-
-
 def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> None:
     cell = replace(cell_of(loads=LOADS[:2]), limits={"joint1": (-0.5, 0.5)})
     found = poses_of(cell)
@@ -241,8 +204,3 @@ def test_several_sources_add_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.weight, [0.5, *[0.1] * 5])
     for part in ("1 of [[design.test_pose]]", "3 of path.csv", "2 in [design.test_box]"):
         assert part in found.source
-
-
-def test_a_path_too_long_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="10001 poses; a path takes at most 10000"):
-        poses_of(path_cell(tmp_path, JOINTS + "\n" + f"{GOOD}\n" * 10_001))

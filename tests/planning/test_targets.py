@@ -80,8 +80,6 @@ SAGGING = {
     "nominal": Nominal(joint_compliance=COMPLIANCE, gravity_compensator=COMPENSATOR),
 }
 CASES: dict[str, tuple[Chain, Cell]] = {
-    "everything": (CHAIN, plan_cell(FULL, "position", loads=BOTH)),
-    "markers known": (CHAIN, plan_cell(FULL[:-1], "position", loads=BOTH)),
     "one marker fitted": (CHAIN, plan_cell((*FULL[:-1], "marker_position:marker:M2"), "position")),
     "deflections": (CHAIN, plan_cell(loads=DOWN[None])),
     "levels": (
@@ -93,16 +91,11 @@ CASES: dict[str, tuple[Chain, Cell]] = {
         CHAIN, plan_cell((*FULL, "gravity_compensator"), "position", model=SAGGING, loads=BOTH)
     ),
     "full poses": (CHAIN, plan_cell((*FULL, "marker_orientation"), "pose", loads=BOTH)),
-    "distances": (CHAIN, plan_cell((*FULL, "distance_sensor"), "distance", loads=BOTH)),
     "sliding joints": (sliding_chain(), any_cell(sliding_chain(), FULL, loads=BOTH / 10)),
 }  # fmt: skip
-LONG = ("everything", "markers known", "distances")
 
 
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(c, marks=pytest.mark.long if c in LONG else ()) for c in CASES],
-)
+@pytest.mark.parametrize("case", CASES)
 def test_the_rows_are_how_position_changes_with_the_parameters(case: str) -> None:
     """Points that are stated, and the markers where they are fitted and none is stated."""
     chain, cell = CASES[case]

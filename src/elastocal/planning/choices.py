@@ -106,10 +106,6 @@ class RelaxedPoint:
     relaxed: Relaxed
     share: float
 
-    @property
-    def value(self) -> float:
-        return self.relaxed.value
-
 
 @dataclass(frozen=True)
 class Choice:
@@ -147,16 +143,18 @@ class Choice:
         self.progress("comparing what was chosen with the cell as it stands")
         before, after = (self.relaxed(c, COMPARED) for c in (cell, found.cell))
         if after is None or (
-            freedom.loads is None and before is not None and before.value <= after.value
+            freedom.loads is None
+            and before is not None
+            and before.relaxed.value <= after.relaxed.value
         ):
             found, after = replace(found, cell=cell), before
         assert after is not None
-        figure, unit = after.setup.criterion.reported(after.value)
+        figure, unit = after.setup.criterion.reported(after.relaxed.value)
         places = np.stack([boxes.places(cell), boxes.places(found.cell)], axis=1)
         return Chosen(
             places=dict(zip(boxes.names, places, strict=True)),
             loads=None if freedom.loads is None else found.cell.design.loads,
-            before=None if before is None else after.setup.criterion.figure(before.value),
+            before=None if before is None else after.setup.criterion.figure(before.relaxed.value),
             after=figure,
             unit=unit,
             candidates=len(after.pool),
@@ -192,10 +190,12 @@ class Choice:
             # All the way, or a part of it where the rules leave too little there.
             way = (self.relaxed(boxes.placed(cell, boxes.at(unit + part * (there - unit))))
                    for part in (1.0, 0.5, 0.25))  # fmt: skip
-            better = next((p for p in way if p is not None and p.value < best.value), None)
+            better = next(
+                (p for p in way if p is not None and p.relaxed.value < best.relaxed.value), None
+            )
             if better is None:
                 break
-            gain, best = 1 - better.value / best.value, better
+            gain, best = 1 - better.relaxed.value / best.relaxed.value, better
             if gain < GAIN:
                 break
         return best
@@ -206,7 +206,7 @@ class Choice:
             self.progress(f"choosing {what} {k + 1} of {len(cells)}")
             points.append(self.relaxed(cell))
         found = (point for point in points if point is not None)
-        return min(found, key=lambda point: point.value, default=None)
+        return min(found, key=lambda point: point.relaxed.value, default=None)
 
     def _moved(self, boxes: Boxes, point: RelaxedPoint) -> Array:
         """The point (3 k,) of the unit cube that lowers Φ most at the weights of `point`."""

@@ -160,24 +160,6 @@ def reading_noise(
     return sparse.csr_array(covariance)
 
 
-def pose_covariance(
-    model: Model, observed: Observations, n_poses: int, x: Array, readings: IntArray | None = None
-) -> Array:
-    """Covariance (N, r, r) of the observations of each pose, means of `readings` (N, L) in the load
-    states, `[design] repeats` where these are None.  A pose that is approached from both sides is
-    visited twice."""
-    spec, rows = model.cell.design, len(observed.table)
-    each = np.full((n_poses, 1), spec.repeats) if readings is None else np.maximum(readings, 1)
-    each = np.repeat(each.ravel(), rows // each.size).astype(float)
-    visits = 2 if spec.motion.both_directions else 1
-    found = reading_noise(model, observed, x, each, visits).tocoo()
-    r = found.shape[0] // n_poses
-    blocks = np.zeros((n_poses, r, r))
-    i, j = found.coords
-    blocks[i // r, i % r, j % r] = found.data
-    return blocks
-
-
 # From the symbolic model to information: whitened B of any pose.
 
 CHUNK_NUMBERS = 4_000_000  # numbers of a chunk's regressor held at once
@@ -200,7 +182,6 @@ class PoseInformation:
 
     @cached_property
     def forces(self) -> Array:
-        """The load states (L, 3) N in which each pose is read."""
         return plan_forces(self.model.cell)
 
     @property
@@ -249,9 +230,17 @@ class PoseInformation:
 
     def noise(self, q: Array, readings: IntArray | None = None) -> tuple[Observations, Array]:
         """What is read at the poses q (N, n), and the Cholesky factors (N, r, r) of its covariance,
-        that of NEVER in place of what is not seen or read."""
-        observed = observe(self.rows(q), self.model.observe)
-        covariance = pose_covariance(self.model, observed, len(q), self.x, readings)
+        that of NEVER in place of what is not seen or read.  A pose that is approached from both
+        sides is visited twice."""
+        model, spec = self.model, self.model.cell.design
+        observed = observe(self.rows(q), model.observe)
+        each = np.full((len(q), 1), spec.repeats) if readings is None else np.maximum(readings, 1)
+        each = np.repeat(each.ravel(), len(observed.table) // each.size).astype(float)
+        visits = 2 if spec.motion.both_directions else 1
+        found = reading_noise(model, observed, self.x, each, visits).tocoo()
+        r, (i, j) = found.shape[0] // len(q), found.coords
+        covariance = np.zeros((len(q), r, r))
+        covariance[i // r, i % r, j % r] = found.data
         if not (seen := self.seen(q, readings)).all():
             size = observed.size
             states = covariance.shape[1] // (size * seen.shape[2])  # that are observed

@@ -15,7 +15,6 @@ from elastocal.identification.noise_structure import course_waves
 from elastocal.planning import execution as drift_module
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.execution import DRIFT, Alias, schedule, turns
-from elastocal.planning.information import pose_covariance
 from elastocal.planning.plan import plan_table
 from elastocal.planning.test_poses import prediction_rows
 
@@ -115,13 +114,12 @@ def test_the_alias_is_what_least_squares_make_of_shifted_readings():
     alias = Alias.of(information, q, blocks, setup.gathered(blocks), setup.target_rows)
     rng = np.random.default_rng(0)
     time, direction = rng.uniform(size=(8, 2)), rng.normal(size=3)
-    observed, _ = information.noise(q)
+    observed, root = information.noise(q)
     table, model, x = observed.table, information.model, information.x
     state = (table.force != 0).any(axis=1).astype(int)
     d = observed.apply(time[table.configuration, state][:, None] * direction)
     B = model.regressor(table, x, information.columns, observed).B
     B = B.reshape(8, -1, len(information.columns))
-    root = np.linalg.cholesky(pose_covariance(model, observed, 8, x))
     B, d = (np.linalg.solve(root, v) for v in (B, d.reshape(8, -1, 1)))
     wrong = np.linalg.lstsq(B.reshape(-1, B.shape[-1]), d.ravel(), rcond=None)[0]
     targets = target_poses.test_poses(cell, chain, None, 0)
