@@ -511,16 +511,13 @@ def read_table(
     its name; a file has `most` bytes.  Raises InputError that names file, line, column and text.
     """
     source = str(path)
-    if text is not None:
-        lines = CsvLines(source, BytesIO(text.encode()), what, comments)
-        table = _read(source, "line", lines.header, lines.rows(), choose, lines.delimiter != ",")
-    elif Path(path).suffix.lower() in PARQUET:
+    if text is None and Path(path).suffix.lower() in PARQUET:
         frame = _parquet(source, what)
         cells = frame.astype(object).where(frame.notna(), "")
         texts = (list(map(str, row)) for row in cells.itertuples(index=False, name=None))
         table = _read(source, "row", list(frame.columns), enumerate(texts, start=1), choose, False)
     else:
-        with open_input(path, what, most) as handle:
+        with open_input(path, what, most) if text is None else BytesIO(text.encode()) as handle:
             lines = CsvLines(source, handle, what, comments)
             commas = lines.delimiter != ","
             table = _read(source, "line", lines.header, lines.rows(), choose, commas)

@@ -128,11 +128,15 @@ def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_pat
     ("columns", "told"),
     [
         ('x_mm = "*_x"\ny_mm = "*_y"', "'M2' has no column for y_mm, as 'M2_y'"),
+        (
+            'x_mm = "*_x"\n[source.optional]\nsigma_x_um = "*_s"',
+            "'M2' has no column for sigma_x_um, as 'M2_s'",
+        ),
         ('name = "*_name"', "* stands for the markers of a row"),
     ],
 )
 def test_places_of_markers_that_are_not_there_are_told(tmp_path, columns, told):
-    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M2_x_mm\n1,2,3,4\n")
+    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M2_x_mm,M1_s_um\n1,2,3,4,5\n")
     (tmp_path / "map.toml").write_text(f"[[source]]\n[source.columns]\n{columns}\n")
     done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
     assert done.exit_code == 2 and told in done.output

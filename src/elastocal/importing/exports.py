@@ -10,7 +10,7 @@ import re
 import signal
 import threading
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -161,6 +161,14 @@ class Rows:
     header_line: int = 0
     split_at: str = ""
     comments: tuple[str, ...] = ()
+
+    @property
+    def layout(self) -> str:
+        if self.split_at in ("KRL", "RAPID"):
+            return self.split_at
+        head = f"header in line {self.header_line}" if self.header_line else "no header"
+        mark = {"tab": "tabs", "space": "blanks"}.get(self.split_at, f"{self.split_at!r}")
+        return f"columns split at {mark}, {head}"
 
 
 def table_rows(
@@ -600,87 +608,68 @@ def joint_stems(numbers: Iterable[str]) -> list[str]:
 
 
 def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable) -> Records:
-    """The rows of `path` as `source` of the mapping `where` describes them.
+    """The rows of `path` as `source` of the mapping `where` describes them, one for each marker
+    where a row has several.
 
-    A row with an empty cell where a number belongs is passed over and listed.
+    A row with an empty cell where a number belongs is passed over and listed; of a marker without
+    a value that one alone.
     """
-    settings = source.text or TextSourceKeys()
+    settings, name = source.text or TextSourceKeys(), str(path)
     asked = mapping_file.wanted(where, source.columns or {}, source.optional or {})
-    name = str(path)
     lines, encoding = read_lines(path, settings.encoding or "auto")
     table = _table(name, lines, settings, asked)
     if len(table.rows) > MAX_ROWS:
         raise InputError(f"{name}: more than {MAX_ROWS:,} rows; thin the export out")
     hint = unit_in_comments(where, settings.unit_comment, table.comments)
-    markers = mapping_file.markers_of_row(name, asked, table.header)
-    parts = [
-        _read(name, encoding, table, [c.of_marker(marker) for c in asked], source, units, hint)
-        for marker in markers or [""]
-    ]
-    return _side_by_side(parts, markers) if markers else parts[0]
-
-
-def _read(
-    name: str, encoding: str, table: Rows, asked: Sequence[ColumnKey], source: SourceTable,
-    units: UnitsTable, hint: str | None,
-) -> Records:  # fmt: skip
-    settings = source.text or TextSourceKeys()
-    columns = mapping_file.resolve(name, asked, table.header, len(table.rows[0][1]), units, hint)
-    numeric = [c for c in columns if not c.is_text]
+    width = len(table.rows[0][1])
+    columns = {
+        marker: mapping_file.resolve(
+            name, [c.of_marker(marker) for c in asked], table.header, width, units, hint
+        )
+        for marker in mapping_file.markers_of_row(name, asked, table.header) or [""]
+    }
+    every = [c for own in columns.values() for c in own]
     cells = NumberCells(
         settings.decimal or "auto",
         settings.thousands or "none",
         settings.missing or (),
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
-         for c in numeric if c.index[0] < len(row)),
+         for c in every if not c.is_text and c.index[0] < len(row)),
     )  # fmt: skip
     kept, values, ignored = _rows(name, table, columns, cells)
-    if not kept:
-        number, reason = ignored[0]
-        raise InputError(
-            f"{name}: none of its {len(table.rows)} rows is complete (line {number}: "
-            f"{reason}); correct the places in [source.columns]"
-        )
-    used = {i for c in columns for i in c.index}
-    head = f"header in line {table.header_line}" if table.header_line else "no header"
-    mark = {"tab": "tabs", "space": "blanks"}.get(table.split_at, f"{table.split_at!r}")
-    program = table.split_at in ("KRL", "RAPID")
-    understood = Understood(
-        file=name,
-        preset=source.preset,
-        role=source.role or "both",
-        encoding=encoding,
-        layout=table.split_at if program else f"columns split at {mark}, {head}",
-        decimal=cells.decimal,
-        columns=tuple((c.header, column(c.stem, c.unit), c.unit) for c in columns),
-        unused=tuple(n or f"column {i + 1}" for i, n in enumerate(table.header) if i not in used),
-        rows=len(kept),
-        ignored=tuple(sorted([*table.ignored, *ignored])),
-    )
-    line = np.array([number for number, _ in kept], dtype=np.int64)
-    numbers, of = dict[str, Array](), dict[str, str]()
-    for c, own in zip(numeric, np.array(values).reshape(len(kept), -1).T, strict=True):
-        stem = c.stem
-        spread = stem.startswith("sigma_") and source.coverage_factor
-        of[stem] = table_unit(stem, c.unit)
-        found = convert(own, c.unit, of[stem]) / (spread or 1.0)
-        numbers[stem] = found + numbers.get(stem, 0.0)  # seconds and nanoseconds of a time add up
-    texts = _texts([row for _, row in kept], columns)
+    numbers, of = _numbers(columns, values, kept, source.coverage_factor or 1.0)
+    texts = _texts([row for _, row, _ in kept], next(iter(columns.values())))
+    if "" not in columns:
+        texts["marker"] = [marker for _, _, marker in kept]
+    line = np.array([number for number, _, _ in kept], dtype=np.int64)
     written = texts.pop("time_text", None)
     if written is not None and "time" not in numbers:
         form = source.time_format or ()
         formats = [form] if isinstance(form, str) else form
         seconds = seconds_of(name, line.tolist(), written, formats)
         numbers["time"], of["time"] = np.array(seconds), "s"
+    used = {i for c in every for i in c.index}
+    understood = Understood(
+        file=name,
+        preset=source.preset,
+        role=source.role or "both",
+        encoding=encoding,
+        layout=table.layout,
+        decimal=cells.decimal,
+        columns=tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
+        unused=tuple(n or f"column {i + 1}" for i, n in enumerate(table.header) if i not in used),
+        rows=len(kept),
+        ignored=tuple(sorted({*table.ignored, *ignored})),
+    )
     file = np.zeros(len(line), dtype=np.int64)
     return Records((name,), file, line, numbers, of, texts, understood, source.load)
 
 
 def _rows(
-    name: str, table: Rows, columns: Sequence[ColumnKey], cells: NumberCells
-) -> tuple[list[tuple[int, list[str]]], list[list[float]], list[tuple[int, str]]]:
-    numeric = [c for c in columns if not c.is_text]
-    widest = max(columns, key=lambda c: max(c.index))
+    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]], cells: NumberCells
+) -> tuple[list[tuple[int, list[str], str]], list[list[float]], list[tuple[int, str]]]:
+    """Complete rows (line, cells, marker) and their numbers; what is passed over and why."""
+    widest = max((c for own in columns.values() for c in own), key=lambda c: max(c.index))
     kept, values, ignored = [], [], []
     for number, row in table.rows:
         if max(widest.index) >= len(row):
@@ -689,21 +678,47 @@ def _rows(
                 f"is column {max(widest.index) + 1} ({widest.header}); correct the line, "
                 "or pass over such lines with ignore in [source.text]"
             )
-        found = []
-        for c in numeric:
-            cell = row[c.index[0]]
-            try:
-                value = cells.value(cell)
-            except ValueError:
-                raise cells.complaint(name, number, cell, c.header) from None
-            if value is None:
-                ignored.append((number, f"no value in column {c.header}"))
-                break
-            found.append(value)
-        else:
-            kept.append((number, row))
-            values.append(found)
+        for marker, own in columns.items():
+            found = []
+            for c in (c for c in own if not c.is_text):
+                cell = row[c.index[0]]
+                try:
+                    value = cells.value(cell)
+                except ValueError:
+                    raise cells.complaint(name, number, cell, c.header) from None
+                if value is None:
+                    ignored.append((number, f"no value in column {c.header}"))
+                    break
+                found.append(value)
+            else:
+                kept.append((number, row, marker))
+                values.append(found)
+    if not kept:
+        number, reason = ignored[0]
+        raise InputError(
+            f"{name}: none of its {len(table.rows)} rows is complete (line {number}: "
+            f"{reason}); correct the places in [source.columns]"
+        )
     return kept, values, ignored
+
+
+def _numbers(
+    columns: Mapping[str, Sequence[ColumnKey]], values: list[list[float]],
+    kept: Sequence[tuple[int, list[str], str]], coverage: float,
+) -> tuple[dict[str, Array], dict[str, str]]:  # fmt: skip
+    """The numbers by column, and the units of the measurement table that they are in."""
+    read, of_row = np.array(values).reshape(len(kept), -1), np.array([row[2] for row in kept])
+    numbers, of = dict[str, Array](), dict[str, str]()
+    for marker, own in columns.items():
+        rows = np.flatnonzero(of_row == marker)
+        for k, c in enumerate(c for c in own if not c.is_text):
+            of[c.stem] = table_unit(c.stem, c.unit)
+            found = convert(read[rows, k], c.unit, of[c.stem])
+            # Seconds and nanoseconds of a time add up.
+            numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += (
+                found / coverage if c.stem.startswith("sigma_") else found
+            )
+    return numbers, of
 
 
 def _texts(rows: Sequence[list[str]], columns: Sequence[ColumnKey]) -> dict[str, list[str]]:
@@ -718,27 +733,6 @@ def _texts(rows: Sequence[list[str]], columns: Sequence[ColumnKey]) -> dict[str,
             found = [f"{t} {unit}".strip() if re.fullmatch(r"[\d.,]+", t) else t for t in found]
         texts[c.stem] = found
     return texts
-
-
-def _side_by_side(parts: Sequence[Records], markers: Sequence[str]) -> Records:
-    """One row for each marker of a row; of a marker without a value that one alone is left out."""
-    every = Records.stacked(
-        [
-            replace(part, texts=part.texts | {"marker": [name] * len(part)})
-            for part, name in zip(parts, markers, strict=True)
-        ]
-    )
-    seen = [part.understood for part in parts]
-    unused = set.intersection(*(set(understood.unused) for understood in seen))
-    understood = replace(
-        seen[0],
-        columns=tuple(dict.fromkeys(column for u in seen for column in u.columns)),
-        unused=tuple(name for name in seen[0].unused if name in unused),
-        rows=len(every),
-        ignored=tuple(sorted({each for u in seen for each in u.ignored})),
-    )
-    one = replace(every, files=parts[0].files, file=np.zeros(len(every), dtype=np.int64))
-    return replace(one.take(np.argsort(one.line, kind="stable")), understood=understood)
 
 
 def likely_presets(path: Path) -> list[str]:

@@ -412,12 +412,12 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
     """The markers that have a column each in one row, as the file calls them; none where the
     mapping has no * in a place.
     """
-    each = [target for target in asked if target.of_each_marker and target.required]
     free = _unnamed(asked, header)
-    found = {target.key: _marker_names(target, free) for target in each}
-    names = list(dict.fromkeys(name for names in found.values() for name in names))
-    for name in names:
-        absent = [t for t in each if name not in found[t.key]]
+    found = {target: _marker_names(target, free) for target in asked if target.of_each_marker}
+    names = list(dict.fromkeys(name for t, own in found.items() if t.required for name in own))
+    for name in names:  # what is optional is there for all of them or for none
+        absent = [t for t, own in found.items()
+                  if name not in own and (t.required or {*own} & {*names})]  # fmt: skip
         if absent:
             raise InputError(
                 f"{source}: {quoted(name)} has no column for {listed(t.key for t in absent)}, as "
