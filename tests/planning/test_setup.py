@@ -202,8 +202,6 @@ def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any
 @pytest.mark.parametrize(
     ("interest", "error", "told"),
     [
-        ("joint2.complience", InputError, ["did you mean 'joint2.compliance'", "interest"]),
-        ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "fixed=['joint1"]),
         (
             "joint1.offset",
             InsufficientDataError,

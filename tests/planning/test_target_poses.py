@@ -1,7 +1,8 @@
-"""Test poses from the cell, from a path, from a box, or drawn; and what is wrong with them."""
+"""Test poses from the cell, a path, a box, or drawn; what does not fit the robot is told."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,14 +12,17 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from support.calibration import placement
-from support.cells import kr270_cell, kr270_chain, nominal_flanges, random_poses
+from support.cells import DOWN, kr270_cell, kr270_chain, nominal_flanges, random_poses
+from support.design_cells import plan_cell, scara, setup_of
+from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal, Tool
-from elastocal.cell.plan_wishes import DesignSpec, TargetBox, TargetPath, TargetPose
-from elastocal.cell.work_cell import Cell
+from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.work_cell import Cell, Solid, Workspace, read_cell
 from elastocal.errors import InputError
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.test_poses import DEFAULT_COUNT, TargetPoses
+from elastocal.planning.candidates import joint_space
+from elastocal.planning.test_poses import DEFAULT_COUNT, TargetPoses, check_cell
 
 CHAIN = kr270_chain()
 LOADS = np.array([[0.0, 0, 0], [0, 0, -2600], [0, 900, -2600]])
@@ -97,14 +101,9 @@ GOOD = "0,-90,90,0,30,0"
     ("text", "told"),
     [
         (f"{JOINTS},weight\n{GOOD},1\n{GOOD},0", ["line 3, column weight", "must be positive"]),
-        (f"{JOINTS}\n{GOOD}\n0,1,90,0,30,0", ["line 3, column q2_deg: joint2", "at 1° is beyond"]),
         ("weight\n1", ["q1_deg … or x_mm,y_mm,z_mm are missing"]),
         (f"{JOINTS},x_mm,y_mm,z_mm\n{GOOD},1,1,1", ["two ways", "keep the joints or"]),
         ("x_mm,y_mm,z_mm,repeat\n1,1,1,1", ["'repeat' has no meaning in a path"]),
-        (
-            "x_mm,y_mm,z_mm\n1500,0,1000\n9000,0,1000",
-            ["line 3, columns x_mm, y_mm, z_mm: the place is out of reach", "(1 of 2", "base_pos"],
-        ),
         (JOINTS + f"\n{GOOD}" * 10_001, ["10001 poses; a path takes at most 10000"]),
         ("x_m,y_m,z_m\n1500,0,1000", ["line 2", "out of reach", "no nearer than 1799", "unit?"]),
     ],
@@ -130,13 +129,10 @@ def test_a_box_is_filled_with_reached_places() -> None:
 
 
 def test_a_box_out_of_reach_is_told_with_a_place_and_a_remedy() -> None:
-    box = TargetBox(LOWER, np.array([1.7, 0.3, 30.0]), 8)
-    told = r"\[design.test_box\]: the place \[1\..* out of reach, .* mm \(.*smaller, move it"
+    box = TargetBox(LOWER, np.array([1.7, 0.3, 30.0]), 8, np.eye(3))
+    told = r"\[1\..* out of reach, .* mm .*leave out rpy_deg, move it, or check base_position_m"
     with pytest.raises(InputError, match=told):
-        poses_of(cell_of(test_box=box))
-    with pytest.raises(InputError, match=r"leave out rpy_deg, move it, or check base_position_m"):
-        nominal = Nominal(base_position=np.zeros(3))
-        poses_of(cell_of(nominal=nominal, test_box=replace(box, rotation=np.eye(3))))
+        poses_of(cell_of(nominal=Nominal(base_position=np.zeros(3)), test_box=box))
 
 
 @dataclass(frozen=True)
@@ -204,3 +200,83 @@ def test_several_sources_add_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.weight, [0.5, *[0.1] * 5])
     for part in ("1 of [[design.test_pose]]", "3 of path.csv", "2 in [design.test_box]"):
         assert part in found.source
+
+
+HOME = np.radians([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
+HIGH = np.radians([0.0, 10.0, 90.0, 0.0, 0.0, 0.0])  # joint 2 ends at 0°
+BALL = Solid("ball", "sphere", np.array([0.1]))
+
+
+def cell(workspace: Workspace | None = None, model: Any = None, **design: Any) -> Cell:
+    found = kr270_cell()
+    spec = found.model if model is None else replace(found.model, **model)
+    return replace(
+        found, workspace=workspace or Workspace(), design=DesignSpec(**design), model=spec
+    )
+
+
+@pytest.mark.parametrize(
+    ("bad", "told"),
+    [
+        (
+            cell(model={"compliance_levels": {"joint2": (-1.0,)}}, levels={"joint2": (-0.9,)}),
+            ["none of its levels in [model.compliance_levels]", "-51.5662°"],
+        ),
+        (cell(motion=Motion(home=HOME[:5])), ["design.motion.home_si has 5 numbers", "give 6"]),
+        (cell(motion=Motion(home=HIGH)), ["design.motion.home_si: joint2", "at 10°", "to 0°"]),
+        (
+            cell(motion=Motion(speed=np.ones(2), degrees=True)),
+            ["design.motion.speed_deg_per_s has 2 numbers", "or one for all"],
+        ),
+        (
+            cell(test_poses=(TargetPose(HOME), TargetPose(HIGH, degrees=True))),
+            ["q_deg of [[design.test_pose]] no. 2: joint2", "at 10°", "correct the posture"],
+        ),
+    ],
+)
+def test_what_does_not_fit_is_told_with_key_found_and_remedy(bad: Cell, told: list[str]) -> None:
+    with pytest.raises(InputError) as caught:
+        check_cell(bad, kr270_chain())
+        target_poses.test_poses(bad, kr270_chain())
+    assert not [part for part in told if part not in str(caught.value)], str(caught.value)
+
+
+def test_a_compliance_known_at_levels_asks_test_poses_and_plan_to_keep_to_them() -> None:
+    levels = {"compliance_levels": {"joint2": (-1.0, 0.0)}}
+    off = plan_cell(
+        model=levels, levels={"joint2": (-1.0,)}, loads=DOWN[None], test_poses=(TargetPose(HOME),)
+    )
+    q = random_poses(kr270_chain(), 30, seed=1)
+    q[:, 1] = -1.0
+    with pytest.raises(InputError, match=r"test pose 1: joint2 at -90° is none of its .*, 0°"):
+        setup_of(off, q)
+    with pytest.raises(InputError, match=r"levels\] joint2_deg = .* instead of joint3"):
+        joint_space(cell(model=levels, levels={"joint3": (0.0,)}), kr270_chain())
+
+
+def test_degrees_do_not_fit_a_prismatic_joint() -> None:
+    chain = scara()
+    for bad, told in (
+        ({"test_poses": (TargetPose(HOME[:4], degrees=True),)}, "q_deg of .* use q_si of"),
+        ({"motion": Motion(home=HOME[:4], degrees=True)}, "home_deg .* use .*home_si"),
+        ({"motion": Motion(speed=np.ones(4), degrees=True)}, "speed_deg_per_s .* use .*speed_si"),
+    ):
+        told = told.replace(" use ", r" joint3 \(q3\) is prismatic; use ")
+        with pytest.raises(InputError, match=told):
+            check_cell(cell(**bad), chain)
+            target_poses.test_poses(cell(**bad), chain)
+
+
+def test_the_cell_shown_in_the_documentation_fits_its_robot(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "file-formats.md").read_text(encoding="utf-8")
+    blocks = re.findall(r"```toml(?: workspace| design)?\n(.*?)```", page, re.S)
+    assert len(blocks) == 3
+    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
+    (tmp_path / "fixture.stl").write_text("read by the collision check", encoding="utf-8")
+    joints = ",".join(f"q{i}_deg" for i in range(1, 7))
+    (tmp_path / "path.csv").write_text(f"{joints}\n0,-90,90,0,30,0\n", encoding="utf-8")
+    (tmp_path / "cell.toml").write_text("\n".join(blocks), encoding="utf-8")
+    shown = read_cell(tmp_path / "cell.toml")
+    check_cell(shown, kr270_chain())
+    targets = target_poses.test_poses(shown, kr270_chain())
+    assert len(targets.q) == 1 + 1 + 20

@@ -116,6 +116,8 @@ class DesignOptions:
 MOST_POSES = 100  # that a target is sought with
 
 
+# Products of matrices of a few dozen rows: more threads of BLAS wait for each other.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def design(
     cell: Cell,
     options: DesignOptions | None = None,
@@ -125,14 +127,7 @@ def design(
     """The measurement plan that [design] of the cell asks for, with its certificates.  It depends
     on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
     interrupted and taken up again from `checkpoint`."""
-    # Products of matrices of a few dozen rows: more threads of BLAS wait for each other.
-    with threadpool_limits(limits=1, user_api="blas"):
-        return _planned(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress)
-
-
-def _planned(
-    cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
-) -> Plan:
+    options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
     whole, spec = _Design(cell, options, checkpoint, progress), cell.design
     if spec.choose is None and spec.minutes is None:
         return whole.run()

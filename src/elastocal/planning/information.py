@@ -411,10 +411,12 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
 
 
 def whitened(model: Model, table: Measurements, x: Array) -> tuple[Array, Array]:
-    """B (rows, parameters) of the readings by their stated noise, and as it is."""
+    """B (rows, parameters) of the readings, by the stated noise and what readings of one visit or
+    configuration share, and as it is."""
     observed = observe(table, model.observe)
     B = model.regressor(table, x, None, observed).B
-    return observed_weights(model, observed, x).apply(B), B
+    own = whitener(reading_noise(model, observed, x))
+    return Weights("stated", own, True, "noise as stated").apply(B), B
 
 
 def next_number(labels: Iterable[str]) -> int:
@@ -422,8 +424,3 @@ def next_number(labels: Iterable[str]) -> int:
     can join them: 9 after "8", "8-" and "warm-up"; 1 where there is no number."""
     numbers = [int(m[0]) for m in (re.match(r"[0-9]+", label) for label in labels) if m]
     return max(numbers, default=0) + 1
-
-
-def observed_weights(model: Model, observed: Observations, x: Array) -> Weights:
-    """The stated noise, and with it what readings of one visit or configuration share."""
-    return Weights("stated", whitener(reading_noise(model, observed, x)), True, "noise as stated")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -57,12 +57,8 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     if plan.curve:
         yield say.Fold("Number of poses", curve, printed=True, figures=("curve",))
     if plan.timed:
-        title = "Poses and readings within the time"
-        heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
-        rows = [
-            (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
-        ]
-        yield say.Fold(title, lambda: [say.ShownTable(heads, rows, (), title=title)], printed=True)
+        table = timed_table(plan)
+        yield say.Fold(table.title, lambda: [table], printed=True)
     yield say.Fold("What the plan is worth", lambda: [say.Lines([*plan_lines(plan)])], printed=True)
 
 
@@ -78,17 +74,15 @@ def next_report(found: NextPoses) -> say.Report:
 
 def _key(plan: Plan) -> say.KeyFigures:
     n, minutes = say.counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
-    worth = f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
-    figures = [("poses", str(len(plan.q))), ("criterion", worth)]
+    worth = "criterion", f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     if plan.of_test_poses:
-        worth = f"{_rho(plan):.3g} µm"
-        figures[1] = ("error at the test poses", worth)
+        worth = "error at the test poses", f"{_rho(plan):.3g} µm"
+    figures = [("poses", str(len(plan.q))), worth]
     if (e := plan.everywhere) is not None:
         figures.append(("error over the joint ranges", f"{e.elsewhere * 1e6:.3g} µm"))
     figures.append(("time", minutes))
-    if len(figures) < 4:
-        figures.append(("load states", str(len(plan.forces))))
-    return say.KeyFigures(f"{n} → {worth}, {minutes}", figures)
+    figures += [("load states", str(len(plan.forces)))][: 4 - len(figures)]
+    return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
 
 
 def _gain(found: NextPoses) -> say.Figure:
@@ -111,19 +105,19 @@ SERVES = "most affected if dropped (standard deviation)"
 
 
 def pose_table(plan: Plan, decimals: int = 2) -> say.ShownTable:
-    kinds = plan.model.chain.kinds
-    heads = ["pose", *say.joint_heads(kinds), "order"]
-    heads += [] if plan.crossed else ["load"]
-    heads += [] if plan.seen is None else ["markers"]
+    kinds, each = plan.model.chain.kinds, range(len(plan))
+    joints = zip(*(say.joint_texts(q, kinds, decimals) for q in plan.q), strict=True)
+    columns: dict[str, Sequence[str]] = {"pose": plan.configurations}
+    columns |= dict(zip(say.joint_heads(kinds), joints, strict=True))
     order = say.first_stops(plan)
-    rows: list[tuple[str, ...]] = []
-    for k, name in enumerate(plan.configurations):
-        row = [name, *say.joint_texts(plan.q[k], kinds, decimals)]
-        row += [str(order[k]), *([] if plan.crossed else [plan.loads(k)])]
-        row += [] if plan.seen is None else [printable(plan.markers(k))]
-        rows.append(tuple(row))
-    words = tuple(k for k, head in enumerate(heads) if head in ("load", "markers"))
-    return say.ShownTable(tuple(heads), rows, words, title="Poses")
+    columns["order"] = [str(order[k]) for k in each]
+    if not plan.crossed:
+        columns["load"] = [plan.loads(k) for k in each]
+    if plan.seen is not None:
+        columns["markers"] = [printable(plan.markers(k)) for k in each]
+    words = tuple(k for k, head in enumerate(columns) if head in ("load", "markers"))
+    rows = list(zip(*columns.values(), strict=True))
+    return say.ShownTable(tuple(columns), rows, words, title="Poses")
 
 
 def served(reason: Reason) -> str:
@@ -150,12 +144,24 @@ def interval_table(plan: Plan) -> say.ShownTable:
 
 
 def curve_table(plan: Plan) -> say.ShownTable:
-    heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
     rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]
+    heads = ("poses", _figure(plan), "best possible on the pool")
     return say.ShownTable(heads, rows, (), title="Number of poses")
+
+
+def timed_table(plan: Plan) -> say.ShownTable:
+    rows = [
+        (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
+    ]
+    heads = ("poses", "readings each", "minutes", _figure(plan))
+    return say.ShownTable(heads, rows, (), title="Poses and readings within the time")
+
+
+def _figure(plan: Plan) -> str:
+    return f"{plan.criterion} {plan.unit}".strip()
 
 
 def stop_table(plan: Plan) -> say.ShownTable:
@@ -293,12 +299,6 @@ def _chosen_lines(plan: Plan) -> Told:
         )
     if s is None:
         return
-    worth = ""
-    if s.crossed is not None and s.chosen is not None:
-        worth = (
-            f" (relaxed on candidates, in the same time: in all load states {s.crossed:.4g}{unit}, "
-            f"chosen for each pose {s.chosen:.4g}{unit})"
-        )
     text = f"every pose in every load state, as {s.why}"
     if s.used != "all":
         text = listed(
@@ -306,32 +306,36 @@ def _chosen_lines(plan: Plan) -> Told:
             for n, name in zip(plan.read_in, map(load_name, plan.forces), strict=True)
             if n
         )
-    yield "Loads", f"{text}{worth}."
+    if s.crossed is not None and s.chosen is not None:
+        text += (
+            f" (relaxed on candidates, in the same time: in all load states {s.crossed:.4g}{unit}, "
+            f"chosen for each pose {s.chosen:.4g}{unit})"
+        )
+    yield "Loads", f"{text}."
 
 
 def _everywhere_lines(plan: Plan) -> Told:
-    e = plan.everywhere
-    if e is None:
+    if (e := plan.everywhere) is None:
         return
 
-    def micrometres(error: float | None) -> str:
+    def shown(error: float | None) -> str:
         return "none" if error is None else f"{error * 1e6:.4g}"
 
-    own = "" if plan.of_test_poses else f"; at the test poses {e.test_poses * 1e6:.4g}"
+    own = "" if plan.of_test_poses else f"; at the test poses {shown(e.test_poses)}"
     text = (
-        f"{e.elsewhere * 1e6:.4g} µm rms over the joint ranges{own}; a random plan gives "
-        f"{micrometres(e.random_elsewhere)} there and {micrometres(e.random_test_poses)} at the "
-        "test poses"
+        f"{shown(e.elsewhere)} µm rms over the joint ranges{own}; a random plan gives "
+        f"{shown(e.random_elsewhere)} there and {shown(e.random_test_poses)} at the test poses"
     )
-    noise = plan.model.cell.noise
-    if noise.drift:
+    if drift := plan.model.cell.noise.drift:
         text += (
-            f"; with the drift of {noise.drift * 1e6:.3g} µm that [noise] states "
-            f"{e.drifting_test_poses * 1e6:.4g} and {e.drifting_elsewhere * 1e6:.4g} µm"
+            f"; with the drift of {drift * 1e6:.3g} µm that [noise] states "
+            f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
         )
     if e.share:
-        text += f"; minimised is the weighted error, {plan.reported:.4g} µm, in which the joint "
-        text += f"ranges count {100 * e.share:.0f} %"
+        text += (
+            f"; minimised is the weighted error, {plan.reported:.4g} µm, in which the joint ranges "
+            f"count {100 * e.share:.0f} %"
+        )
         text += f", with ρ₀ at most {100 * e.cap:g} % above its minimum" if e.cap else ""
     elif plan.of_test_poses:
         text += (
@@ -397,8 +401,6 @@ def _certificate_lines(plan: Plan) -> Told:
 
 
 def _execution_lines(plan: Plan) -> Told:
-    """The way, how far it was checked, and what a steady drift does in this order and in the
-    shortest."""
     e, space = plan.execution, plan.model.cell.workspace
     again = sum(stop.again > 0 for stop in e.stops)
     visits = f", {again} of them at reference poses" if again else ""
