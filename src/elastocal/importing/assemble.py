@@ -7,7 +7,7 @@ cell.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -158,17 +158,30 @@ class Assembled:
         return len(self.origin)
 
 
-def assemble(where: str, points: Records, log: Records | None, joined: Joined | None,
-             mapping: MappingTable) -> Assembled:  # fmt: skip
-    """One row per point that has joint values, in the points' order.
+def with_joint_values(points: Records, log: Records, joined: Joined) -> Records:
+    """The points that have joint values, with these and what else the log says of them."""
+    rows = np.flatnonzero(joined.row >= 0)
+    own, theirs = points.take(rows), log.take(joined.row[rows])
+    stems = joint_stems(log.numbers)
+    q = {stem: joined.q[rows, j] for j, stem in enumerate(stems)}
+    poses = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
+    return replace(
+        own,
+        numbers=theirs.numbers | own.numbers | q,
+        units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
+        texts=poses | own.texts,
+    )
+
+
+def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
+    """A row for each point, in their order.
 
     Configurations are those of the names, else of the joint log, else joint values that agree
     within same_pose_deg.  Repeats are numbered in order where the file does not number them.  Times
     are counted from the first reading.
     """
-    settings = mapping.join or mapping_file.JoinTable()
-    rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
-    numbers, units = _numbers(points, log, joined, rows)
+    settings, n = mapping.join or mapping_file.JoinTable(), len(points)
+    numbers, units = dict(points.numbers), dict(points.units)
     stems = joint_stems(numbers)
     if not stems:
         raise InputError(
@@ -179,25 +192,21 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     forces = forces_of(where, points, mapping.loads)
     if forces is not None:
         for k, stem in enumerate(FORCES):
-            numbers[stem], units[stem] = forces[rows, k], "N"
-    q = np.column_stack([numbers[stem] for stem in stems])
-    spread = (log or points).spread(settings.same_pose_deg, settings.same_pose_mm)
-    configuration, warnings = _configurations(points, joined, rows, q, spread)
+            numbers[stem], units[stem] = forces[:, k], "N"
+    spread = points.spread(settings.same_pose_deg, settings.same_pose_mm)
+    configuration, warnings = _configurations(points, spread)
     if (stated := _forces(numbers)) and len(stated) < len(FORCES):
         absent = [stem for stem in FORCES if stem not in stated]
-        numbers |= dict.fromkeys(absent, np.zeros(len(rows)))
+        numbers |= dict.fromkeys(absent, np.zeros(n))
         units |= dict.fromkeys(absent, "N")
         warnings.append(f"{listed(absent)} in no column: taken as 0 N beside {listed(stated)}")
     columns: dict[str, Sequence[str] | NDArray] = {"configuration": configuration}
     marker = points.texts.get("marker")
-    markers = [""] * len(rows) if marker is None else [marker[i] for i in rows]
-    force = [tuple(row) for row in np.column_stack(
-        [numbers.get(stem, np.zeros(len(rows))) for stem in FORCES])]  # fmt: skip
-    columns["repeat"] = _repeats(
-        points, rows, list(zip(configuration, markers, force, strict=True))
-    )
+    force = np.column_stack([numbers.get(stem, np.zeros(n)) for stem in FORCES])
+    keys = zip(configuration, marker or [""] * n, map(tuple, force), strict=True)
+    columns["repeat"] = _repeats(points, keys)
     if marker is not None:
-        columns["marker"] = markers
+        columns["marker"] = marker
     time = numbers.pop("time", None)
     for family in families(kinds).values():
         if family.name not in LABELS:
@@ -205,33 +214,15 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     if time is not None:
         columns["time_s"] = np.round(time - time.min(), 6)
     if any(points.names):
-        columns["note_point"] = [points.names[i] for i in rows]
-    origin = [points.where(int(i)) for i in rows]
+        columns["note_point"] = points.names
+    origin = [points.where(i) for i in range(n)]
     columns["note_source"] = origin
     return Assembled(columns, kinds, origin, tuple(warnings))
 
 
-def _numbers(
-    points: Records, log: Records | None, joined: Joined | None, rows: IntArray
-) -> tuple[dict[str, Array], dict[str, str]]:
-    numbers = {stem: values[rows] for stem, values in points.numbers.items()}
-    units = dict(points.units)
-    if log is not None and joined is not None:
-        for stem, values in log.numbers.items():
-            if stem not in numbers:
-                numbers[stem], units[stem] = values[joined.row[rows]], log.units[stem]
-        for j, unit in enumerate(log.q_units):
-            numbers[f"q{j + 1}"], units[f"q{j + 1}"] = joined.q[rows, j], unit
-    return numbers, units
-
-
-def _configurations(
-    points: Records, joined: Joined | None, rows: IntArray, q: Array, spread: Array
-) -> tuple[list[str], list[str]]:
-    stated = points.texts.get("configuration")
-    if stated is None and joined is not None:
-        stated = joined.pose
-    if stated is None:
+def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str]]:
+    names, q = points.texts.get("configuration"), points.q
+    if names is None:
         kinds, inverse = np.unique(q, axis=0, return_inverse=True)
         first = np.full(len(kinds), len(q))
         np.minimum.at(first, inverse.ravel(), np.arange(len(q)))
@@ -239,7 +230,6 @@ def _configurations(
         codes = np.empty(len(kinds), dtype=np.int64)
         codes[order] = joining.groups_alike(kinds[order], spread)
         return [str(code + 1) for code in codes[inverse.ravel()]], []
-    names = [stated[i] for i in rows]
     _, code = np.unique(np.array(names, dtype=object).astype(str), return_inverse=True)
     low = np.full((code.max() + 1, q.shape[1]), np.inf)
     high = -low
@@ -256,27 +246,27 @@ def _configurations(
     ]
 
 
-def _repeats(points: Records, rows: IntArray, keys: list[tuple]) -> IntArray:
+def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
     stated = points.texts.get("repeat")
     count: dict[tuple, int] = {}
     known: dict[tuple, int] = {}
-    repeats = np.zeros(len(rows), dtype=np.int64)
-    for k, (i, key) in enumerate(zip(rows, keys, strict=True)):
+    repeats = np.zeros(len(points), dtype=np.int64)
+    for k, key in enumerate(keys):
         if stated is None:
             repeats[k] = count.get(key, 0)
             count[key] = int(repeats[k]) + 1
             continue
-        text = stated[i]
+        text = stated[k]
         if not WHOLE.fullmatch(text):
-            raise InputError(f"{points.where(int(i))}: repeat {quoted(text)} is no whole number; "
+            raise InputError(f"{points.where(k)}: repeat {quoted(text)} is no whole number; "
                              "correct the pattern or the column")  # fmt: skip
         repeats[k] = int(text)
         first = known.setdefault((*key, int(text)), k)
         if first != k:
             raise InputError(
-                f"{points.where(int(i))}: repeat {text} of configuration {key[0]}"
+                f"{points.where(k)}: repeat {text} of configuration {key[0]}"
                 f"{f', marker {key[1]}' if key[1] else ''} stands in line "
-                f"{points.line[rows[first]]} too; leave the repeat out of the pattern to have "
+                f"{points.line[first]} too; leave the repeat out of the pattern to have "
                 "shots numbered in order"
             )
     return repeats
@@ -489,7 +479,9 @@ def import_files(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
     joined = None if log is None else joining.join(where, points, log, table.join)
-    made = assemble(where, points, log, joined, table)
+    if log is not None and joined is not None:
+        points = with_joint_values(points, log, joined)
+    made = assemble(where, points, table)
     text = table_text(made)
     measured = validated(text, name, made, cell)
     fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
