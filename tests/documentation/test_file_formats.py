@@ -13,7 +13,7 @@ from elastocal.cli.main import app
 from elastocal.config import keys_of, tables_in
 from elastocal.diagnosis.diagnosis import Curve, RivalPair, Untested
 from elastocal.identification.faulty_readings import FaultyGroup
-from elastocal.identification.knowledge import KnowledgeTable
+from elastocal.identification.knowledge import Knowledge
 from elastocal.identification.outliers import Outlier
 from elastocal.measurements import families
 from elastocal.model.dh import DH_FAMILIES
@@ -49,8 +49,7 @@ def missing(wanted, text):
     return sorted(k for k in set(wanted) if not re.search(rf"(?<!\w){re.escape(k)}(?!\w)", code))
 
 
-KNOWLEDGE_FIELDS = KnowledgeTable.model_fields.values()
-KNOWLEDGE_TABLES = [t for field in KNOWLEDGE_FIELDS for t, _ in tables_in(field.annotation)]
+KNOWLEDGE_TABLES = [t for known in keys_of(Knowledge) for t, _ in tables_in(known.kind)]
 
 
 @pytest.mark.parametrize("title, table", cell_keys_page.tables())
@@ -61,9 +60,10 @@ def test_every_key_of_the_cell_file_is_on_the_page(title, table):
     assert not absent, f"{title}: {absent}"
 
 
-@pytest.mark.parametrize("table", [KnowledgeTable, *KNOWLEDGE_TABLES])
+@pytest.mark.parametrize("table", [Knowledge, *KNOWLEDGE_TABLES])
 def test_every_key_of_the_knowledge_file_is_on_the_page(table):
-    assert not [k for k in table.model_fields if k not in section("Knowledge file")]
+    assert len(KNOWLEDGE_TABLES) == 4
+    assert not [k.name for k in keys_of(table) if k.name not in section("Knowledge file")]
 
 
 def test_every_column_of_the_measurement_table_is_on_the_page():

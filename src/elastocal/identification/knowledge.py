@@ -13,8 +13,20 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
 
-from elastocal.above import ByValue
-from elastocal.config import Positive, Table, Text, checked, read_toml, required
+from elastocal.config import (
+    AnyFloat,
+    Key,
+    Many,
+    Positive,
+    Spot,
+    Table,
+    Text,
+    checked,
+    keyed,
+    read_toml,
+    record,
+    required,
+)
 from elastocal.errors import InputError, option, require
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
@@ -125,15 +137,29 @@ class System:
 
 # An entry of a matrix: a parameter, a linear combination of parameters, or a number.
 Entry = str | float | Mapping[str, float]
+NUMBER = "a finite number in SI units"
+FACTORS = (
+    "factors by parameter, with names in quotes, as in "
+    '{ "joint2.compliance" = 1.0, "joint3.compliance" = -1.0 }'
+)
 
 
-@dataclass(frozen=True)
+@record
 class Bounds:
     """lower ≤ x ≤ upper for one parameter, in its unit; equal bounds fix it."""
 
-    name: str
-    lower: float = -math.inf
-    upper: float = math.inf
+    name: str = keyed(
+        'the name of a parameter, as in "joint2.compliance"', "parameter", form=Text, required=True
+    )
+    lower: AnyFloat = keyed(f"{NUMBER}; without one, none", form=float, default=-math.inf)
+    upper: AnyFloat = keyed(f"{NUMBER}; without one, none", form=float, default=math.inf)
+
+    @classmethod
+    def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, float]:
+        name = quoted(table["parameter"])
+        told = f"the bounds of {name} state neither lower nor upper; state one"
+        spot.require({"lower", "upper"} & {*table}, told)
+        return {}
 
     def __post_init__(self) -> None:
         require(
@@ -143,19 +169,17 @@ class Bounds:
         )
 
 
-@dataclass(frozen=True)
+@record
 class LinearEquality:
     """Σ coefficient · x = value over the named parameters: a symmetry, a known sum."""
 
-    terms: Mapping[str, float]
-    value: float = 0.0
-    label: str = ""
+    terms: Annotated[dict[Text, float], Field(min_length=1)] = keyed(FACTORS, required=True)
+    value: float = keyed(NUMBER, default=0.0)
+    label: str = keyed("a text", default="")
 
     def __post_init__(self) -> None:
-        numbers = [*self.terms.values(), self.value]
         require(
-            bool(np.isfinite(numbers).all()) and any(self.terms.values()),
-            f"equality '{self}' needs finite numbers and at least one non-zero coefficient",
+            any(self.terms.values()), f"equality '{self}' needs at least one non-zero coefficient"
         )
 
     def __str__(self) -> str:
@@ -165,15 +189,24 @@ class LinearEquality:
         )
 
 
-@dataclass(frozen=True)
+@record
 class SemidefiniteMatrix:
     """A symmetric matrix of parameters that is positive semidefinite: no load gains energy.
 
     `entries` are its rows; an entry is a parameter's name, {name: coefficient, …}, or a number.
     """
 
-    label: str
-    entries: tuple[tuple[Entry, ...], ...]
+    label: str = keyed("a text")
+    entries: Many[Many[Entry]] = keyed(
+        "rows of parameter names, numbers or factors by parameter, as in "
+        '[["a", "b"], ["b", "c"]]',
+        form=Annotated[list[list[str | float | dict[str, float]]], Field(min_length=1)],
+        into=lambda rows, *_: tuple(map(tuple, rows)), required=True,
+    )  # fmt: skip
+
+    @classmethod
+    def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, str]:
+        return {"label": table.get("label") or f"matrix {int(spot.keys[-1]) + 1}"}
 
     def __post_init__(self) -> None:
         n = len(self.entries)
@@ -182,11 +215,9 @@ class SemidefiniteMatrix:
             f"matrix '{self.label}' is not square: rows of {[len(row) for row in self.entries]}",
         )
         cells = [[combination(entry) for entry in row] for row in self.entries]
-        numbers = [c for row in cells for cell in row for c in cell.values()]
         require(
-            bool(np.isfinite(numbers).all())
-            and any(n for row in cells for cell in row for n in cell),
-            f"matrix '{self.label}' needs finite numbers and at least one parameter",
+            any(n for row in cells for cell in row for n in cell),
+            f"matrix '{self.label}' needs at least one parameter",
         )
         for i in range(n):
             for j in range(i):
@@ -304,6 +335,11 @@ def physical_constraints(model: Model) -> Constraints:
 # Prior knowledge of parameters: data sheets, an earlier calibration, a sister robot.
 
 
+class PriorTable(Table):
+    mean: float = required(NUMBER)
+    std: Positive = required("a positive number in SI units")
+
+
 @dataclass(frozen=True)
 class GaussianPrior:
     """x[names] ~ N(mean, covariance): mean (k,) and covariance (k, k) in the parameters' units.
@@ -345,8 +381,9 @@ class GaussianPrior:
         """From {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}, …}, in SI units."""
         require(bool(table), "the prior is empty; name at least one parameter")
         stated = {k: dict(v) if isinstance(v, Mapping) else v for k, v in table.items()}
-        known = checked(KnowledgeTable, {"prior": stated}, option("prior")).prior.values()
-        return cls.independent(tuple(table), [p.mean for p in known], [p.std for p in known])
+        known = checked(Knowledge, {"prior": stated}, option("prior")).prior
+        assert known is not None
+        return known
 
     def rows(self, names: Sequence[str]) -> tuple[Array, Array]:
         """P (k, p) and target (k,) with |target − P x|² = (x − mean)ᵀ covariance⁻¹ (x − mean).
@@ -393,54 +430,19 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
     return np.divide(passed, variance, out=share, where=variance > 0)
 
 
-# The knowledge file (TOML): its keys, and what they say of the parameters.
-
-Terms = Annotated[dict[Text, float], Field(min_length=1)]
-FACTORS = (
-    "factors by parameter, with names in quotes, as in "
-    '{ "joint2.compliance" = 1.0, "joint3.compliance" = -1.0 }'
-)
+# All of it, and the file (TOML) that states it.
 
 
-class PriorTable(Table):
-    mean: float = required("a finite number in SI units")
-    std: Positive = required("a positive number in SI units")
+def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> GaussianPrior | None:
+    means, std = ([getattr(p, key) for p in tables.values()] for key in ("mean", "std"))
+    try:
+        return GaussianPrior.independent(tuple(tables), means, std) if tables else None
+    except InputError as error:
+        raise InputError(f"{spot.path}: {error}") from None
 
 
-class BoundsTable(Table):
-    parameter: Text = required('the name of a parameter, as in "joint2.compliance"')
-    lower: float | None = Field(None, description="a finite number in SI units; without one, none")
-    upper: float | None = Field(None, description="a finite number in SI units; without one, none")
-
-
-class EqualityTable(Table):
-    terms: Terms = required(FACTORS)
-    value: float = Field(0.0, description="a finite number in SI units")
-    label: str = Field("", description="a text")
-
-
-class SemidefiniteTable(Table):
-    entries: Annotated[list[list[str | float | dict[str, float]]], Field(min_length=1)] = Field(
-        description="rows of parameter names, numbers or factors by parameter, as in "
-        '[["a", "b"], ["b", "c"]]'
-    )
-    label: str = Field("", description="a text")
-
-
-class KnowledgeTable(Table):
-    physical: bool = Field(False, description="true or false")
-    prior: dict[Text, PriorTable] = Field(
-        default_factory=dict, description='tables by parameter, as in [prior."joint2.compliance"]'
-    )
-    bounds: list[BoundsTable] = Field(default_factory=list, description="[[bounds]] tables")
-    equality: list[EqualityTable] = Field(default_factory=list, description="[[equality]] tables")
-    semidefinite: list[SemidefiniteTable] = Field(
-        default_factory=list, description="[[semidefinite]] tables"
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Knowledge(ByValue):
+@record
+class Knowledge:
     """What is known of the parameters besides the readings, in SI units.
 
     Attributes:
@@ -455,10 +457,25 @@ class Knowledge(ByValue):
         True
     """
 
-    physical: bool = False
-    constraints: Constraints = field(default_factory=Constraints)
-    prior: GaussianPrior | None = None
-    source: str = "knowledge"
+    physical: bool = keyed(default=False)
+    constraints: Constraints = keyed(
+        keys=(
+            Key("bounds", "[[bounds]] tables", list[Bounds]),
+            Key("equality", "[[equality]] tables", list[LinearEquality]),
+            Key("semidefinite", "[[semidefinite]] tables", list[SemidefiniteMatrix]),
+        ),
+        default_factory=Constraints,
+    )
+    prior: GaussianPrior | None = keyed(
+        'tables by parameter, as in [prior."joint2.compliance"]', form=dict[Text, PriorTable],
+        into=_stated_prior, default=None,
+    )  # fmt: skip
+    source: str = field(default="knowledge", compare=False)
+
+    @classmethod
+    def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, Any]:
+        tables = (tuple(table.get(name, ())) for name in ("bounds", "equality", "semidefinite"))
+        return {"constraints": Constraints(*tables), "source": str(spot.path)}
 
     def of(self, model: Model) -> tuple[Constraints, GaussianPrior | None]:
         """Constraints and prior on the model's parameters.
@@ -483,26 +500,4 @@ def read_knowledge(path: str | Path) -> Knowledge:
     Raises InputError that names file, key, what the key takes and the nearest valid key.
     """
     path = Path(path)
-    table = checked(KnowledgeTable, read_toml(path, "knowledge file"), path)
-    try:
-        prior = GaussianPrior.from_dict(table.model_dump()["prior"]) if table.prior else None
-        return Knowledge(table.physical, _constraints(table), prior, str(path))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
-
-
-def _constraints(table: KnowledgeTable) -> Constraints:
-    bounds: list[Bounds] = []
-    for b in table.bounds:
-        require(
-            b.lower is not None or b.upper is not None,
-            f"the bounds of {quoted(b.parameter)} state neither lower nor upper; state one",
-        )
-        lower = -math.inf if b.lower is None else b.lower
-        bounds.append(Bounds(b.parameter, lower, math.inf if b.upper is None else b.upper))
-    equalities = [LinearEquality(e.terms, e.value, e.label) for e in table.equality]
-    matrices = [
-        SemidefiniteMatrix(m.label or f"matrix {k}", tuple(tuple(row) for row in m.entries))
-        for k, m in enumerate(table.semidefinite, start=1)
-    ]
-    return Constraints(tuple(bounds), tuple(equalities), tuple(matrices))
+    return checked(Knowledge, read_toml(path, "knowledge file"), path)
