@@ -20,7 +20,6 @@ from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
-from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (
     Excess,
@@ -34,8 +33,6 @@ from elastocal.identification.prediction import (
 )
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.scrutiny import MOST_NUMBERS
-from elastocal.identification.smooth_functions import SmoothPart
-from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.arm import check_loads
 from elastocal.model.calibrated import (
@@ -46,9 +43,8 @@ from elastocal.model.calibrated import (
     nominal_flange_rows,
     tool_point,
 )
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import COMPONENTS, Observations, observe
-from elastocal.units import Array, IntArray, microns
+from elastocal.model.observations import COMPONENTS, observe
+from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms
@@ -256,7 +252,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Calibration(Result):
+class Calibration(scrutiny.FoundFit, Result):
     """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
 
     Attributes:
@@ -312,21 +308,12 @@ class Calibration(Result):
         ['joint1.compliance']
     """
 
-    model: Model
     method: str
-    noise: Noise
     estimates: tuple[Estimate, ...]
     combinations: tuple[Combination, ...]
-    x: Array
-    determined: tuple[str, ...]
     spread: Covariance
     correlations: tuple[tuple[str, str, float], ...]
-    observations: Observations
-    residual: Array
-    held_out: Array
     sigma: float
-    dof: int
-    residual_rms: float
     heldout_rms: float
     nominal_rms: float
     converged: bool
@@ -334,15 +321,12 @@ class Calibration(Result):
     outliers: tuple[Outlier, ...]
     excluded: tuple[Outlier, ...]
     warnings: tuple[str, ...]
-    weights: Weights
-    noise_parts: dict[str, float]
     test: TestErrors | None = None
     residual_summary: ResidualSummary | None = None
     faulty_report: OutlierReport | None = None
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
-    smooth: tuple[SmoothPart, ...] = ()
     left: OpenParameters | None = None
     predicted: PredictedError | None = None
     copies: tuple[int, ...] = ()
@@ -503,18 +487,6 @@ class Calibration(Result):
             f"{functions}{held}>"
         )
 
-    @cached_property
-    def columns(self) -> IntArray:
-        """Indices (determined,) of the parameters `determined` among the model's."""
-        index = {name: i for i, name in enumerate(self.model.names)}
-        return np.array([index[name] for name in self.determined], dtype=np.int64)
-
-    @cached_property
-    def B(self) -> Array:
-        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
-        observed = self.observations
-        return self.model.regressor(observed.table, self.x, observations=observed).B
-
     @property
     def _looks(self) -> bool:
         """Whether to look again: not at a table too large to do it in passing, an exact fit, which
@@ -543,7 +515,7 @@ class Calibration(Result):
     def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""
-        return scrutiny.uncertainty_budget(self, table) if self._looks else None
+        return scrutiny.uncertainty_budget(self, self.arm, table) if self._looks else None
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:

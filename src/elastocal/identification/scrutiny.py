@@ -8,7 +8,8 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Any, Protocol
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,39 +30,34 @@ from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array, BoolArray, IntArray, microns
 
 
-class FoundFit(Protocol):
-    """What of a calibration is looked at again, by the names that it has there."""
+@dataclass(frozen=True, repr=False, eq=False, kw_only=True)
+class FoundFit:
+    """What of a `Calibration` is looked at again; it says what each is."""
 
-    @property
-    def model(self) -> Model: ...
-    @property
-    def x(self) -> Array: ...
-    @property
-    def B(self) -> Array: ...
-    @property
-    def residual(self) -> Array: ...
-    @property
-    def held_out(self) -> Array: ...
-    @property
-    def residual_rms(self) -> float: ...
-    @property
-    def dof(self) -> int: ...
-    @property
-    def observations(self) -> Observations: ...
-    @property
-    def weights(self) -> Weights: ...
-    @property
-    def columns(self) -> IntArray: ...
-    @property
-    def determined(self) -> tuple[str, ...]: ...
-    @property
-    def smooth(self) -> tuple[SmoothPart, ...]: ...
-    @property
-    def noise(self) -> Noise: ...
-    @property
-    def noise_parts(self) -> dict[str, float]: ...
-    @property
-    def arm(self) -> CalibratedArm: ...
+    model: Model
+    x: Array
+    determined: tuple[str, ...]
+    observations: Observations
+    residual: Array
+    held_out: Array
+    dof: int
+    residual_rms: float
+    weights: Weights
+    noise: Noise
+    noise_parts: dict[str, float]
+    smooth: tuple[SmoothPart, ...] = ()
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """Indices (determined,) of the parameters `determined` among the model's."""
+        index = {name: i for i, name in enumerate(self.model.names)}
+        return np.array([index[name] for name in self.determined], dtype=np.int64)
+
+    @cached_property
+    def B(self) -> Array:
+        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
+        observed = self.observations
+        return self.model.regressor(observed.table, self.x, observations=observed).B
 
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
@@ -357,14 +353,16 @@ class UncertaintyBudget:
         return {"at": self.at, **{f"{k}_um": microns(v) for k, v in told.items()}}
 
 
-def uncertainty_budget(fit: FoundFit, table: Measurements | None = None) -> UncertaintyBudget:
+def uncertainty_budget(
+    fit: FoundFit, arm: CalibratedArm, table: Measurements | None = None
+) -> UncertaintyBudget:
     """The budget at the poses and loads of a `table`, by default those fitted."""
     B, at = fit.B, "the poses fitted"
     if table is not None:
         B, at = fit.model.regressor(table, fit.x).B, table.source
-    own, left = mean_squares(fit.arm, B, fit.observations.size)
+    own, left = mean_squares(arm, B, fit.observations.size)
     visits, readings = (fit.noise_parts.get(part, 0.0) for part in ("visits", "readings"))
-    lack = min(max(fit.arm.lacking**2 - visits, 0.0), readings)
+    lack = min(max(arm.lacking**2 - visits, 0.0), readings)
     parameters, open_, shared, single, beyond = np.sqrt(
         [own, left, visits, readings - lack, lack]
     ).tolist()
