@@ -105,18 +105,13 @@ def test_ill_conditioned():
     assert len(named) == 3 and set(named) <= set(result.determined)
 
 
-def springs():
-    nominal = Nominal(joint_compliance=(2e-5,) * 3)
-    return Model.assembled(
-        planar_chain(), cell_of(("base_frame", "joint_compliance"), nominal=nominal)
-    )
-
-
 STATES = [[0, 0, 0], [200, 0, -400]]
 
 
 def test_a_parameter_beyond_its_bound():
-    model = springs()
+    nominal = Nominal(joint_compliance=(2e-5,) * 3)
+    effects = ("base_frame", "joint_compliance")
+    model = Model.assembled(planar_chain(), cell_of(effects, nominal=nominal))
     truth = with_values(model, {"joint3.compliance": -1e-5})
     result = identified(model, truth=truth, forces=STATES, sigma=20 * SIGMA)
     assert kinds(result) == {"beyond bound"}
@@ -125,30 +120,25 @@ def test_a_parameter_beyond_its_bound():
     assert "fit with bounds" in text_of(result, "beyond bound")
 
 
-def spoil(rows, by=0.01):
-    def change(table):
+@pytest.mark.parametrize("alike", [False, True])
+def test_too_many_outliers_are_no_reading_errors_unless_one_shift_explains_them(alike):
+    model, rows = Model.assembled(planar_chain(), cell_of(PLACED)), np.arange(10, 16)
+    by = 0.01 if alike else 0.01 * np.random.default_rng(0).normal(size=(6, 3))
+
+    def spoilt(table):
         position = table.position.copy()
         position[rows] += by
         return replace(table, position=position)
 
-    return change
-
-
-def test_too_many_outliers_are_no_reading_errors():
-    model, rows = Model.assembled(planar_chain(), cell_of(PLACED)), np.arange(10, 16)
-    apart = 0.01 * np.random.default_rng(0).normal(size=(6, 3))
-    result = identified(model, poses=50, change=spoil(rows, apart))
-    assert kinds(result) == {"outliers", "share"}
-    assert "(lines 12–17)" in text_of(result, "outliers")
-
-
-def test_as_many_that_one_shift_explains_are_set_apart_and_the_shift_is_told():
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    result = identified(model, poses=50, change=spoil(np.arange(10, 16)))
-    assert [o.line for o in result.excluded] == list(range(12, 18)) and not result.outliers
-    found = result.finding("faulty_readings")
-    assert found.numbers["shifted"] == 6
-    assert "One common shift explains lines 12 to 17 by 17.4 mm" in found.remedy
+    result = identified(model, poses=50, change=spoilt)
+    assert [o.line for o in (result.excluded if alike else result.outliers)] == list(rows + 2)
+    told = result.finding("faulty_readings")
+    if alike:
+        assert told.numbers["shifted"] == 6
+        assert "One common shift explains lines 12 to 17 by 17.4 mm" in told.remedy
+    else:
+        assert kinds(result) == {"outliers", "share"} and told.numbers["shifted"] == 0
+        assert "(lines 12–17)" in text_of(result, "outliers")
 
 
 def test_a_missing_effect_in_one_load_state_is_no_shift():

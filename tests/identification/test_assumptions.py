@@ -102,9 +102,6 @@ def campaign_of_repeats(model, plan, seed):
     return replace(table, repeat=np.tile(np.arange(6), len(plan)), position=position), rows
 
 
-# Loads in another unit.
-
-
 # Numbers that the data cannot support.
 
 

@@ -16,12 +16,6 @@ def shifted(table, rows, by):
     return replace(table, position=position)
 
 
-def test_a_clean_table_has_no_finding():
-    model, table, _ = campaign()
-    report = identify(model, table).faulty_report
-    assert report.findings == () and report.good.all()
-
-
 @pytest.mark.parametrize("effect", [0.0, 1e-4])
 def test_a_block_of_lines_is_one_finding(effect):
     """Eight lines off by 3 mm, under noise of 50 µm with and without a shared deviation."""

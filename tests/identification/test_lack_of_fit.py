@@ -1,6 +1,5 @@
 """The lack-of-fit test: pure error from repeats against the scatter between configurations."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -50,20 +49,13 @@ def test_it_is_the_textbook_decomposition():
     np.testing.assert_allclose(found.F, between / dof_between / (pure / dof_pure), rtol=1e-12)
 
 
-def test_a_configuration_effect_is_told():
-    model, table = campaign(3, effect=1e-4)
-    result = identify(model, table, Options(method="ols"))
-    found = result.noise.lack_of_fit
-    # The effect's variance is 4 times a reading's; means of 4 readings carry it whole.
-    assert found.p < 1e-6 and 5 < found.F < 50
-    assert any(w.startswith(SENTENCE) for w in result.warnings)
-    json.dumps(result.to_json(), allow_nan=False)
-
-
-def test_the_default_counts_with_a_configuration_effect():
-    """The same table: the effect is in the noise model, so intervals are wider and nobody warns."""
+def test_a_configuration_effect_is_told_and_the_default_counts_with_it():
+    """There the effect is in the noise model, so intervals are wider and nobody warns."""
     model, table = campaign(3, effect=1e-4)
     plain, result = identify(model, table, Options(method="ols")), identify(model, table)
+    # The effect's variance is 4 times a reading's; means of 4 readings carry it whole.
+    assert plain.noise.lack_of_fit.p < 1e-6 and 5 < plain.noise.lack_of_fit.F < 50
+    assert any(w.startswith(SENTENCE) for w in plain.warnings)
     assert result.noise.kind.endswith("+configuration")
     assert result.noise.lack_of_fit.p < 1e-6
     assert not any(w.startswith(SENTENCE) for w in result.warnings)

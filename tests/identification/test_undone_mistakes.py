@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from identification.test_far_values import CASES, cell, poses
+from support.parts import deflections
 from typer.testing import CliRunner
 
 import elastocal as ec
 from elastocal.cli.main import app
+from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.model.observations import observe
 
 COUPLED = "coupling { joint = 3, of = 2, factor = -1 }"
 
@@ -136,3 +139,14 @@ def test_a_longer_link_is_no_scale(tmp_path):
     path = cell(tmp_path)
     fit = ec.identify(path, ec.simulate(path, poses(40, 3), values={"link2.dx": 0.02}, seed=4))
     assert fit.finding("scale") is None and fit.finding("far_from_nominal") is not None
+
+
+def test_deflections_are_small_but_their_positions_tell_swapped_columns() -> None:
+    model, table = deflections()
+    observed = observe(table, "deflection")
+    none_left = np.zeros(observed.value.size)
+    refuse_nonsense(model, observed, model.nominal, none_left, table)
+    mirrored = replace(table, position=np.asarray(table.position)[:, [0, 2, 1]])
+    mended = "no deflections of this arm.*the readings fit the nominal arm only to .* they would"
+    with pytest.raises(ec.InsufficientDataError, match=mended):
+        refuse_nonsense(model, observed, model.nominal, none_left, mirrored)

@@ -333,7 +333,6 @@ def scale_of(result: Calibration) -> float | None:
 
 
 def _size(value: float, unit: str) -> str:
-    """A length in mm, an angle in degrees, as mastering has them."""
     number, unit = {"m": (value * 1e3, " mm"), "rad": (math.degrees(value), "°")}.get(
         unit, (value, f" {unit}")
     )
@@ -376,7 +375,6 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
 
 
 def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
-    """The residual's mean square against the stated noise, by its χ² distribution."""
     ratio = result.noise.ratio_to_stated
     if ratio is None:
         yield _note("noise_not_compared", "" if _lacks_fit(result) else STATE_NOISE)
@@ -408,7 +406,6 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
 
 
 def _stated_kurtosis(result: Calibration) -> float:
-    """Of what is kept of noise with the tails that the cell states; normal noise has none."""
     tails, size = result.model.cell.noise.tails, result.observations.size
     if tails is None:
         return 0.0
@@ -417,7 +414,6 @@ def _stated_kurtosis(result: Calibration) -> float:
 
 
 def _lacking(result: Calibration) -> str:
-    """What to do where much is left: ask diagnose, unless the cell has what it names."""
     effects = dict.fromkeys(p.effect for p in result.model.parameters)
     named = [e.replace("_", " ") for e in effects
              if e not in STATED_BY_FILE and not effect_of(e).registered]  # fmt: skip
@@ -617,21 +613,18 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
 
 
 def _unread(result: Calibration) -> list[str]:
-    """Places of the markers that the table has no reading of, not even one that was excluded."""
     excluded = {f"marker:{o.marker}" for o in result.excluded}
     places = unread_markers(result.model, result.observations.table)
     return [place for place in places if place not in excluded]
 
 
 def no_reading(result: Calibration) -> str:
-    """ "no reading of marker M2 in data.csv" """
     names = [place.removeprefix("marker:") for place in _unread(result)]
     several, source = "s" * (len(names) > 1), result.observations.table.source
     return f"no reading of marker{several} {listed(names, 4)} in {source}"
 
 
 def _prior(result: Calibration) -> Iterator[Finding]:
-    """Parameters of which the prior says more than the readings, the most so first."""
     shares = result.prior_share
     names = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
     if names:
@@ -670,7 +663,6 @@ def _shape(result: Calibration) -> Iterator[Finding]:
 
 
 def shape_of(summary: ResidualSummary) -> Finding:
-    """Are the standardised residuals normal?"""
     skew, kurtosis, p = (
         summary.whole.skewness, summary.whole.excess_kurtosis, summary.whole.normality_p
     )  # fmt: skip
@@ -710,8 +702,6 @@ def _test(result: Calibration) -> Iterator[Finding]:
 def of_solution(
     result: Calibration, solution: Solution, whole: Measurements
 ) -> tuple[Finding, ...]:
-    """Conditioning of the fit, parameters beyond their physical bounds, and in the `whole` table
-    readings with another marker's name."""
     return (*_conditioning(result, solution), *_bounds(result), *_exchanged(result, whole))
 
 

@@ -52,7 +52,6 @@ class Matrix:
     balance: Array
 
     def at(self, x: Array) -> Array:
-        """M(x) (n, n)."""
         return self.constant + np.tensordot(x, self.slopes, axes=1)
 
     def balanced(self, whole: bool = False) -> Matrix:
@@ -298,7 +297,6 @@ def _index(name: str, position: Mapping[str, int], where: str) -> int:
 def _row(
     terms: Mapping[str, float], position: Mapping[str, int], where: str
 ) -> tuple[Array, float]:
-    """Coefficients (p,) and the constant of a combination."""
     row, constant = np.zeros(len(position)), 0.0
     for name, coefficient in terms.items():
         if name:

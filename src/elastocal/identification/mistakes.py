@@ -117,7 +117,6 @@ def _mm(metres: float) -> str:
 
 
 def _some(table: Measurements) -> Measurements:
-    """As many readings as tell it, without load where these are enough."""
     light = np.flatnonzero(~np.any(table.force != 0, axis=1))
     rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
     if len(rows) > SAMPLE:
@@ -129,7 +128,7 @@ def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
     problem = nominal_problem(model, _some(table))
     found = register(problem)
-    place = found.places(problem.flange_rotation, problem.flange_position, problem.marker)
+    place = found.places(problem.flange, problem.marker)
     distance = np.linalg.norm(problem.points - place, axis=1)
     return found.error, float(np.percentile(distance, MOST))
 
@@ -158,7 +157,6 @@ class JointMap:
         return c @ self.matrix.T + self.offset
 
     def after(self, first: JointMap) -> JointMap:
-        """This map of what `first` gives."""
         return JointMap(
             first.words + self.words, self.matrix @ first.matrix,
             self.matrix @ np.broadcast_to(first.offset, len(self.matrix)) + self.offset,
@@ -167,7 +165,6 @@ class JointMap:
 
 
 def joint_maps(chain: Chain) -> list[JointMap]:
-    """Single mistakes, all signs with each coupling, and pairs of the others."""
     signs, couplings, others = (list(some(chain)) for some in (_signs, _couplings, _others))
     single = [sign for sign in signs if sign.mistakes == 1]
     pairs = [
@@ -223,7 +220,6 @@ ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
 
 
 def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[Alternative]:
-    """Joint values and positions read otherwise; those first of which few have to be undone."""
     position, maps = np.asarray(table.position), joint_maps(chain)
     q = np.stack([joint_map.of(table.q) for joint_map in maps])
     flange = nominal_flanges(chain, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
@@ -296,7 +292,6 @@ MOST_ROWS = 20_000
 
 
 def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
-    """Joint values of the rows to which the readings have slipped, where few blocks explain it."""
     visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
     visits, rows = int(visit[-1]) + 1, np.arange(len(table))
     if visits < BLOCK or len(table) > MOST_ROWS:
@@ -331,7 +326,6 @@ def _placed_by(
 
 
 def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:
-    """These rows with the joint values and markers of the rows `shift` further on."""
     return replace(
         table.take(rows), q=table.q[rows + shift], marker=table.marker[rows + shift]
     )  # fmt: skip
@@ -340,7 +334,6 @@ def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measur
 def _blocks(
     table: Measurements, flange: Array, visit: IntArray, shifts: IntArray
 ) -> list[tuple[IntArray, int]]:
-    """Blocks of rows and shifts with which they fit best, those of small shifts first."""
     found = []
     last = int(visit[-1]) + 1 - BLOCK
     for first in np.unique(np.linspace(0, last, min(WINDOWS, last + 1)).astype(int)):
@@ -357,7 +350,7 @@ def _blocks(
 def _distances(found: Registration, table: Measurements, flange: Array, shifts: IntArray) -> Array:
     """Distance (n, shifts) in m of every reading from the nominal place of the row that many
     further on; infinite beyond the table."""
-    place = found.places(flange[:, :3, :3], flange[:, :3, 3], table.marker)
+    place = found.places(flange, table.marker)
     to = np.arange(len(table))[:, None] + shifts
     off = np.asarray(table.position)[:, None] - place[np.clip(to, 0, len(table) - 1)]
     inside = (to >= 0) & (to < len(table))
@@ -539,7 +532,6 @@ def _cause(every: Measurements, fit: NominalFit | None) -> str:
 
 
 def _constant(table: Measurements) -> str:
-    """The columns of a position that hold one value while the arm moved, and those of joints."""
     columns = [] if table.position is None else list(zip("xyz", table.position.T, strict=True))
     columns += [(f"q{j + 1}", values) for j, values in enumerate(table.q.T)]
     same = [name for name, values in columns if (values == values[0]).all()]
@@ -582,7 +574,6 @@ class Exchanged:
 
 
 def exchanged(model: Model, table: Measurements) -> Exchanged | None:
-    """Readings that have another marker's name; None where there are none."""
     names, n = table.marker_names, len(table)
     poses = len(np.unique(table.q, axis=0))
     if table.position is None or len(names) < 2 or not FEWEST_POSES <= poses <= n <= MOST_READINGS:
@@ -591,10 +582,8 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
     marker, far = table.marker, np.sqrt(special.chdtri(3, FALSE_ALARM / n))
     for _ in range(PASSES):  # base and markers by the names as they should be
         found = register(replace(problem, marker=marker))
-        places = np.stack([
-            found.places(problem.flange_rotation, problem.flange_position, np.full(n, m))
-            for m in range(len(names))
-        ], axis=1)  # fmt: skip
+        each = [found.places(problem.flange, np.full(n, m)) for m in range(len(names))]
+        places = np.stack(each, axis=1)
         distance = np.linalg.norm(problem.points[:, None] - places, axis=2)
         nearest = distance.argmin(axis=1)
         least = distance[row, nearest]

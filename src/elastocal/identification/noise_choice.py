@@ -85,7 +85,6 @@ class Sets:
         self.sets = set_of[j[:, 0] > 0]
 
     def mean(self, values: Array) -> Array:
-        """Of each set (S, …) of values (N, …)."""
         if self.n == len(self.of):
             out = np.empty_like(values)
             out[self.of] = values
@@ -135,12 +134,10 @@ class NoisyReadings:
 
     @property
     def own(self) -> int:
-        """How many of the variances are those of single readings."""
         return len(self.structure.names)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of all variances."""
         return (*self.structure.names, *(d.name for d in self.deviations))
 
     @property
@@ -250,12 +247,10 @@ class Fitted(MixedFit):
 
     @property
     def own(self) -> Array:
-        """Variances of single readings."""
         return self.theta[: self.noisy.own]
 
     @property
     def common(self) -> Array:
-        """Variances of the deviations that readings share."""
         return self.theta[self.noisy.own :]
 
     @property
@@ -436,7 +431,6 @@ class NoiseFit:
 
     @property
     def description(self) -> str:
-        """The model in words."""
         names: dict[str, list[str]] = {}
         for d, _ in self.fit.found:
             names.setdefault(d.part, []).append(d.name)
@@ -452,7 +446,6 @@ class NoiseFit:
         return self.fit.lasting
 
     def of_readings(self) -> NoiseFit:
-        """Named as the best of what was tried that knows nothing of the arm's visits."""
         tried = [t for t in self.trials if not Kind.parsed(t.kind).by_visit]
         kind = min(tried, key=lambda t: t.criterion).kind
         return replace(self, kind=kind, trials=tuple(tried), reason=_reason(kind, tried))
@@ -678,7 +671,6 @@ def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
 def linearised(
     model: Model, observed: Observations, x: Array, columns: NDArray[np.int64]
 ) -> Readings:
-    """Residuals and B of the `columns` at x (parameters,), with the labels of each observation."""
     at = model.regressor(observed.table, x, columns, observed)
     n, size = len(observed.lead), observed.size
     table = observed.table
@@ -730,7 +722,6 @@ def with_stated_sharing(own: Weights, model: Model, observed: Observations, x: A
 
 
 def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | None]:
-    """Axes along and across the line of sight (N, 3, 3) and its length (N,), where it is known."""
     position = observed.table.position
     if position is None or observed.size != 3:
         return None, None

@@ -243,7 +243,6 @@ class Readings:
 
     @property
     def spare(self) -> int:
-        """How many variances they may tell."""
         return (self.e.size - self.n_parameters) // ROWS_PER_VARIANCE
 
     def take(self, chosen: BoolArray) -> Readings:
@@ -280,7 +279,6 @@ class Structure:
     matrix: Array
 
     def covariance(self, theta: Array) -> Array:
-        """Of each reading (N, size, size)."""
         return np.einsum("nl,nlij->nij", theta[self.index], self.matrix)
 
 
@@ -695,7 +693,6 @@ class Kind(NamedTuple):
 
     @classmethod
     def parsed(cls, name: str) -> Kind:
-        """That of a name, as "axis+configuration+joints+time", known or not."""
         own, *parts = name.split("+")
         return cls(own, tuple(parts))
 

@@ -58,12 +58,10 @@ class SingleReadings:
 
     @property
     def above(self) -> bool:
-        """Whether the noise is stated too small."""
         return self.ratio**2 * self.dof > float(special.chdtri(self.dof, BEYOND))
 
     @property
     def explains(self) -> bool:
-        """Whether it explains a residual above the stated noise."""
         return self.above and self.rest >= REST
 
 
@@ -227,7 +225,6 @@ class Noise:
 
     @property
     def estimated(self) -> bool:
-        """Whether the weights come from a noise model with estimated variances."""
         return bool(self.sizes)
 
     def scatter(self, n_joints: int) -> tuple[Array, float]:
@@ -278,7 +275,6 @@ class Noise:
 
 
 def noise_of(found: MethodResult, sigma: float) -> Noise:
-    """The noise behind what was `found`; `sigma` is the standard deviation of a whitened row."""
     weights, covariance = found.solution.problem.weights, found.intervals.covariance
     noise = Noise(
         weights.kind,
@@ -398,7 +394,6 @@ def _spent(found: MethodResult) -> int:
 
 
 def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
-    """Repeats against configurations, each reading weighted by its own noise alone."""
     solution = found.solution
     problem, residual = solution.problem, solution.fit.residual
     noise, whitened = found.noise, problem.weights.apply(residual)

@@ -88,7 +88,6 @@ class Influence:
     by: float
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers; what is infinite is None."""
         return {
             k: None if isinstance(v, float) and not np.isfinite(v) else v
             for k, v in vars(self).items()
@@ -96,7 +95,6 @@ class Influence:
 
 
 def influence(fit: FoundFit) -> tuple[Influence, ...]:
-    """Leverage and influence of every configuration, in the order of the table."""
     observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
     white, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
@@ -356,7 +354,6 @@ class UncertaintyBudget:
 def uncertainty_budget(
     fit: FoundFit, arm: CalibratedArm, table: Measurements | None = None
 ) -> UncertaintyBudget:
-    """The budget at the poses and loads of a `table`, by default those fitted."""
     B, at = fit.B, "the poses fitted"
     if table is not None:
         B, at = fit.model.regressor(table, fit.x).B, table.source
@@ -461,7 +458,6 @@ def _step(name: str, result: FoundFit, residual: Array, rng: np.random.Generator
 
 
 def _floor(result: FoundFit) -> tuple[float | None, str]:
-    """What repeats scatter, else what the stated noise gives."""
     observed = result.observations
     parts = result.residual.reshape(-1, observed.size)[:, :3]
     square, dof = pure_error(observed.place, parts)

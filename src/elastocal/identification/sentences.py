@@ -234,7 +234,6 @@ def _lines(readings: tuple[Outlier, ...]) -> str:
 
 
 def _runs(lines: Iterable[int]) -> str:
-    """ "142–507, 610 …": runs of lines, the first eight."""
     runs = named_runs(list(lines))
     return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import combinations, product
 
 import numpy as np
@@ -101,9 +101,9 @@ class Registration:
     markers: Array
     error: float
 
-    def places(self, turn: Array, position: Array, marker: IntArray) -> Array:
-        """Where flanges at `turn` (n, 3, 3) and `position` (n, 3) have each `marker` (n,)."""
-        body = np.einsum("nij,nj->ni", turn, self.markers[marker]) + position
+    def places(self, flange: Array, marker: IntArray) -> Array:
+        """Where flanges (n, 4, 4) have each `marker` (n,)."""
+        body = np.einsum("nij,nj->ni", flange[:, :3, :3], self.markers[marker]) + flange[:, :3, 3]
         return np.asarray(body @ self.rotation.T + self.translation)
 
 
@@ -111,30 +111,26 @@ class Registration:
 class RegistrationProblem:
     """Find R_b, t_b, m with p_i = R_b (R_i m_c(i) + t_i) + t_b.
 
-    `flange_rotation` (n, 3, 3) and `flange_position` (n, 3): nominal flange poses in the base
-    frame; `points` (n, 3) readings; `marker` (n,) codes into `start_markers` (M, 3).
-    `free_markers` (M,) says which marker positions are unknown, `free_base` whether the base is;
-    a known base is (`base_rotation`, `base_translation`).
+    `flange` (n, 4, 4): nominal flange poses in the base frame; `points` (n, 3) readings; `marker`
+    (n,) codes into `start_markers` (M, 3), of which `free_markers` (M,) are unknown; a known base
+    is (`base_rotation`, `base_translation`).
     """
 
-    flange_rotation: Array
-    flange_position: Array
+    flange: Array
     points: Array
     marker: IntArray
     start_markers: Array
     free_markers: BoolArray
-    free_base: bool
-    base_rotation: Array
-    base_translation: Array
+    free_base: bool = True
+    base_rotation: Array = field(default_factory=lambda: np.eye(3))
+    base_translation: Array = field(default_factory=lambda: np.zeros(3))
 
 
 def nominal_problem(model: Model, table: Measurements) -> RegistrationProblem:
-    """Base and all markers free, of the nominal arm and positions."""
-    T = model.rigid.flange_poses(table)
+    n = len(table.marker_names)
     return RegistrationProblem(
-        T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
-        np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
-        True, np.eye(3), np.zeros(3),
+        model.rigid.flange_poses(table), np.asarray(table.position), table.marker,
+        np.zeros((n, 3)), np.ones(n, dtype=bool),
     )  # fmt: skip
 
 
@@ -147,13 +143,11 @@ def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
     n = len(problem.points)
     if n > SAMPLE:
         chosen = np.random.default_rng(seed).choice(n, SAMPLE, replace=False)
-        of_rows = ("flange_rotation", "flange_position", "points", "marker")
+        of_rows = ("flange", "points", "marker")
         problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
     starts = problem.base_rotation[None]
     if problem.free_base:
-        flange = np.zeros((len(problem.points), 4, 4))
-        flange[:, :3, :3], flange[:, :3, 3] = problem.flange_rotation, problem.flange_position
-        linear = linear_fits(flange[None], problem.points, problem.marker).matrix[0]
+        linear = linear_fits(problem.flange[None], problem.points, problem.marker).matrix[0]
         U, _, Vt = np.linalg.svd(linear.T)
         body = _body_points(problem, problem.start_markers)
         starts = np.stack([
@@ -202,7 +196,7 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
     With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations, of
     orthogonal blocks.  Its normal equations cost half the digits, which a start can spare.
     """
-    turn, code = problem.flange_rotation, problem.marker
+    turn, code = problem.flange[:, :3, :3], problem.marker
     free = np.flatnonzero(problem.free_markers)
     fixed = problem.start_markers * ~problem.free_markers[:, None]
     known = np.zeros(3) if problem.free_base else problem.base_translation
@@ -233,14 +227,11 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
 
 def _body_points(problem: RegistrationProblem, markers: Array) -> Array:
     """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
-    turn, code = problem.flange_rotation, problem.marker
-    out = np.empty((*markers.shape[:-2], *problem.flange_position.shape))
+    out = np.empty((*markers.shape[:-2], len(problem.flange), 3))
     for k in range(markers.shape[-2]):
-        here = code == k
-        turned = markers[..., k, :] @ turn[here].reshape(-1, 3).T
-        out[..., here, :] = (
-            turned.reshape(*turned.shape[:-1], -1, 3) + problem.flange_position[here]
-        )
+        here = problem.marker == k
+        turned = markers[..., k, :] @ problem.flange[here, :3, :3].reshape(-1, 3).T
+        out[..., here, :] = turned.reshape(*turned.shape[:-1], -1, 3) + problem.flange[here, :3, 3]
     return out
 
 
@@ -292,7 +283,7 @@ def start_values(
     T = model.rigid.flange_poses(table.take(rows))
     nominal = model.cell.model.nominal
     problem = RegistrationProblem(
-        T[:, :3, :3], T[:, :3, 3], table.position[rows], codes[rows],
+        T, table.position[rows], codes[rows],
         np.array([model.cell.tool.markers[m] for m in names]),
         np.array([f"marker:{m}" in places for m in names]),
         "base" in places,
