@@ -33,10 +33,6 @@ def table_for(model, n=20, seed=0, q=None):
     return measured(model, plan, true_values(model, rng), 5e-5, rng)
 
 
-def scaled(table, factor):
-    return replace(table, position=table.position * factor)
-
-
 def refused(model, table, error, *parts):
     """`identify` and `check_table` both refuse, with every part in the message."""
     for check in (check_table, identify):
@@ -85,6 +81,13 @@ def test_fewer_equations_than_parameters(model):
     )
     assert "or fit fewer effects" in str(caught.value)
     assert caught.value.exit_code == 1
+
+
+def test_the_test_table_is_checked_too(model):
+    other = table_for(model, seed=1)
+    wrong = replace(other, position=other.position * 1e3, source="other.csv")
+    with pytest.raises(InputError, match=r"other\.csv: the readings extend over .* millimetres"):
+        identify(model, table_for(model), test=wrong)
 
 
 def test_fixed_names_places_and_effects(model):

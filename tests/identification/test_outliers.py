@@ -85,22 +85,15 @@ def distance_block(seed, share, shift):
     return model, replace(table, distance=distance), block, truth
 
 
-@pytest.mark.parametrize(
-    ("seed", "shift"),
-    [
-        (0, 0.03),
-        pytest.param(1, -0.1, marks=pytest.mark.long),
-    ],
-)
-def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
+def test_a_shifted_block_of_two_fifths_of_the_distances_is_found():
     """The cable slipped for 48 of 120 rows, by 100 σ and more: all of them, at most one other."""
-    model, table, block, truth = distance_block(seed, 0.4, shift)
+    model, table, block, truth = distance_block(0, 0.4, 0.03)
     result = identify(model, table, Options(faulty="drop"))
     found = rows_of(result.excluded)
     assert set(block) <= set(found) and len(found) <= len(block) + 1
     assert blocks([o.line for o in result.excluded])[0] == (block[0] + 2, block[-1] + 2)
     offset = result["tracker.length_offset"].held
-    assert abs(offset - truth[model.names.index("tracker.length_offset")]) < abs(shift) / 4
+    assert abs(offset - truth[model.names.index("tracker.length_offset")]) < 0.03 / 4
 
 
 # --- leaving them out -----------------------------------------------------------------------

@@ -20,22 +20,12 @@ from elastocal.model.observations import observe
 COUPLED = "coupling { joint = 3, of = 2, factor = -1 }"
 
 
-@pytest.mark.parametrize(
-    ("case", "told"),
-    [
-        ("fanuc_convention", f"with the sign of joint 3 turned round and with {COUPLED}"),
-        (
-            "rows_closed_up",
-            "configurations 1 to 20 fit the nominal arm to 2.02 mm; from 21 on the points belong "
-            "to joint values one later, from 27 two later",
-        ),
-    ],
-)
-def test_the_mistake_is_named_and_the_exit_code_is_1(case, told):
-    folder = CASES / case
+def test_the_mistake_is_named_and_the_exit_code_is_1():
+    folder = CASES / "fanuc_convention"
     ran = CliRunner().invoke(
         app, ["identify", *(str(folder / f) for f in ("cell.toml", "train.csv"))]
     )
+    told = f"with the sign of joint 3 turned round and with {COUPLED}"
     assert ran.exit_code == 1 and told in ran.stderr
 
 
@@ -82,20 +72,11 @@ def test_pairs_of_mistakes(made, change, told):
     assert told in refusal(path, joints(change)(table))
 
 
-@pytest.mark.parametrize(
-    ("missing", "told"),
-    [
-        ([10], "configurations 1 to 10 fit the nominal arm to {} mm; from 11 on the points belong "
-               "to joint values one later"),
-        ([6, 20, 21], "from 7 on the points belong to joint values one later, from 20 3 later"),
-    ],
-)  # fmt: skip
-def test_readings_that_closed_up(made, missing, told):
+def test_readings_that_closed_up(made):
     path, table = made
-    left = np.delete(table.position.reshape(40, 3, 3), missing, axis=0).reshape(-1, 3)
+    left = np.delete(table.position.reshape(40, 3, 3), [6, 20, 21], axis=0).reshape(-1, 3)
     found = refusal(path, replace(table.take(np.arange(len(left))), position=left))
-    for part in told.split("{}"):
-        assert part in found
+    assert "from 7 on the points belong to joint values one later, from 20 3 later" in found
 
 
 def test_one_row_that_closed_up_lets_markers_change_places(made):
