@@ -113,6 +113,13 @@ def test_by_time_takes_the_nearest_with_the_offset(tmp_path):
         imported(tmp_path, files, TIMED + "offset_s = 100.0\ntolerance_s = 0.15\n")
 
 
+def test_seconds_and_nanoseconds_of_one_clock_add_up(tmp_path):
+    log = [(k, 500_000_000, k, 0) for k in range(4)]
+    files = timed((2.5,), []) | {"joints.csv": table("s,n,a,b", log)}
+    mapping = TIMED.replace('time_s = "t", q1', 'time_s = "s", time_ns = "n", q1')
+    assert q1(imported(tmp_path, files, mapping)) == [2]
+
+
 def test_times_are_read_as_their_format_says_or_iso(tmp_path):
     files = timed(("24.12.2026 10:00:02",), [(f"2026-12-24T10:00:0{k}Z", k) for k in range(4)])
     mapping = TIMED.replace("time_s", "time_text").replace(

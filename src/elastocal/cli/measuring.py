@@ -441,8 +441,6 @@ def demo(
 
 # import: tracker exports and joint logs → the measurement table.
 
-PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, wide, kuka, abb, ros"
-
 
 @command(
     "import",
@@ -482,7 +480,7 @@ def import_(
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.assemble import import_files
     from elastocal.importing.exports import likely_presets
-    from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+    from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping, with_units
     from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
 
@@ -504,7 +502,7 @@ def import_(
             f"{path} as --preset {' or '.join(found)}" for path, found in likely.items() if found
         ]
         hint = f"; what reads your files: {', '.join(read_by)}" if read_by else ""
-        raise InputError(f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{hint}")
+        raise InputError(f"import needs --map mapping.toml, or --preset: {listed(PRESETS)}{hint}")
     run.writes((output, ".csv"))
     run.reads(*paths, mapping, cell)
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
