@@ -1,40 +1,33 @@
-"""Levenberg–Marquardt on triangles: it arrives, within bounds, and says when it has not."""
+"""Levenberg–Marquardt turns back where there is no prediction."""
+
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import sparse
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.least_squares import SumOfSquares, descend
-from elastocal.identification.weighted_problem import Evaluation, RFactor
+from elastocal.identification.least_squares import Problem, fit
+from elastocal.identification.weighted_problem import Weights
+from elastocal.model.manipulator import Regression
+from elastocal.model.observations import Observations
 
 
-def objective_of(residual, jacobian, p, tie=np.inf):
-    def evaluate(u):
-        e = residual(u)
-        if not np.isfinite(e).all():
+class Reciprocal:
+    """1/x, which has no value below zero, in the place of an arm."""
+
+    shrunk = np.zeros(1, dtype=bool)
+
+    def regressor(self, table, x, columns, observed):
+        if x[0] <= 0:
             raise ElastocalError("no equilibrium")
-        return Evaluation(e, RFactor.of(-jacobian(u), e))
-
-    return SumOfSquares(evaluate, np.eye(p) / tie, np.zeros(p))
+        return Regression(np.array([[-1 / x[0] ** 2]]), 1 / x, observed)
 
 
 def test_descent_turns_back_where_there_is_no_prediction():
-    """1/u − 2 has none below zero, where the full step from 3 leads."""
-
-    def residual(u):
-        return np.array([1 / u[0] - 2.0, 0.0]) if u[0] > 0 else np.array([np.nan, 0.0])
-
-    def slope(u):
-        return np.array([[-1 / u[0] ** 2], [0.0]])
-
-    found = descend(objective_of(residual, slope, 1), np.array([3.0]), 1e-12, 99)
-    assert found.converged and found.u[0] == pytest.approx(0.5, rel=1e-9)
-
-
-def test_descent_with_ties_is_the_minimum():
-    rng = np.random.default_rng(4)
-    A, y = rng.normal(size=(30, 4)), rng.normal(size=30) * 4
-    objective = objective_of(lambda u: y - A @ u, lambda u: -A, 4, tie=0.5)
-    found = descend(objective, np.zeros(4), 1e-12, 20)
-    expected = np.linalg.lstsq(np.vstack([A, 2 * np.eye(4)]), np.append(y, np.zeros(4)))[0]
-    np.testing.assert_allclose(found.u, expected, atol=1e-9)
+    """The full step from 3 towards 1/x = 2 leads below zero."""
+    one, table = np.ones(1), SimpleNamespace(source="data")
+    row = Observations("distance", 2 * one, sparse.eye_array(1, format="csr"), np.arange(1), table)
+    problem = Problem(Reciprocal(), row, Weights("none", None, False, ""), 3 * one, np.arange(1))
+    found = fit(problem, problem.free, 3 * one, one, tolerance=1e-12)
+    assert found.converged and found.x[0] == pytest.approx(0.5, rel=1e-9)

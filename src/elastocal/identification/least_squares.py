@@ -8,7 +8,6 @@ P; every fit is the same descent by Levenberg and Marquardt on R factors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -44,113 +43,6 @@ EXHAUSTED = "the step limit was reached; the start may be far off or the data il
 LEAST_DAMPING = 1e-18  # of the largest squared column, once a full step has failed
 SHORTER = 0.3
 ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
-
-
-@dataclass(frozen=True)
-class Descent:
-    """Where it ended: variables u (p,), the evaluation there, why, and after how many."""
-
-    u: Array
-    at: Evaluation
-    converged: bool
-    reason: str
-    evaluations: int
-
-
-@dataclass(frozen=True)
-class SumOfSquares:
-    """|e(u)|² + |target − P u|² under the `limits` on u, B = −∂e/∂u.
-
-    `evaluate` gives the R factor of e and of B per unit of u, (p,) in typical sizes; it raises
-    ElastocalError where the model has no prediction.  `evaluate_last`, where given, evaluates in
-    its place where the descent means to end: for what else is wanted there.
-    """
-
-    evaluate: Callable[[Array], Evaluation]
-    P: Array
-    target: Array
-    limits: System | None = None
-    evaluate_last: Callable[[Array], Evaluation] | None = None
-
-    def rows(self, u: Array, at: Evaluation) -> tuple[Array, Array]:
-        """A and b of the linearised cost |b − A step|²."""
-        rows = at.r_factor.augmented
-        A, b = np.vstack([rows[:, :-1], self.P]), self.target - self.P @ u
-        return A, np.concatenate([rows[:, -1], b])
-
-    def cost(self, u: Array, at: Evaluation) -> float:
-        """The sum of squares of readings and prior."""
-        return at.r_factor.rss + float(np.sum((self.target - self.P @ u) ** 2))
-
-    def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
-        """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
-        p, (A, b) = len(u), self.rows(u, at)
-        damped, target = np.vstack([A, np.sqrt(damping) * np.eye(p)]), np.append(b, np.zeros(p))
-        if self.limits is None:
-            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
-            step = least_norm(damped, target, cond=cond)
-        else:
-            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
-        left = b - A @ step
-        return step, float(b @ b - left @ left)
-
-
-def descend(
-    objective: SumOfSquares, u: Array, tolerance: float, max_evaluations: int,
-    at: Evaluation | None = None,
-) -> Descent:  # fmt: skip
-    """Full Gauss–Newton steps while they lower the cost, damped ones where they do not.
-
-    Ends where the linearised cost promises less than `tolerance` of itself: that last step is
-    still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
-    converges.  Steps are judged by the cost itself, so no rounding of it can keep it from ending.
-    `at` is the evaluation at u, where it is known.
-
-    Raises ElastocalError where the start has no prediction.
-    """
-    ending = objective.evaluate_last or objective.evaluate
-    at = at or objective.evaluate(u)
-    cost, damping, evaluations = objective.cost(u, at), 0.0, 1
-    failed = -1.0  # the damping that was too little a step ago
-    while evaluations < max_evaluations:
-        step, promised = objective.step(u, at, damping)
-        last = promised <= tolerance * cost
-        if last and np.abs(step).max(initial=0.0) <= ROUNDING:
-            return Descent(u, at, True, NEGLIGIBLE, evaluations)
-        evaluations += 1
-        try:
-            trial = (ending if last else objective.evaluate)(u + step)
-            trial_cost = objective.cost(u + step, trial)
-        except ElastocalError:
-            trial, trial_cost = at, np.inf
-        if last and (damping == 0 or failed >= 0):  # more than what is left is not to be had
-            kept = trial_cost <= cost * (1 + ROUNDING)
-            at, u = (trial, u + step) if kept else (at, u)
-            return Descent(u, at, True, SETTLED, evaluations)
-        if cost - trial_cost > 1e-4 * promised:
-            u, at, cost = u + step, trial, trial_cost
-            less = damping / 10 if damping > LEAST_DAMPING * _steepest(at) else 0.0
-            damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
-        elif np.abs(step).max(initial=0.0) <= ROUNDING:
-            return Descent(u, at, True, NEGLIGIBLE, evaluations)
-        else:
-            failed, damping = damping, _shortened(objective, u, at, damping, step)
-    return Descent(u, at, False, EXHAUSTED, evaluations)
-
-
-def _shortened(
-    objective: SumOfSquares, u: Array, at: Evaluation, damping: float, step: Array
-) -> float:
-    """The damping with which a step that failed has at most SHORTER of its length."""
-    longest = SHORTER * float(np.linalg.norm(step))
-    damping = max(10 * damping, LEAST_DAMPING * _steepest(at))
-    while np.linalg.norm(objective.step(u, at, damping)[0]) > longest:
-        damping *= 10
-    return damping
-
-
-def _steepest(at: Evaluation) -> float:
-    return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
 
 # What a step promises of the cost where a descent ends.  The last step is taken: at a million rows
@@ -239,36 +131,125 @@ class PriorRows:
             P, target = sigma * P[:, columns], sigma * (target - P[:, held] @ x[held])
         return cls(P, target, constraints.resolve(names).restricted(columns, x))
 
-    def on_bounds(self, values: Array, unit: Array) -> Array:
-        """Values (columns,) with what lies at its bound but for rounding on it."""
-        if self.system is None:
-            return values
-        for bound in (self.system.lower, self.system.upper):
-            values = np.where(np.abs(values - bound) <= ROUNDING * unit, bound, values)
-        return np.clip(values, self.system.lower, self.system.upper)
 
+@dataclass(frozen=True)
+class Objective:
+    """|e(u)|² + |target − P u|² under the `limits` on u, where X[columns] = x[columns] + size · u
+    and the other parameters are x (parameters,).  The columns are a choice `among` these."""
 
-def objective_of(
-    problem: Problem, columns: IntArray, x: Array, sizes: Array, known: PriorRows | None,
-    among: IntArray | None = None,
-) -> SumOfSquares:  # fmt: skip
-    """The objective over u with X[columns] = x[columns] + sizes[columns] · u."""
-    size = sizes[columns]
-    known = known or PriorRows(np.zeros((0, len(columns))), np.zeros(0))
+    problem: Problem
+    columns: IntArray
+    x: Array
+    size: Array
+    known: PriorRows
+    among: IntArray
 
-    def evaluated(u: Array, asked: IntArray = columns) -> Evaluation:
-        at = evaluate(problem.model, problem.parts, moved(x, columns, size * u), asked)
+    @cached_property
+    def P(self) -> Array:
+        return self.known.P * self.size
+
+    @cached_property
+    def target(self) -> Array:
+        return self.known.target - self.known.P @ self.x[self.columns]
+
+    @cached_property
+    def limits(self) -> System | None:
+        system = self.known.system
+        return None if system is None else system.moved(self.x[self.columns], self.size)
+
+    def evaluate(self, u: Array, last: bool = False) -> Evaluation:
+        """e, and the R factor of it and of B per unit of u; the `last` time with that of the
+        columns `among` which these are.  Raises ElastocalError where the model has no prediction.
+        """
+        problem, asked = self.problem, self.among if last else self.columns
+        at = evaluate(problem.model, problem.parts, self.values(u), asked)
         if not np.isfinite(at.r_factor.rss):
             raise ElastocalError(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        return at.chosen(columns, asked, size)
+        return at.chosen(self.columns, asked, self.size)
 
-    target = known.target - known.P @ x[columns]
-    limits = None if known.system is None else known.system.moved(x[columns], size)
-    last = None if among is None else lambda u: evaluated(u, among)
-    return SumOfSquares(evaluated, known.P * size, target, limits, last)
+    def values(self, u: Array) -> Array:
+        """X (parameters,), what lies at its bound but for rounding on it."""
+        values, system = moved(self.x, self.columns, self.size * u), self.known.system
+        if system is not None:
+            own = values[self.columns]
+            for bound in (system.lower, system.upper):
+                own = np.where(np.abs(own - bound) <= ROUNDING * self.size, bound, own)
+            values[self.columns] = np.clip(own, system.lower, system.upper)
+        return values
+
+    def rows(self, u: Array, at: Evaluation) -> tuple[Array, Array]:
+        """A and b of the linearised cost |b − A step|²."""
+        rows = at.r_factor.augmented
+        A, b = np.vstack([rows[:, :-1], self.P]), self.target - self.P @ u
+        return A, np.concatenate([rows[:, -1], b])
+
+    def cost(self, u: Array, at: Evaluation) -> float:
+        """The sum of squares of readings and prior."""
+        return at.r_factor.rss + float(np.sum((self.target - self.P @ u) ** 2))
+
+    def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
+        """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
+        p, (A, b) = len(u), self.rows(u, at)
+        damped, target = np.vstack([A, np.sqrt(damping) * np.eye(p)]), np.append(b, np.zeros(p))
+        if self.limits is None:
+            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
+            step = least_norm(damped, target, cond=cond)
+        else:
+            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
+        left = b - A @ step
+        return step, float(b @ b - left @ left)
+
+    def descend(
+        self, u: Array, at: Evaluation, tolerance: float, most: int
+    ) -> tuple[Array, Evaluation, str, int]:
+        """Full Gauss–Newton steps while they lower the cost, damped ones where they do not, from
+        the evaluation `at` u: where they end, why, and after how many evaluations.
+
+        Ends where the linearised cost promises less than `tolerance` of itself: that last step is
+        still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
+        converges.  Steps are judged by the cost itself, so no rounding of it can keep it from
+        ending.
+        """
+        cost, damping, evaluations = self.cost(u, at), 0.0, 1
+        failed = -1.0  # the damping that was too little a step ago
+        while evaluations < most:
+            step, promised = self.step(u, at, damping)
+            last, small = promised <= tolerance * cost, np.abs(step).max(initial=0.0) <= ROUNDING
+            if last and small:
+                return u, at, NEGLIGIBLE, evaluations
+            evaluations += 1
+            try:
+                trial = self.evaluate(u + step, last)
+                trial_cost = self.cost(u + step, trial)
+            except ElastocalError:
+                trial, trial_cost = at, np.inf
+            if last and (damping == 0 or failed >= 0):  # more than what is left is not to be had
+                kept = trial_cost <= cost * (1 + ROUNDING)
+                return (*((u + step, trial) if kept else (u, at)), SETTLED, evaluations)
+            if cost - trial_cost > 1e-4 * promised:
+                u, at, cost = u + step, trial, trial_cost
+                less = damping / 10 if damping > LEAST_DAMPING * _steepest(at) else 0.0
+                damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
+            elif small:
+                return u, at, NEGLIGIBLE, evaluations
+            else:
+                failed, damping = damping, self._shortened(u, at, damping, step)
+        return u, at, EXHAUSTED, evaluations
+
+    def _shortened(self, u: Array, at: Evaluation, damping: float, step: Array) -> float:
+        """The damping with which a step that failed has at most SHORTER of its length."""
+        longest = SHORTER * float(np.linalg.norm(step))
+        damping = max(10 * damping, LEAST_DAMPING * _steepest(at))
+        while np.linalg.norm(self.step(u, at, damping)[0]) > longest:
+            damping *= 10
+        return damping
+
+
+def _steepest(at: Evaluation) -> float:
+    return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
 
 def moved(x: Array, columns: IntArray, step: Array) -> Array:
@@ -291,26 +272,24 @@ def fit(
     evaluation of these at x, where it is known.
 
     On R factors, with the cost and the gradient of all rows, until a step promises less than
-    `tolerance` of the cost.  Every step starts from the residual of the
-    exact model, so that the rounding of one is taken back by the next.  Constraints are convex and
-    kept in every step: where none improves the fit, the conditions of Karush, Kuhn and Tucker hold.
+    `tolerance` of the cost.  Every step starts from the residual of the exact model, so that the
+    rounding of one is taken back by the next.  Constraints are convex and kept in every step: where
+    none improves the fit, the conditions of Karush, Kuhn and Tucker hold.
 
     Raises ElastocalError where the start has poses without equilibrium, InputError for constraints
     that contradict each other, InsufficientDataError where they leave something undetermined.
     """
-    objective, size = objective_of(problem, columns, x, sizes, known, among), sizes[columns]
-    u = np.zeros(len(columns))
+    size, u = sizes[columns], np.zeros(len(columns))
+    known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
+    objective = Objective(problem, columns, x, size, known, columns if among is None else among)
     if objective.limits is not None:  # the nearest that is allowed
         u = minimise(np.eye(len(u)), u, objective.limits).x
-    if at is not None and among is not None:
-        at = at.chosen(columns, among, size)
-    found = descend(objective, u, tolerance, max_steps, at)
-    at, values = found.at, moved(x, columns, size * found.u)
-    if known is not None:
-        values[columns] = known.on_bounds(values[columns], size)
+    at = objective.evaluate(u) if at is None else at.chosen(columns, objective.among, size)
+    u, at, reason, evaluations = objective.descend(u, at, tolerance, max_steps)
     return Fit(
-        values, at.residual, problem.weights.apply(at.residual), at.r_factor.scaled(1 / size),
-        found.converged, found.reason, found.evaluations, problem, columns, sizes, at.wide,
+        objective.values(u), at.residual, problem.weights.apply(at.residual),
+        at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason, evaluations, problem, columns,
+        sizes, at.wide,
     )  # fmt: skip
 
 
@@ -405,7 +384,7 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     equilibrium any more.  Steps that do not settle lead to none.
     """
     fit, limit, size = found.fit, found.objective + rise, found.fit.sizes[found.fit.columns]
-    objective = objective_of(fit.problem, fit.columns, fit.x, fit.sizes, found.known)
+    objective = Objective(fit.problem, fit.columns, fit.x, size, found.known, fit.columns)
     assert objective.limits is not None
     far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
     u = np.zeros(len(size))
@@ -425,8 +404,7 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
             step = step / 2
         u = u + step
         if np.linalg.norm(A @ step) <= PRECISION * np.sqrt(rise):
-            values = fit.x[fit.columns] + size * u
-            return float(found.known.on_bounds(values, size)[index])
+            return float(objective.values(u)[fit.columns[index]])
         if abs(size[index] * u[index]) > far:
             break
     return side * np.inf
