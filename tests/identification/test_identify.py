@@ -29,7 +29,6 @@ from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
-from elastocal.identification.knowledge import physical_constraints
 from elastocal.identification.options import Options
 from elastocal.identification.solve import reduce
 from elastocal.model.manipulator import Model
@@ -114,27 +113,6 @@ def test_six_compliances_and_the_geometry_lie_within_their_intervals():
 @pytest.mark.long
 def test_six_compliances_and_the_geometry_lie_within_their_intervals_over_40_arms():
     check_coverage(*kr270_coverage(range(100, 140), poses=25))
-
-
-@pytest.mark.long
-def test_random_chains_are_covered_too():
-    inside, sizes, hits = [], [], []
-    chain = random_chain(1)
-    nominal = Nominal(joint_compliance=(1e-5,) * 6)
-    load_point = (0.15, 0.1, 0.2)
-    true = Model.assembled(chain, cell_of(SPRINGS, nominal=nominal, load_point=load_point))
-    model = Model.assembled(chain, cell_of(SPRINGS, load_point=load_point))
-    springs = [f"joint{i}.compliance" for i in range(1, 7)]
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        truth = true_values(true, rng)
-        plan = table_at(random_poses(chain, 30, seed), [[0, 0, 0], [0, 0, -300], [150, 0, -300]])
-        result = identify(model, measured(true, plan, truth, SIGMA, rng))
-        hit = covered(result, truth)
-        inside.append(hit.sum())
-        sizes.append(len(hit))
-        hits.append(covered(result, truth, [n for n in springs if n in result.determined]).mean())
-    assert in_share(inside, sizes) and in_share(hits, np.ones(40))
 
 
 def test_vertical_load_alone_leaves_joint_1_undetermined():
@@ -229,17 +207,6 @@ def test_distance_observation(seed):
     assert_one_arm_is_covered(result, truth)
 
 
-def test_seven_axes_with_an_unknown_tool():
-    path, flange = packaged_urdf("iiwa14")
-    model = Model.assembled(read_urdf(path, flange=flange), cell_of(GEOMETRY))
-    rng = np.random.default_rng(7)
-    truth = true_values(model, rng)
-    plan = table_at(random_poses(model.chain, 40, 7))
-    result = identify(model, measured(model, plan, truth, SIGMA, rng))
-    assert_one_arm_is_covered(result, truth)
-    assert result.nominal_rms > 10 * result.residual_rms
-
-
 # --- (g) invariance ---------------------------------------------------------------------------
 
 
@@ -257,15 +224,13 @@ def springs_case(seed=0, poses=20):
     return true, measured(true, plan, truth, SIGMA, rng), truth
 
 
-@pytest.mark.parametrize("turn", [0, 3])
-def test_turning_and_moving_the_tracker_changes_nothing(turn):
+def test_turning_and_moving_the_tracker_changes_nothing():
     """Positions and forces in another frame: the same arm, the same residuals.
 
     Loads are dead forces without link weights, so even the vertical may turn.
     """
     model, table, _ = springs_case()
-    R = Rotation.from_rotvec(np.pi * np.eye(4, 3)[turn]) if turn < 3 else Rotation.random(rng=0)
-    shift = np.array([2.0, -1.0, 0.7])
+    R, shift = Rotation.random(rng=0), np.array([2.0, -1.0, 0.7])
     moved = replace(table, position=R.apply(table.position) + shift, force=R.apply(table.force))
     a, b = identify(model, table), identify(model, moved)
     turned_back = R.inv().apply(b.residual.reshape(-1, 3)).ravel()
@@ -351,33 +316,7 @@ def test_fixing_the_base_at_its_hint():
     assert_one_arm_is_covered(result, truth)
 
 
-def test_bounded_keeps_compliances_physical_and_changes_nothing_else():
-    model, table, _ = springs_case()
-    free, bounded = identify(model, table), identify(model, table, bounds_of(model))
-    np.testing.assert_allclose(bounded.residual, free.residual, atol=1e-3 * SIGMA)
-    soft = Model.assembled(planar_chain(), cell_of(("base_frame", "joint_compliance"),
-                                         nominal=Nominal((2e-5,) * 3)))  # fmt: skip
-    wrong = with_values(soft, {"joint2.compliance": -3e-5})
-    plan = table_at(random_poses(soft.chain, 20, 0), [[0, 0, 0], [0, 0, -400]])
-    table = measured(soft, plan, wrong, SIGMA, np.random.default_rng(0))
-    assert identify(soft, table)["joint2.compliance"].held < -1e-5
-    found = identify(soft, table, bounds_of(soft))
-    assert min(e.held for e in found.estimates if e.name.endswith("compliance")) >= 0.0
-
-
-def bounds_of(model):
-    return Options(constraints=physical_constraints(model))
-
-
 # --- (l) the result -----------------------------------------------------------------------------
-
-
-@lru_cache
-def some_result(options=None):
-    model, table, truth = springs_case()
-    other = measured(model, table_at(random_poses(model.chain, 20, 9)), truth, SIGMA,
-                     np.random.default_rng(9))  # fmt: skip
-    return identify(model, table, options, test=other)
 
 
 def test_json_of_a_result_with_infinities_is_still_json():
@@ -392,18 +331,6 @@ def test_json_of_a_result_with_infinities_is_still_json():
     found = json.loads(json.dumps(result.to_json(), allow_nan=False))
     assert found["heldout_rms_um"] is None and found["test"] is None
     assert found["residual_rms_um"] > 0
-
-
-def test_residual_table_adds_up():
-    result = some_result()
-    rows = result.residual_table()
-    _, table, _ = springs_case()
-    assert len(rows) == len(table)
-    assert [row["line"] for row in rows] == table.row.tolist()
-    parts = np.array([[row[f"residual_{k}_um"] for k in "xyz"] for row in rows])
-    assert np.sqrt((parts**2).sum(axis=1).mean()) == pytest.approx(result.residual_rms * 1e6)
-    held = np.array([[row[f"heldout_{k}_um"] for k in "xyz"] for row in rows])
-    assert np.sqrt((held**2).sum(axis=1).mean()) == pytest.approx(result.heldout_rms * 1e6)
 
 
 def test_the_same_input_gives_the_same_result():

@@ -115,15 +115,6 @@ def test_gross_errors_do_not_bend_a_robust_fit(method):
     assert np.sqrt(np.mean(bent**2)) > 2 * np.sqrt(np.mean(error**2))
 
 
-# --- noise ----------------------------------------------------------------------------------
-
-
-# --- intervals ------------------------------------------------------------------------------
-
-
-# --- what does not go together --------------------------------------------------------------
-
-
 @pytest.mark.parametrize("stated", [True, False])
 def test_computed_readings_give_the_true_values_and_no_noise(stated):
     """Without noise there is nothing to estimate it from, nor a reading beyond it."""
