@@ -56,6 +56,9 @@ def test_the_posterior_is_that_of_ridge_regression(seed, kept):
     assert np.allclose(np.diag(C @ found.cofactor @ C.T), np.diag(hat))
     share = np.diag(found.cofactor * prior @ found.cofactor) / np.diag(found.cofactor)
     assert np.allclose(found.prior_share, share)
+    # Of the ordinary ones alone, the others taken for noise.
+    weight, R = scales.variance * np.linalg.inv(marginal(B, e, scales, kept)[0]), found.marginal.R
+    assert np.allclose(R.T @ R, B[:, kept].T @ weight @ B[:, kept])
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -169,7 +169,6 @@ class Reduced:
         return Minimum(x, float(left @ left), self._named(stated or self.system, found), found)
 
     def _holds(self, u: Array) -> bool:
-        """Whether u lies in the region, matrices to round-off."""
         for matrix in self.matrices:
             values = np.linalg.eigvalsh(matrix.at(u))
             if values[0] < -ROUND_OFF * max(np.abs(values).max(), 0.0):
@@ -219,7 +218,6 @@ class Reduced:
         return u, prices, duals
 
     def _touched(self, found: Nearest) -> BoolArray:
-        """Which rows (k,) the point lies on."""
         slack = (self.rows @ found[0] - self.least) * self.lengths
         return np.asarray((found[1] > 0) | (slack <= ON_BOUND))
 
@@ -403,7 +401,6 @@ def _value(cp: ModuleType, matrix: Matrix, x: Any) -> Any:
 
 
 def _solve(problem: Any) -> str:
-    """Solve the problem in place; its status."""
     import cvxpy as cp
 
     with warnings.catch_warnings():

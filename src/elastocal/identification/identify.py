@@ -105,7 +105,6 @@ def identify(
 
 
 def _fallen(model: Model, table: Measurements, x: Array) -> tuple[str, ...]:
-    """That the base lies far from upright, where weights act, or loads that hang."""
     hangs = table.force.any() and not table.force[:, :2].any() and (table.force[:, 2] <= 0).all()
     weighs = model.cell.model.link_gravity or bool(hangs)
     lies = fallen(model, x) if weighs and model.observe != "distance" else None
@@ -113,7 +112,6 @@ def _fallen(model: Model, table: Measurements, x: Array) -> tuple[str, ...]:
 
 
 def _disordered(model: Model, *tables: Measurements | None) -> tuple[str, ...]:
-    """That effects of the last move rest on an order which is not that of the campaign."""
     by_order = model.cell.model.approach == BY_ORDER
     if not by_order and not any(effect_of(p.effect).family == "move" for p in model.parameters):
         return ()
@@ -124,7 +122,6 @@ def _disordered(model: Model, *tables: Measurements | None) -> tuple[str, ...]:
 def _fitted(
     model: Model, table: Measurements, observed: Observations, options: Options, progress: Progress
 ) -> tuple[Solution, Solution, MethodResult]:
-    """The fits to all observations and to those that are not faulty, and what the method found."""
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
@@ -151,7 +148,6 @@ def _fitted(
 
 
 def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:
-    """The options for the observations that are not `left_out` (N,)."""
     if options.covariance is None:
         return options
     rows = np.repeat(~left_out, size)
@@ -279,7 +275,6 @@ def summarise(
 def _judged(
     result: Calibration, found: MethodResult, poses: NewPoses, whole: Measurements
 ) -> Calibration:
-    """The result with the error expected at those poses, findings and warnings."""
     solution = found.solution
     predicted = predicted_error(
         result.arm, result.observations, result.excess, result.spread, poses,
@@ -326,7 +321,6 @@ SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see 
 
 
 def _shown(solution: Solution, covariance: Array, leverage: Array | None) -> ShownPoses | None:
-    """How sure the fit is where it was measured; None where the table is too large to say."""
     if solution.problem.large or leverage is None or not np.isfinite(covariance).all():
         return None
     left = np.maximum(1 - leverage, SEEN_BY_OTHERS)
@@ -381,7 +375,6 @@ def _estimates(
 
 
 def _not_stated(p: Parameter, held: float, limits: tuple[float, float]) -> str:
-    """Why the readings' value of a parameter is not stated."""
     if p.beyond(limits):
         return f"beyond its physical bound {p.lower if held < p.lower else p.upper:g}"
     if held == p.nominal and held != 0:

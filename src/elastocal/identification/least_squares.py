@@ -187,7 +187,6 @@ class Objective:
         return A, np.concatenate([rows[:, -1], b])
 
     def cost(self, u: Array, at: Evaluation) -> float:
-        """The sum of squares of readings and prior."""
         return at.r_factor.rss + float(np.sum((self.target - self.P @ u) ** 2))
 
     def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
@@ -253,7 +252,6 @@ def _steepest(at: Evaluation) -> float:
 
 
 def moved(x: Array, columns: IntArray, step: Array) -> Array:
-    """x (parameters,) with `step` added to these columns."""
     out = x.astype(float)
     out[columns] += step
     return out

@@ -142,7 +142,6 @@ def _linearised(problem: Problem, x: Array, kept: IntArray, kind: str) -> Readin
 def refined(
     every: Solution, start: Solution, x: Array, good: BoolArray, weights: Weights
 ) -> Solution:
-    """The kept parameters of `start` fitted from x to the good observations with other weights."""
     observed = every.problem.observations
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
@@ -250,7 +249,6 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
 
 
 def _held(found: MethodResult, limits: dict[int, tuple[float, float]]) -> dict[int, float]:
-    """The fitted parameters to be held, and where."""
     held, fit = {}, found.solution.fit
     for c in set(limits) & set(fit.columns.tolist()):
         p, (low, high), x = found.solution.problem.model.parameters[c], limits[c], float(fit.x[c])
@@ -287,7 +285,6 @@ def _holding(
 
 
 def is_exact(solution: Solution) -> bool:
-    """Are these residuals mere rounding?"""
     return rms_3d(solution.fit.residual, solution.problem.observations.size) < EXACT
 
 
@@ -601,7 +598,6 @@ def _contradiction(
 
 
 def _dof(solution: Solution, before: Intervals, columns: IntArray) -> Array:
-    """The method's degrees of freedom (columns,); its fewest for a parameter that it held."""
     known = dict(zip(solution.fit.columns.tolist(), before.covariance.dof.tolist(), strict=True))
     fewest = min(known.values())
     return np.array([known.get(c, fewest) for c in columns.tolist()])

@@ -145,11 +145,6 @@ class JointFit:
     def posterior(self) -> Posterior:
         return self.linear.posterior(self.scales)
 
-    @property
-    def sigma(self) -> float:
-        """Of a whitened row."""
-        return float(np.sqrt(self.scales.variance))
-
     def whitened(self, part: Part) -> tuple[Array, Array]:
         """Q (rows, columns), whose squares are by how much of the noise the fit varies at the
         readings of a part, and their residual (rows,)."""
@@ -238,8 +233,6 @@ def _without(solution: Solution, sized: IntArray) -> Solution:
 
 
 class _Course:
-    """The fits of one identification, and what they have in common."""
-
     def __init__(
         self, every: Solution, sound: Solution, functions: Functions, options: Options,
         progress: Progress,
@@ -307,9 +300,8 @@ class _Course:
         return JointFit(found, reduction, scales, linear)
 
     def _chosen(self, free: LinearRows, scales: Scales) -> Reduction:
-        problem, sizes = self.sound.problem, self.every.sizes
-        marginal, sigma = free.posterior(scales).marginal, float(np.sqrt(scales.variance))
-        return choose(problem, sizes, marginal, sigma, WORTH_A_COLUMN)
+        problem, marginal = self.sound.problem, free.posterior(scales).marginal
+        return choose(problem, self.every.sizes, marginal, scales.sigma, WORTH_A_COLUMN)
 
     def _started(self, x: Array, reduction: Reduction) -> Array:
         """x with what is not fitted at its start, and its share moved over; other functions
@@ -338,7 +330,6 @@ class _Course:
         return held_out_by_parts(model, parts, found.x, columns, posterior.half, step)
 
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
-        """Fit, noise and good readings that agree with each other."""
         noise: NoiseFit | None = None
         x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
         level, shape = np.inf, (-1, self.observed.size)
@@ -447,7 +438,7 @@ class _Course:
             "of readings and smooth functions together, the functions as random as their sizes "
             "say; assumes the noise model and normal noise"
         )
-        matrix = posterior.variance * posterior.cofactor
+        matrix = fit.scales.variance * posterior.cofactor
         covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
         intervals = Intervals(covariance, covariance.interval(x[columns], LEVEL))
         shares = zip(columns.tolist(), posterior.prior_share.tolist(), strict=True)
@@ -462,9 +453,11 @@ class _Course:
         )  # fmt: skip
         own = f.columns[posterior.own]
         names, nominal = tuple(self.model.names[c] for c in own), f.nominal[posterior.own]
-        prior = GaussianPrior.independent(names, nominal, fit.sigma / np.diag(posterior.of_own))
+        prior = GaussianPrior.independent(
+            names, nominal, fit.scales.sigma / np.diag(posterior.of_own)
+        )
         stands = float(((posterior.of_own @ (x[own] - nominal)) ** 2).sum())
-        return result, FunctionPrior(prior, fit.sigma, spare, stands)
+        return result, FunctionPrior(prior, fit.scales.sigma, spare, stands)
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
         f, posterior, x = self.functions, fit.posterior, fit.found.x

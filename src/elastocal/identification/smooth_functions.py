@@ -43,6 +43,10 @@ class Scales:
     variance: float
     gain: Array
 
+    @property
+    def sigma(self) -> float:
+        return float(np.sqrt(self.variance))
+
 
 @dataclass(frozen=True)
 class LinearRows:
@@ -138,7 +142,7 @@ class LinearRows:
         P = np.eye(len(own), k + len(own), k) / std[own, None]
         rows = self.factor.of_columns(np.append(np.arange(k), k + own))
         prior = RFactor(np.column_stack([P, np.zeros(len(own))]), 0)
-        return Posterior(rows.merged(prior), own, P, scales.variance)
+        return Posterior(rows.merged(prior), own, P)
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,6 @@ class Posterior:
     r_factor: RFactor
     own: IntArray
     P: Array
-    variance: float
 
     @property
     def ordinary(self) -> int:
@@ -182,7 +185,6 @@ class Posterior:
 
     @cached_property
     def cofactor(self) -> Array:
-        """Covariance over σ²."""
         return self.half @ self.half.T
 
     @property

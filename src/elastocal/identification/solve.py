@@ -173,7 +173,6 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 
 
 def free_r_factor(problem: Problem, found: Fit) -> RFactor:
-    """The R factor of the free columns at the fitted values."""
     if np.array_equal(found.columns, problem.free):
         return found.r_factor
     if found.wide is not None:

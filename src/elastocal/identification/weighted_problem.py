@@ -374,7 +374,6 @@ class RFactor:
         return cls(_factor(np.column_stack([B, e])), len(e))
 
     def merged(self, other: RFactor) -> RFactor:
-        """The R factor of the rows of both."""
         stacked = np.vstack([self.augmented, other.augmented])
         return RFactor(_factor(stacked), self.rows + other.rows)
 
@@ -403,7 +402,6 @@ class RFactor:
 
     @property
     def rss(self) -> float:
-        """|e|²."""
         return float(self.augmented[:, -1] @ self.augmented[:, -1])
 
     def scaled(self, scale: Array) -> RFactor:
@@ -446,7 +444,6 @@ def least_norm(A: Array, b: Array, cond: float | None = None, check_finite: bool
 
 
 def merge(factors: Iterable[RFactor]) -> RFactor:
-    """The R factor of all rows, merged in the order given."""
     return reduce(RFactor.merged, factors)
 
 
@@ -528,12 +525,10 @@ def residual_of(model: Model, part: Part, x: Array) -> Array:
 
 
 def regressor(model: Model, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
-    """B of a part, raw."""
     return model.regressor(part.observations.table, x, columns, part.observations)
 
 
 def each(parts: Partition, work: Callable[[Part], Result]) -> Iterator[Result]:
-    """`work` on every part, results in order."""
     return in_order(parts.spans, lambda span: work(parts.part(span)))
 
 
