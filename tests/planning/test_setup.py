@@ -134,6 +134,10 @@ def test_a_prior_adds_its_information() -> None:
         expected[k, k] = s**-2
     assert np.allclose(added, expected, rtol=1e-12)
     assert setup.value(TABLE_2) < without.value(TABLE_2)
+    # What has a prior counts, however little that says.
+    weak = GaussianPrior(("joint1.compliance",), np.zeros(1), np.diag([1e-2]))
+    kept = setup_of(plan_cell(loads=DOWN[None]), POSES, known=Known(prior=weak)).information.names
+    assert "joint1.compliance" in kept and "joint1.compliance" not in without.information.names
 
 
 def test_a_prior_of_an_unknown_parameter_is_refused() -> None:
@@ -249,3 +253,4 @@ def test_a_plan_estimates_what_identification_will() -> None:
     result = identify(model, data, Options(method="wls", faulty="keep"))
     assert set(setup.information.names) == set(result.determined)
     assert "joint6.offset" not in setup.information.names
+    assert "joint6.offset" in setup_of(cell, TABLE_2).information.names  # of very many

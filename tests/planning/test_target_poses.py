@@ -53,13 +53,12 @@ def places(found: TargetPoses) -> NDArray:
 def test_stated_poses_come_with_their_force_point_and_share() -> None:
     q = random_poses(CHAIN, 2, seed=1)
     own, force = np.array([0.0, 0.1, 0.0]), np.array([1.0, 2.0, 3.0])
-    found = poses_of(
-        cell_of(test_poses=(TargetPose(q[0], force, 3.0, own), TargetPose(q[1], force)))
-    )
-    np.testing.assert_array_equal(found.q, q)
-    np.testing.assert_array_equal(found.force, [force, force])
-    np.testing.assert_allclose(found.weight, [0.75, 0.25])
-    np.testing.assert_array_equal(found.point, [own, POINT])
+    asked = TargetPose(q[0], force, 3.0, own), TargetPose(q[1])
+    found = poses_of(cell_of(loads=LOADS, test_poses=asked))
+    np.testing.assert_array_equal(found.q, q[[0, 1, 1]])
+    np.testing.assert_array_equal(found.force, [force, *LOADS[1:]])
+    np.testing.assert_allclose(found.weight, [0.75, 0.125, 0.125])
+    np.testing.assert_array_equal(found.point, [own, POINT, POINT])
     assert "2 of [[design.test_pose]]" in found.source
 
 
