@@ -289,6 +289,17 @@ def test_every_key_arrives_in_si_units(read, folder):
     check_same(read(WHOLE), whole(folder))
 
 
+def test_each_key_is_read_for_itself(read):
+    """Without any one of them the cell is another one, or misses it."""
+    lines = WHOLE.splitlines()
+    for k, line in enumerate(lines):
+        if "=" in line:
+            try:
+                assert read("\n".join(lines[:k] + lines[k + 1 :])) != read(WHOLE), line
+            except InputError:
+                continue
+
+
 def test_what_is_not_stated_has_its_default(read, folder):
     plain = Cell(name="cell", path=folder / "cell.toml", robot=Robot(urdf=folder / "arm.urdf"))
     for more in ("", "[workspace]\n", "[workspace]\ngeometry = 'none'\n", "[design]\n",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import threading
 
 import casadi as ca
@@ -230,13 +231,14 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
         assert one.tobytes() == three.tobytes()
 
 
-def test_one_tape_may_be_called_by_several_threads() -> None:
+def test_one_tape_and_its_pickled_copy_may_be_called_by_several_threads() -> None:
     function, x = BatchFunction(*mixed(), "numpy"), np.random.default_rng(1).uniform(0, 1, (500, 3))
     expected = function(x, np.ones(1))
+    again = pickle.loads(pickle.dumps(function))  # its tape is made anew there
     found: list = [None] * 8
 
     def call(k: int) -> None:
-        found[k] = function(x, np.ones(1))
+        found[k] = (function, again)[k % 2](x, np.ones(1))
 
     callers = [threading.Thread(target=call, args=(k,)) for k in range(len(found))]
     for caller in callers:

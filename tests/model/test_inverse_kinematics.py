@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import kr270_chain, nominal_flanges, random_poses
 from support.robots import PACKAGED, packaged_urdf
 
-from elastocal.model.chain import Chain
+from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.rigid import nominal_flange
 from elastocal.model.urdf import read_urdf
@@ -112,3 +112,14 @@ def test_what_is_out_of_reach_is_told_with_its_distance(far: float) -> None:
     assert found.miss[1, 0] <= np.linalg.norm(drawn - goal, axis=1).min() * (1 + 1e-5)
     at, _ = places(chain, found.q[1, :1])
     assert found.miss[1, 0] == pytest.approx(np.linalg.norm(at[0] - goal))
+
+
+def test_a_range_without_an_end_is_a_turn_from_the_other() -> None:
+    """1e16 is none, as files write it; without both ends it lies about the middle."""
+    chain = kr270_chain()
+    lower = np.array([-np.inf, -1e16, -0.5, -np.inf, -1.0, -9.0])
+    upper = np.array([0.5, 0.5, np.inf, 1e16, 1.0, 9.0])
+    low, high = finite_ranges(chain, lower, upper)
+    turn = 2 * np.pi
+    np.testing.assert_allclose(low, [0.5 - turn, 0.5 - turn, -0.5, -np.pi, -1.0, -9.0])
+    np.testing.assert_allclose(high, [0.5, 0.5, turn - 0.5, np.pi, 1.0, 9.0])

@@ -63,3 +63,13 @@ def test_derivatives_are_regular_near_zero(angle: float, axis: np.ndarray) -> No
     np.testing.assert_allclose(_exp_slope(angle * axis).full(), expected, rtol=0, atol=2 * angle)
     slope = _round_trip_slope(angle * axis).full()
     np.testing.assert_allclose(slope, np.eye(3), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("below", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])
+@given(axis=axes)
+@settings(deadline=None)
+def test_log_up_to_half_a_turn(below: float, axis: np.ndarray) -> None:
+    """Near π the axis may come back reversed; the rotation and the angle are the same."""
+    R = Rotation.from_rotvec((np.pi - below) * axis).as_matrix()
+    np.testing.assert_allclose(exp(log(R)), R, rtol=0, atol=1e-14)
+    assert np.linalg.norm(log(R)) == pytest.approx(np.pi - below, abs=1e-14)
