@@ -98,8 +98,6 @@ class Boxes:
 
 @dataclass(frozen=True)
 class RelaxedPoint:
-    """The relaxed optimum of a cell on candidates that its rules allow."""
-
     cell: Cell
     setup: Setup
     pool: FeasiblePool
@@ -297,7 +295,6 @@ TRIES = 3  # plans whose moves took longer than was thought
 def within(
     choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes: float
 ) -> Plan:  # fmt: skip
-    """The plan of least error that takes no longer than `minutes`, with its alternatives."""
     asked = minutes
     for left in reversed(range(TRIES)):
         sizes, best, poses = _sizes(choice, cell, asked)
@@ -325,7 +322,6 @@ class _Fit(NamedTuple):
 def _sizes(
     choice: Choice, cell: Cell, minutes: float
 ) -> tuple[tuple[TimedSize, ...], TimedSize, int]:
-    """What fits, by numbers of repeats, the best, and how many poses have as many stops as it."""
     spec, drawn, found = cell.design, choice.draw(cell), list[_Fit]()
     # Where a reading takes no time nothing says how many of them there may be.
     for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):

@@ -146,8 +146,6 @@ def design(
 
 
 class _Design:
-    """The course of a design; what each step needs of the steps before it."""
-
     def __init__(
         self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress,
         first: _Design | None = None,
@@ -306,7 +304,6 @@ class _Design:
         return Known(options.fixed, options.prior, self.done)
 
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
-        """The test poses of the cell as it stands, and the rest of the joint ranges."""
         cell, seed = self.work.cell, self.options.seed
         # There the arm works, and the tracker need not see it.
         workspace = replace(cell.workspace, visibility=None, load=None)

@@ -55,7 +55,6 @@ Step = (
 def steps_of(
     execution: Execution, configurations: Sequence[str], forces: Array | None = None
 ) -> Iterator[Step]:
-    """Every step in order, beginning and ending at home where there is one."""
     loads = ["no load"] if forces is None else [load_name(force) for force in forces]
     loaded = [False] if forces is None else [bool(np.any(force)) for force in forces]
     home = execution.motion.home

@@ -117,7 +117,6 @@ class Setup:
 
     @cached_property
     def elsewhere_rows(self) -> Array | None:
-        """The same all over the joint ranges."""
         return None if self.beyond is None else _root(*self.beyond)
 
     def pool(self, q: Array, group: IntArray, readings: IntArray | None = None) -> FeasiblePool:
@@ -286,7 +285,6 @@ def share_within(
     weights, price = alone.weights, ((1 + cap) ** 2 - 1) * alone.value
 
     def over(u: float) -> float:
-        """What the test poses pay more than they should, of the price; near enough is 0."""
         nonlocal weights
         other = replace(problem, criterion=replace(setup, share=u / (1 + u)).criterion)
         weights = relax(in_terms(other, T), LOOSE, weights).weights

@@ -210,8 +210,6 @@ WRONG_UNIT = 1e5  # mm
 
 @dataclass(frozen=True)
 class _Sources:
-    """What every source of test poses is read, reached or drawn by."""
-
     cell: Cell
     chain: Chain
     rules: Feasibility | None

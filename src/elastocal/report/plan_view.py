@@ -165,7 +165,6 @@ def _figure(plan: Plan) -> str:
 
 
 def stop_table(plan: Plan) -> say.ShownTable:
-    """The stops in the order of execution: what the operator does at each, with a box to tick."""
     rows, loads, e = [], len(plan.forces) > 1, plan.execution
     for k, (stop, now) in enumerate(zip(e.stops, e.arrivals, strict=True)):
         change = ", to change" * (stop.change_after is not None)
@@ -196,7 +195,6 @@ def plan_headline(plan: Plan) -> str:
 
 
 def _weighted(plan: Plan) -> bool:
-    """Was the error at the test poses minimised together with that elsewhere?"""
     return plan.everywhere is not None and plan.everywhere.share > 0
 
 
@@ -207,7 +205,6 @@ def _rho(plan: Plan) -> float:
 
 
 def _criterion(plan: Plan) -> str:
-    """The name of what the search made small, which starts and bound are figures of."""
     if _weighted(plan):
         return "weighted error"
     return "ρ₀" if plan.of_test_poses else plan.criterion
