@@ -103,6 +103,21 @@ def test_every_load_state_runs_through_the_poses(tmp_path):
     np.testing.assert_allclose(found.table.force[:, 2], [0, 0, -980.665, -980.665])
 
 
+def test_what_else_the_log_says_goes_with_its_poses(tmp_path):
+    """Their names and temperatures; the tracker states two standard deviations."""
+    sigmas = "".join(f', sigma_{axis}_um = "s"' for axis in "xyz")
+    mapping = ORDER.replace('z_mm = "z" }', f'z_mm = "z"{sigmas} }}\ncoverage_factor = 2.0')
+    mapping = mapping.replace('q2_deg = "b"', 'q2_deg = "b", temperature_C = "T"')
+    files = {
+        "points.csv": table("name,x,y,z,s", [(n, 1000, 0, 2, 30) for n in ("M1", "M2", "M1")]),
+        "joints.csv": table("name,a,b,T", [("A", 10, 0, 20.5), ("B", 20, 0, 21.5)]),
+    }
+    read = imported(tmp_path, files, mapping).table
+    assert [read.configuration_labels[c] for c in read.configuration] == ["A", "A", "B"]
+    assert read.temperature.tolist() == [20.5, 20.5, 21.5]
+    np.testing.assert_allclose(read.sigma, 15e-6)
+
+
 def test_by_time_takes_the_nearest_with_the_offset(tmp_path):
     files = timed((100.2, 109.9), [(k, k) for k in range(0, 20, 2)])
     found = imported(tmp_path, files, TIMED + "offset_s = 100.0\nstill_deg = 5.0\n")
