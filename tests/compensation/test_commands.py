@@ -163,11 +163,6 @@ def test_a_limit_is_kept_and_named():
     assert any("joint 3 stands at its limit" in told for told in free.warnings)
 
 
-def test_a_column_that_the_model_needs_is_asked_for():
-    with pytest.raises(InputError, match=r"targets\.csv: the model needs the column approach_1"):
-        commanded(arm_of("joint_offset", "hysteresis"), at_postures())
-
-
 def test_uncertainty_is_what_other_values_would_do():
     """Σ_p by differences of the model's own predictions, not by the derivative under test."""
     arm = arm_of(*EVERYWHERE, rng=np.random.default_rng(4), std=0.01)

@@ -112,7 +112,7 @@ def test_random_chains_agree_to_1e12(tmp_path_factory, seed: int, from_base: boo
     assert_agrees(chain, reference, count=5)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(4))
 def test_lumped_masses_weigh_the_same(tmp_path: Path, seed: int) -> None:
     """Gravity torques of the lumped masses equal those of all bodies, branches included."""
     text = random_chain_urdf(seed)

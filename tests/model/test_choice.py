@@ -72,55 +72,37 @@ def test_compliances_must_be_one_per_joint() -> None:
         model_of("joint_compliance", nominal=nominal)
 
 
-# --- settings
-
-
-def model_with(settings: dict[str, dict[str, float]], *effects: str, **spec) -> Model:
-    return Model.assembled(
-        kr270_chain(), kr270_cell(effects, nominal=Nominal(settings=settings), **spec)
-    )
+# --- settings and sizes
 
 
 @pytest.mark.parametrize(
-    "effect, key",
+    "effect, stated, told",
     [
-        ("encoder_jump:joint2", "joint2.* jump_time_s"),
-        ("frame_jump", "tracker.* jump_time_s"),
-        ("gear_ripple:joint3", "joint3.* ripple_order"),
+        ("encoder_jump:joint2", {}, r"nominal.settings.joint2.* jump_time_s is missing"),
+        ("joint_drift:joint2", {"joint2": {"time_constant_s": 59.0}}, "time_constant_s takes"),
+        ("gear_ripple:joint1", {"joint1": {"ripple_order": 1001.0}}, "ripple_order takes"),
+        ("encoder_jump:joint1", {"joint1": {"jump_time_s": np.nan}}, "jump_time_s takes"),
+        ("joint_offset", {"joint2": {"jump_times": 3.0}}, "joint2 'jump_times'.*'jump_time_s'"),
+        ("joint_offset", {"join2": {"jump_time_s": 3.0}}, "'join2'.*did you mean 'joint"),
+        ("joint_offset", {"base": {"jump_time_s": 3.0}}, "base 'jump_time_s'.*time_constant_s"),
     ],
 )
-def test_what_nobody_knows_beforehand_must_be_given(effect: str, key: str) -> None:
-    with pytest.raises(InputError, match=f"nominal.settings.{key} is missing"):
-        model_with({}, effect)
+def test_settings_are_there_in_their_range_and_of_some_effect(effect, stated, told) -> None:
+    with pytest.raises(InputError, match=told):
+        model_of(effect, nominal=Nominal(settings=stated))
 
 
 @pytest.mark.parametrize(
-    "effect, place, key, value",
+    "sizes, told",
     [
-        ("joint_drift:joint2", "joint2", "time_constant_s", 59.0),
-        ("gear_ripple:joint1", "joint1", "ripple_order", 1001.0),
-        ("encoder_jump:joint1", "joint1", "jump_time_s", np.nan),
+        ({"joint9": {"offset": 1.0}}, "nominal.sizes: unknown place 'joint9'"),
+        ({"joint2": {"ofset": 1.0}}, "unknown parameter of joint2 'ofset'"),
+        ({"joint2": {"curve_1": 1.0}}, "unknown parameter of joint2 'curve_1'"),
     ],
 )
-def test_values_outside_their_range_are_refused(effect, place, key, value) -> None:
-    with pytest.raises(InputError, match=f"{place}.* {key} takes"):
-        model_with({place: {key: value}}, effect)
-
-
-@pytest.mark.parametrize(
-    "settings, parts",
-    [
-        ({"joint2": {"jump_times": 3.0}}, ["setting of joint2 'jump_times'", "'jump_time_s'"]),
-        ({"join2": {"jump_time_s": 3.0}}, ["unknown place 'join2'", "did you mean 'joint"]),
-        ({"base": {"jump_time_s": 3.0}}, ["setting of base 'jump_time_s'", "time_constant_s"]),
-    ],
-)
-def test_a_setting_that_no_effect_has_meets_its_nearest(settings, parts) -> None:
-    with pytest.raises(InputError) as caught:
-        model_with(settings, "joint_offset")
-    text = str(caught.value)
-    assert "[model] nominal.settings" in text
-    assert all(part in text for part in parts)
+def test_sizes_of_what_no_effect_has_are_refused(sizes, told) -> None:
+    with pytest.raises(InputError, match=told):
+        model_of("joint_offset", nominal=Nominal(sizes=sizes))
 
 
 @pytest.mark.parametrize("name", [n for n, e in CATALOGUE.items() if isinstance(e, DrivenEffect)])
@@ -166,23 +148,6 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
     )
     difference = all_of_it.predict(table) - plain.predict(table)
     assert np.abs(difference).max() < 1e-14
-
-
-def sized(sizes: dict[str, dict[str, float]], *effects: str) -> Model:
-    return Model.assembled(kr270_chain(), kr270_cell(effects, nominal=Nominal(sizes=sizes)))
-
-
-@pytest.mark.parametrize(
-    "sizes, message",
-    [
-        ({"joint9": {"offset": 1.0}}, "nominal.sizes: unknown place 'joint9'"),
-        ({"joint2": {"ofset": 1.0}}, "unknown parameter of joint2 'ofset'"),
-        ({"joint2": {"curve_1": 1.0}}, "unknown parameter of joint2 'curve_1'"),
-    ],
-)
-def test_sizes_of_what_no_effect_has_are_refused(sizes, message) -> None:
-    with pytest.raises(InputError, match=message):
-        sized(sizes, "joint_offset")
 
 
 # --- traits, and effects of one's own

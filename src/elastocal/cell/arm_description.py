@@ -282,7 +282,6 @@ class Unsteadiness:
 
     @property
     def shared(self) -> bool:
-        """Whether readings have some of it in common."""
         return bool(self.joints.any() or self.drift or self.configuration)
 
     def of_joints(self, n: int) -> Array:
@@ -319,7 +318,6 @@ class EffectChoice:
 
 
 def _choices(entries: object) -> object:
-    """Effects as they are chosen; each may be stated as a text."""
     if not isinstance(entries, list | tuple):
         return entries
     choices: list[object] = []

@@ -301,7 +301,6 @@ class Workspace:
 
 
 def _check_names(table: Any, spot: Spot) -> None:
-    """Names of solids and half-spaces can stand in messages and plans, each only once."""
     places: dict[str, str] = {}
     for kind in ("obstacle", "body", "keep_out"):
         for i, entry in enumerate(table.get(kind, ())):

@@ -560,7 +560,6 @@ def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
 
 
 def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
-    """Places that depend on what the data do not determine, or lie where no reading shows it."""
     sure, reached = c.uncertainty, c.reached
     unknown, std = sure.unknown[reached], sure.std[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
@@ -647,7 +646,6 @@ NAMED = 8  # rows that a message names
 
 
 def check_reached(result: Compensation) -> None:
-    """Raise InsufficientDataError where targets are not reached: which, and what would help."""
     table = result.targets.table
     rows = [f"line {line}" for line in table.row]
     check_status(f"{table.source}: %d of %d targets", rows, result.status, REACHED, REMEDIES)

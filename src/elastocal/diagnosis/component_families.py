@@ -20,7 +20,7 @@ from elastocal.measurements import Measurements
 from elastocal.model.effects.base import DrivenEffect, Effect, Stage, index, turning_joints
 from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
-from elastocal.model.effects.smooth import JointCurve, ResidualField
+from elastocal.model.effects.smooth import JointCurve, ResidualField, Waves
 from elastocal.units import Array
 
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.
@@ -78,7 +78,7 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
         cell = cell_with(model.cell, where, tried)
         yield Component(
             "angle", effect, where, driven_columns(dataset, effect, where, tried) * CURVE, CURVE,
-            waves=effect.courses(where, model.chain, cell)[0].waves,
+            waves=Waves.of(effect.functions(where, model.chain, cell)[0]),
             lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
             fellows=len(joints),
         )  # fmt: skip
@@ -399,9 +399,10 @@ def _field(
     """A field as a block, for a search: its direction at every visit, the same waves in each
     component of the motion."""
     cell = cell_with(dataset.base.model.cell, where, _field_settings(dataset, name, length))
-    (course,) = effect.courses(where, dataset.base.model.chain, cell)
-    sd = np.sqrt(course.waves.variances(course.size, course.length))
-    F = course.waves.at(_followed(dataset.visit_table, name)) * sd * MOTION
+    (function,) = effect.functions(where, dataset.base.model.chain, cell)
+    waves = Waves.of(function)
+    sd = np.sqrt(waves.variances(function.size, function.length))
+    F = waves.at(_followed(dataset.visit_table, name)) * sd * MOTION
     F = F.reshape(*dataset.present.shape, -1) * dataset.present[:, :, None]
     entry = effect.entry_at(where)
     D = np.asarray(np.kron(np.eye(entry.size), F[:, :, None, :]), dtype=np.float64)
@@ -422,11 +423,11 @@ def _field_component(
     settings = _field_settings(dataset, name, shortest)
     span = settings[f"field_{name}_high"] - settings[f"field_{name}_low"]
     cell = cell_with(dataset.base.model.cell, where, settings)
-    (course,) = effect.courses(where, dataset.base.model.chain, cell)
+    (function,) = effect.functions(where, dataset.base.model.chain, cell)
     columns = driven_columns(dataset, effect, where, settings) * MOTION
     low, high = (math.log(share * span) for share in (shortest, FIELD_LENGTHS[1]))
     ranges = {k: v for k, v in settings.items() if k.endswith(("low", "high"))}
     return Component(
-        "time" if name == "time" else "pose", effect, where, columns, MOTION, name, course.waves,
-        (low, high), effect.entry_at(where).size, tuple(ranges.items()),
+        "time" if name == "time" else "pose", effect, where, columns, MOTION, name,
+        Waves.of(function), (low, high), effect.entry_at(where).size, tuple(ranges.items()),
     )  # fmt: skip

@@ -78,7 +78,6 @@ class Parameter(ParameterSpec):
     where: str
 
     def beyond(self, interval: tuple[float, float]) -> bool:
-        """Whether all of an interval lies beyond a physical bound."""
         return interval[1] < self.lower or interval[0] > self.upper
 
 
@@ -289,14 +288,17 @@ def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
     return np.eye(len(levels))[nearest]
 
 
+def _as_force(load: ArrayLike) -> Array:
+    try:
+        return np.asarray(load, dtype=float)
+    except (TypeError, ValueError):
+        return np.zeros(())
+
+
 def check_loads(load: ArrayLike | None, n: int) -> None:
-    """Raise InputError unless the option `load` is a force for n poses, or one for each."""
     if load is None:
         return
-    try:
-        force = np.asarray(load, dtype=float)
-    except (TypeError, ValueError):
-        force = np.zeros(())
+    force = _as_force(load)
     known = force.shape in ((3,), (n, 3))
     if not (known and (np.abs(force) <= LARGEST_FORCE).all()):
         found = "numbers beyond all measure" if known else f"an array of shape {force.shape}"
@@ -306,14 +308,11 @@ def check_loads(load: ArrayLike | None, n: int) -> None:
         )
 
 
-def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:
+def given_force(load: ArrayLike | None) -> Array | None:
     """The option `load` as a force (3,) in N, None where it is not given."""
     if load is None:
         return None
-    try:
-        force = np.asarray(load, dtype=float)
-    except (TypeError, ValueError):
-        force = np.zeros(0)
+    force = _as_force(load)
     if force.shape != (3,) or not (np.abs(force) <= LARGEST_FORCE).all():
         found = " ".join(f"{v:g}" for v in force) if force.ndim == 1 and len(force) else load
         most = "" if not np.isfinite(force).all() else f" of at most {LARGEST_FORCE:g}"

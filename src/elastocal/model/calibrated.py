@@ -105,11 +105,9 @@ class Valued:
 
     @cached_property
     def values(self) -> dict[str, float]:
-        """Name → value in SI units."""
         return dict(zip(self.model.names, map(float, self.x), strict=True))
 
     def x_of(self, other: Model) -> Array:
-        """The values of the parameters of a model that has some of these."""
         return np.array([self.values[name] for name in other.names])
 
     @property
@@ -123,7 +121,6 @@ class Valued:
 
     @property
     def elastic(self) -> bool:
-        """Whether loads deflect it."""
         return any(CATALOGUE[name].elastic for name in self.effects)
 
 
@@ -197,7 +194,6 @@ class CalibratedArm(Valued, Saved):
 
 
 def given_arm(name: str, given: Any) -> CalibratedArm:
-    """The arm itself, or that of a `Calibration`, which the option `name` takes."""
     arm = getattr(given, "arm", given)
     if not isinstance(arm, CalibratedArm):
         raise InputError(
@@ -476,7 +472,6 @@ def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[st
 
 
 def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
-    """The calibrated model with the effects `names` alone."""
     cell = calibrated.model.cell
     spec = cell.model
     spec = replace(
@@ -491,7 +486,6 @@ def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
 
 
 def random_table(model: Model, conditions: Conditions, poses: int, seed: int) -> Measurements:
-    """`poses` random poses, a row each, with every column that the arm's effects may ask for."""
     cell, chain, visits = model.cell, model.chain, conditions.visits
     rng = np.random.default_rng(seed)
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
@@ -586,14 +580,8 @@ def share_of_levels(angle: Array, levels: Array) -> Array:
     section 5), so that neighbours say what lies between them.
     """
     order = np.argsort(levels)
-    place = np.interp(angle, levels[order], np.arange(len(levels), dtype=float))
-    low = np.minimum(place.astype(int), len(levels) - 1)
-    high = np.minimum(low + 1, len(levels) - 1)
-    share = np.zeros((len(angle), len(levels)))
-    rows = np.arange(len(angle))
-    share[rows, order[low]] += 1 - (place - low)
-    share[rows, order[high]] += place - low
-    return share
+    hats = (np.interp(angle, levels[order], hat[order]) for hat in np.eye(len(levels)))
+    return np.column_stack(list(hats))
 
 
 class CalibratedTool:

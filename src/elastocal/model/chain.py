@@ -250,7 +250,6 @@ def _limited(joint: Joint, where: str) -> Joint:
 
 
 def _doubts(chain: Chain) -> list[str]:
-    """What hardly any arm has, as sentences that name the likely cause."""
     found = []
     axes = [joint.placement[:3, :3] @ joint.axis for joint in chain.joints]
     before = [joint.axis for joint in chain.joints]

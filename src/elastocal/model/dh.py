@@ -119,7 +119,6 @@ def read_dh(
 
 
 def read_dh_table(path: Path) -> RawTable:
-    """The cells of a DH table; lines that begin with # are comments."""
     return _read(path, DH_FAMILIES, ("angle", "length"), "DH table")
 
 
@@ -234,7 +233,6 @@ def _meant(known: Sequence[Family], what: str, header: str) -> str | None:
 
 
 def _still(table: RawTable, i: int) -> bool:
-    """Whether a row has no joint; InputError where its name says so and its type does not."""
     kind, name = table.text(i, "type"), table.text(i, "joint").lower()
     if not kind and name in NO_JOINTS:
         raise InputError(
@@ -245,7 +243,6 @@ def _still(table: RawTable, i: int) -> bool:
 
 
 def _sign(table: RawTable, i: int) -> float:
-    """1, or -1 where the joint's value counts against its axis."""
     value = dh_number(table, i, "sign", "sign")
     if value not in (1.0, -1.0) and not math.isnan(value):
         raise InputError(

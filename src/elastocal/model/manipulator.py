@@ -255,7 +255,6 @@ class Model(ByValue):
         return model
 
     def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
-        """The same arm with another choice of effects."""
         return self._with(replace(self.cell.model, effects=effects))
 
     def _with(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
@@ -286,11 +285,9 @@ class Model(ByValue):
 
     @property
     def all_names(self) -> list[str]:
-        """Every name that `meant_by` understands."""
         return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
 
     def backend_report(self) -> str:
-        """What evaluates this model, for reports: engines and threads."""
         return evaluated_by(self._symbolic.backend)
 
     @property
@@ -450,7 +447,6 @@ class Model(ByValue):
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
 
     def flange_poses(self, table: Measurements, x: Array | None = None) -> NDArray:
-        """T_tracker_flange (n_rows, 4, 4) at parameter values x, deflections included."""
         return self._frames(table, x)[0]
 
     def target_poses(self, table: Measurements, x: Array | None = None) -> tuple[NDArray, NDArray]:
@@ -466,7 +462,6 @@ class Model(ByValue):
 
 
 def check_equilibrium(table: Measurements, predicted: Array) -> None:
-    """Raise InputError for the first row whose prediction (n_rows, k) is not finite."""
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
     if len(bad):
         raise InputError(
@@ -492,8 +487,6 @@ def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
 
 
 def load_chain(cell: Cell) -> Chain:
-    """The nominal chain of the cell's robot, from its URDF, MuJoCo model, DH table or factory
-    calibration."""
     robot = cell.robot
     path = robot.mjcf or robot.urdf or robot.dh
     if path is None:
@@ -550,7 +543,6 @@ class SmoothGroup(SmoothFunction):
 
 
 def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:
-    """The groups of all shrunk parameters, in the model's order."""
     place = {name: k for k, name in enumerate(model.names)}
     found: list[SmoothGroup] = []
     shrunk = [p for p in model.parameters if p.shrunk]

@@ -106,7 +106,6 @@ class MjcfArm:
         return arm
 
     def anew(self) -> MjcfArm:
-        """The same with what is now in `model`."""
         tree = _tree(self.tree.path, self.tree.name, self.model, self.bodies, self.unweighed)
         return replace(self, tree=tree)
 
@@ -124,7 +123,6 @@ class MjcfArm:
 
     @property
     def flange_body(self) -> int:
-        """The body that is the flange or has the site that is."""
         return self.bodies.index(self.tree.link_of(self.flange)[0])
 
     @property
@@ -318,7 +316,6 @@ def joints_of(model: Any, body: int) -> list[int]:
 
 
 def local(model: Any, body: int) -> Array:
-    """T_parent_body (4, 4) with all joints at `ref`."""
     return transform(model.body_pos[body], model.body_quat[body])
 
 
@@ -347,7 +344,6 @@ def shift(position: Sequence[float] | Array) -> Array:
 
 
 def import_mujoco(what: str = "a MuJoCo model") -> Any:
-    """The package, which `what` needs; InputError where it is not installed."""
     try:
         import mujoco
     except ImportError:
@@ -362,7 +358,6 @@ def mjcf_file(path: Path) -> XmlFile:
 
 
 def parsed(path: Path, text: str | None = None) -> Any:
-    """MuJoCo's MjSpec of a file, or of a `text` that is to stand in its place."""
     mujoco = import_mujoco()
     try:
         with warnings.catch_warnings():
@@ -392,7 +387,6 @@ def _sentence(error: Exception) -> str:
 
 
 def _turn(up: Array) -> Array:
-    """The least rotation (3, 3) that takes the unit vector `up` to z."""
     from scipy.spatial.transform import Rotation
 
     axis = np.cross(up, [0.0, 0.0, 1.0])
@@ -402,7 +396,6 @@ def _turn(up: Array) -> Array:
 
 
 def _check_units(path: Path, spec: Any) -> None:
-    """Raise InputError where the file's angles are in rad and no rad can be so large."""
     import mujoco
 
     kinds = mujoco.mjtOrientation

@@ -107,12 +107,10 @@ def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
 
 
 def rows_needed(observed: Observations, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """The table rows that the observations where `chosen` (N,) holds need."""
     return np.unique(observed.combine[chosen].indices).astype(np.int64)
 
 
 def subset(observed: Observations, chosen: NDArray[np.bool_]) -> Observations:
-    """The observations where `chosen` (N,) holds, with only the table rows they need."""
     combine = observed.combine[chosen]
     rows = rows_needed(observed, chosen)
     value = observed.value.reshape(-1, observed.size)[chosen].ravel()
@@ -224,5 +222,4 @@ def polar_axes(sight: Array) -> Array:
 
 
 def need(condition: bool, message: str) -> None:
-    """Raise InputError unless `condition` holds: what the noise model lacks."""
     require(condition, f"these weights cannot be formed: {message}")

@@ -24,7 +24,6 @@ TINY = 1e-30
 
 
 def skew(v: Any) -> ca.SX:
-    """Cross-product matrix: skew(v) w = v × w."""
     v = ca.SX(v)
     return ca.vertcat(
         ca.horzcat(0, -v[2], v[1]),
@@ -79,7 +78,6 @@ def vector_from_rotation(R: Any) -> ca.SX:
 
 
 def transform(rotation: Any = None, translation: Any = None) -> ca.SX:
-    """Homogeneous transform (4, 4) from a rotation (3, 3) and a translation (3,)."""
     T = ca.SX.eye(4)
     if rotation is not None:
         T[:3, :3] = rotation
@@ -106,7 +104,6 @@ def moved(kind: str, axis: Any, value: float) -> Array:
 
 
 def point(T: ca.SX, p: Any) -> ca.SX:
-    """T applied to the point p (3,)."""
     return T[:3, :3] @ ca.SX(p) + T[:3, 3]
 
 

@@ -222,7 +222,6 @@ class SymbolicArm:
 
     @cached_property
     def frames(self) -> BatchFunction:
-        """Of flange, marker and target."""
         reading = self.arm.reading
         return self._of_rows(self.arm.T_tracker_flange, reading["position"], reading["rotation"])
 

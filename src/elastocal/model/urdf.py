@@ -148,7 +148,6 @@ class Tree:
         return (name, np.eye(4)) if name in self.links else self.frames[name]
 
     def joints_between(self, base: str, flange: str) -> tuple[FileJoint, ...] | None:
-        """All joints from base to flange in order, None unless flange is below base."""
         joints: list[FileJoint] = []
         link = self.link_of(flange)[0]
         while link != base:
@@ -159,7 +158,6 @@ class Tree:
         return tuple(reversed(joints))
 
     def find(self, role: str, name: str, usual: str = "") -> str:
-        """`name`, or an InputError with the nearest name, the `usual` one and all others."""
         there = [*self.links, *(self.frames if role == "flange" else ())]
         hint = did_you_mean(name, there)
         hint += f" (usual here: '{usual}')" if usual and f"'{usual}'" not in hint else ""
@@ -253,14 +251,12 @@ class Tree:
         return [j for j in self.joints_between(base, flange) or () if j.moves]
 
     def placed(self, link: str) -> Array:
-        """T_root_link (4, 4) with every joint between them at rest."""
         T = np.eye(4)
         for joint in self.joints_between(self.root, link) or ():
             T = T @ joint.held
         return T
 
     def serial_chain(self, base: str, flange: str) -> tuple[FileJoint, ...]:
-        """The moving joints between base and flange, in order."""
         joints = self.joints_between(base, flange)
         if joints is None:
             raise InputError(
@@ -372,7 +368,6 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
 
 
 def check_urdf(path: str | Path) -> Tree:
-    """The links and joints of the URDF file at `path`, every name and number checked."""
     file = Path(path)
     return _known(file, read_bytes(file, "URDF file", MAX_BYTES))
 
@@ -384,7 +379,6 @@ def _known(path: Path, data: bytes) -> Tree:
 
 
 def urdf_file(path: Path) -> XmlFile:
-    """The file to be edited."""
     return XmlFile.read(path, "URDF file", "a URDF")
 
 

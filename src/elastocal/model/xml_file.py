@@ -49,7 +49,6 @@ class Tag:
         return next(iter(self.all(name)), None)
 
     def within(self, name: str) -> bool:
-        """Whether it stands in a tag of this name, however deep."""
         return self.above is not None and (self.above.name == name or self.above.within(name))
 
 
@@ -82,7 +81,6 @@ class XmlFile:
 
     @classmethod
     def read(cls, path: Path, file: str, what: str) -> XmlFile:
-        """The file of that path; `file` it is called where it cannot be read or is too large."""
         return cls(path, read_bytes(path, file, MAX_BYTES), what)
 
     @property
@@ -134,18 +132,15 @@ class XmlFile:
         self._inserted.append((at, at, text.encode("utf-8")))
 
     def insert_in(self, tag: Tag, text: str) -> None:
-        """Put text where the content of an element begins."""
         self.insert(self._end(tag.start), text)
 
     def remove(self, tag: Tag) -> None:
         self._inserted.append((tag.start, self._end(tag.start), b""))
 
     def set(self, tag: Tag, stated: Mapping[str, str], without: Collection[str] = ()) -> None:
-        """Let the tag state this, and no longer what `without` names."""
         self._changed.setdefault(tag.start, {}).update(dict.fromkeys(without) | dict(stated))
 
     def set_in(self, tag: Tag, name: str, stated: Mapping[str, str]) -> None:
-        """Let the first `name` in an element state this, where there is none a new one."""
         inside = tag.first(name)
         if inside is None:
             self.insert_in(tag, element(name, stated))
@@ -193,7 +188,6 @@ def comment(text: str) -> str:
 
 
 def as_utf8(path: Path, data: bytes) -> bytes:
-    """An XML file's content as UTF-8, its declaration with it."""
     declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
     name = declared.group(2).strip("\"'") if declared else "utf-8"
     name = "utf-16" if data.startswith(UTF16) else name
@@ -207,7 +201,6 @@ def as_utf8(path: Path, data: bytes) -> bytes:
 
 
 def _around(data: bytes) -> str:
-    """What to say of text before or after the elements, "" where there is none."""
     head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
     before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
     if before.strip() or (before and head is not None and head[0] == b"<?xml"):

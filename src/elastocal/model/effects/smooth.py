@@ -88,6 +88,10 @@ class Waves:
         frequency = np.asarray(2 * np.pi * order / period, dtype=np.float64)
         return cls(low, frequency, span, fade)
 
+    @classmethod
+    def of(cls, f: SmoothFunction) -> Waves:
+        return cls.over(f.low, f.high, f.length, f.lasting)
+
     @property
     def count(self) -> int:
         return 2 * len(self.frequency) + math.isfinite(self.fade)
@@ -123,75 +127,40 @@ class Waves:
         return np.asarray(waves(x[:, None])[0][..., 0])
 
 
-@dataclass(frozen=True)
-class Course:
-    """What a smooth function at a place follows, by the settings that say so: prior `size` in rad
-    or m, `length` ℓ and range in the unit of what it follows.  `components`: how the keys of each
-    component's coefficients begin → unit of its values."""
-
-    name: str
-    components: Mapping[str, str]
-    size: float
-    length: float
-    low: float
-    high: float
-
-    @property
-    def turns(self) -> bool:
-        return self.name != "time"
-
-    @property
-    def waves(self) -> Waves:
-        return Waves.over(self.low, self.high, self.length, self.turns)
-
-    @property
-    def keys(self) -> tuple[tuple[str, ...], ...]:
-        numbers = range(1, self.waves.count + 1)
-        return tuple(tuple(f"{start}_{k}" for k in numbers) for start in self.components)
-
-    @property
-    def parameters(self) -> list[ParameterSpec]:
-        sd = np.sqrt(self.waves.variances(self.size, self.length)).tolist()
-        return [
-            ParameterSpec(key, unit, 0.0, size, shrunk=True)
-            for keys, unit in zip(self.keys, self.components.values(), strict=True)
-            for key, size in zip(keys, sd, strict=True)
-        ]
-
-    @property
-    def function(self) -> SmoothFunction:
-        return SmoothFunction(
-            self.name, self.keys, tuple(self.components.values()), self.size, self.length,
-            self.low, self.high, self.waves.at,
-        )  # fmt: skip
-
-    def values(self, arm: Arm, p: Symbols) -> ca.SX:
-        """The function (components,) of the row."""
-        x = arm.q_commanded[index(self.name)] if self.turns else arm.input("time", 1)
-        waves = ca.vertcat(*self.waves.values(x))
-        every = (ca.vertcat(*(p[key] for key in keys)) for keys in self.keys)
-        return ca.vertcat(*(ca.dot(coefficients, waves) for coefficients in every))
+def smooth_function(
+    follows: str, components: Mapping[str, str], size: float, length: float, low: float, high: float
+) -> SmoothFunction:
+    """A function of `follows`, as its settings say: prior `size` in rad or m, `length` ℓ and range
+    in the unit of what it follows.  `components`: how the keys of each component's coefficients
+    begin → unit of its values."""
+    waves = Waves.over(low, high, length, follows != "time")
+    keys = (tuple(f"{start}_{k}" for k in range(1, waves.count + 1)) for start in components)
+    units = tuple(components.values())
+    return SmoothFunction(follows, tuple(keys), units, size, length, low, high, waves.at)
 
 
 class SmoothEffect(DrivenEffect):
-    """u = Σ_c f_c(x_c) in every component of the motion at a place; `courses` says the x_c."""
+    """u = Σ_c f_c(x_c) in every component of the motion at a place; `functions` says the f_c."""
 
     together = True
 
-    def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
-        """What the function follows at this place."""
-        raise NotImplementedError
-
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(spec for c in self.courses(place, chain, cell) for spec in c.parameters)
-
-    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        return tuple(course.function for course in self.courses(place, chain, cell))
+        return tuple(
+            ParameterSpec(key, unit, 0.0, sd, shrunk=True)
+            for f in self.functions(place, chain, cell)
+            for keys, unit in zip(f.keys, f.units, strict=True)
+            for key, sd in zip(
+                keys, np.sqrt(Waves.of(f).variances(f.size, f.length)).tolist(), strict=True
+            )
+        )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         u = ca.SX.zeros(self.entry_at(place).size)
-        for course in self.courses(place, arm.chain, arm.cell):
-            u += course.values(arm, p)
+        for f in self.functions(place, arm.chain, arm.cell):
+            x = arm.q_commanded[index(f.follows)] if f.lasting else arm.input("time", 1)
+            waves = ca.vertcat(*Waves.of(f).values(x))
+            every = (ca.vertcat(*(p[key] for key in keys)) for keys in f.keys)
+            u += ca.vertcat(*(ca.dot(coefficients, waves) for coefficients in every))
         return u
 
 
@@ -217,8 +186,9 @@ class JointCurve(SmoothEffect):
         Setting("curve_high_rad", "range", math.pi, -100.0, 100.0),
     )
 
-    def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
-        return (Course(place, {"curve": "rad"}, *self.stated(place, chain, cell).values()),)
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
+        stated = self.stated(place, chain, cell).values()
+        return (smooth_function(place, {"curve": "rad"}, *stated),)
 
 
 class ResidualField(SmoothEffect):
@@ -260,17 +230,17 @@ class ResidualField(SmoothEffect):
             ]
         return tuple(found)
 
-    def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
         given, units = self.stated(place, chain, cell), self.entry_at(place).units
-        found = (
-            Course(
+        return tuple(
+            smooth_function(
                 name,
                 {f"field_{name}_{c}": unit for c, unit in enumerate(units, start=1)},
                 *(given[f"field_{name}_{key}"] for key in ("size", "length", "low", "high")),
             )
             for name in (*turning_joints(chain), "time")
+            if given[f"field_{name}_size"] > 0
         )
-        return tuple(course for course in found if course.size > 0)
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
         timed = any(s.get("field_time_size") for s in cell.model.nominal.settings.values())
