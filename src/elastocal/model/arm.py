@@ -78,6 +78,7 @@ class Parameter(ParameterSpec):
     where: str
 
     def beyond(self, interval: tuple[float, float]) -> bool:
+        """Whether all of an interval lies beyond a physical bound."""
         return interval[1] < self.lower or interval[0] > self.upper
 
 

@@ -105,9 +105,11 @@ class Valued:
 
     @cached_property
     def values(self) -> dict[str, float]:
+        """Name → value in SI units."""
         return dict(zip(self.model.names, map(float, self.x), strict=True))
 
     def x_of(self, other: Model) -> Array:
+        """The values of the parameters of a model that has some of these."""
         return np.array([self.values[name] for name in other.names])
 
     @property
@@ -121,6 +123,7 @@ class Valued:
 
     @property
     def elastic(self) -> bool:
+        """Whether loads deflect it."""
         return any(CATALOGUE[name].elastic for name in self.effects)
 
 

@@ -255,6 +255,7 @@ class Model(ByValue):
         return model
 
     def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
+        """The same arm with another choice of effects."""
         return self._with(replace(self.cell.model, effects=effects))
 
     def _with(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
@@ -285,9 +286,11 @@ class Model(ByValue):
 
     @property
     def all_names(self) -> list[str]:
+        """Every name that `meant_by` understands."""
         return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
 
     def backend_report(self) -> str:
+        """What evaluates this model, for reports: engines and threads."""
         return evaluated_by(self._symbolic.backend)
 
     @property
@@ -447,6 +450,7 @@ class Model(ByValue):
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
 
     def flange_poses(self, table: Measurements, x: Array | None = None) -> NDArray:
+        """T_tracker_flange (n_rows, 4, 4) at parameter values x, deflections included."""
         return self._frames(table, x)[0]
 
     def target_poses(self, table: Measurements, x: Array | None = None) -> tuple[NDArray, NDArray]:
