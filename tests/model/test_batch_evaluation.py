@@ -127,9 +127,8 @@ def test_an_unknown_name_is_refused_with_the_nearest(monkeypatch: pytest.MonkeyP
 def test_few_rows_are_evaluated_by_casadi_as_by_numpy() -> None:
     """Sparse outputs, what is the same in all rows, no row at all; and no more of them than pay."""
     p = ca.SX.sym("p", 2)
-    sparse = ca.diagcat(
-        PAIR[0] * p[1], ca.atan2(PAIR[1], p[0]), ca.if_else(PAIR[0] > 1, PAIR[1] ** 3, 0)
-    )
+    diagonal = ca.diagcat(ca.atan2(PAIR[1], p[0]), ca.if_else(PAIR[0] > 1, PAIR[1] ** 3, 0))
+    sparse = ca.vertcat(diagonal, ca.horzcat(PAIR[0] * p[1], 0), ca.horzcat(0, PAIR[1]))
     few, plain = (BatchFunction([PAIR, p], [sparse, PAIR + p], name) for name in (None, "numpy"))
     for n in (0, 1, 10):
         for found, expected in zip(*(f(ROWS[:n], ROWS[3]) for f in (few, plain)), strict=True):
