@@ -8,6 +8,7 @@ import pytest
 from support.calibration import PLACED, cell_of, measured, planar_chain, table_at
 
 from elastocal.cell.arm_description import Nominal
+from elastocal.identification import smooth_fit
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
@@ -100,6 +101,41 @@ def test_held_out_residuals_are_those_of_refits():
         expected = fit.residual[~rows] - B[~rows] @ step
         assert np.allclose(fit.held_out[~rows], expected, rtol=0.02, atol=2e-8)
     assert len(subset(observed, keep).lead) == 39
+
+
+def test_what_a_fit_says_of_its_readings_agrees_with_itself(monkeypatch):
+    """A step to the sizes that it has leads nowhere; and what a configuration's residual e is held
+    out, h = (1 − H)⁻¹ e, and standardised, s = (1 − H)^(−½) e, have eᵀh = sᵀs."""
+    asked, seen = smooth_fit._Course.result, []
+
+    def result(self, fit, cross, *rest):
+        seen.append((self.crossed(fit, fit.scales)[0], cross[0], fit.found.residual))
+        seen.append(fit.standardised())
+        return asked(self, fit, cross, *rest)
+
+    monkeypatch.setattr(smooth_fit._Course, "result", result)
+    model, _, table, *_ = campaign()
+    identify(model, table, Options(method="ols", faulty="keep"))
+    (stepped, held, e), s, *_ = seen
+    np.testing.assert_allclose(stepped, held, atol=1e-2 * SIGMA)
+    each = [part.reshape(-1, 3).sum(axis=1) for part in (e * held, s**2)]
+    np.testing.assert_allclose(*each, rtol=1e-6)
+    assert np.abs(each[0] - (e**2).reshape(-1, 3).sum(axis=1)).max() > SIGMA**2 / 10
+
+
+def test_two_readings_of_one_place_that_err_alike_are_no_faulty_readings():
+    """The model lacks something there; where they are far from each other they are faulty."""
+    model, rng = arm(), np.random.default_rng(7)
+    x, found = true(model, rng), []
+    table = readings(model, x, 80, rng)
+    for near in (True, False):
+        q, position = table.q.copy(), table.position.copy()
+        q[50] = q[5] + 1e-3 if near else q[50]
+        position[50] = measured(model, replace(table, q=q), x, 0.0, rng).position[50]
+        position[[5, 50]] += 3e-4
+        fit = identify(model, replace(table, q=q, position=position))
+        found.append({o.line for o in fit.excluded})
+    assert found == [set(), set(table.row[[5, 50]])]
 
 
 def test_nothing_is_claimed_where_there_are_no_curves():
