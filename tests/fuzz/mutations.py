@@ -58,9 +58,8 @@ def _span(text: str | bytes, rng: Random, longest: int = 200) -> tuple[int, int]
 
 def flip_bits(data: bytes, rng: Random) -> bytes:
     changed = bytearray(data)
-    for _ in range(rng.choice((1, 1, 2, 5, 40))):
-        if changed:
-            changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
+    for _ in range(rng.choice((1, 1, 2, 5, 40)) * bool(data)):
+        changed[rng.randrange(len(changed))] ^= 1 << rng.randrange(8)
     return bytes(changed)
 
 
@@ -68,14 +67,9 @@ def truncate(data: bytes, rng: Random) -> bytes:
     return data[: _place(data, rng)]
 
 
-def cut(data: bytes, rng: Random) -> bytes:
-    begin, end = _span(data, rng)
+def cut_or_double(data: bytes, rng: Random) -> bytes:
+    begin, end = rng.sample(_span(data, rng), 2)
     return data[:begin] + data[end:]
-
-
-def double(data: bytes, rng: Random) -> bytes:
-    begin, end = _span(data, rng)
-    return data[:end] + data[begin:]
 
 
 def insert_bytes(data: bytes, rng: Random) -> bytes:
@@ -84,13 +78,9 @@ def insert_bytes(data: bytes, rng: Random) -> bytes:
 
 
 def encode_anew(data: bytes, rng: Random) -> bytes:
-    text = data.decode("utf-8", errors="replace")
-    kind = rng.choice(("utf-16", "utf-16-be", "utf-32", "latin-1", "utf-8-sig", "cr", "crlf"))
-    if kind == "cr":
-        return text.replace("\n", "\r").encode()
-    if kind == "crlf":
-        return text.replace("\n", "\r\n").encode()
-    return text.replace("e", "é", rng.choice((0, 1))).encode(kind, errors="replace")
+    text = data.decode("utf-8", errors="replace").replace("e", "é", rng.choice((0, 1)))
+    coding = rng.choice(("utf-16", "utf-16-be", "utf-32", "latin-1", "utf-8-sig", "utf-8", "utf-8"))
+    return text.replace("\n", rng.choice(("\n", "\r", "\r\n"))).encode(coding, errors="replace")
 
 
 def empty(data: bytes, rng: Random) -> bytes:
@@ -137,21 +127,14 @@ def other_unit(text: str, rng: Random) -> str:
 
 
 def lines_changed(text: str, rng: Random) -> str:
+    """Some lines left out, turned round, doubled, or the first of them repeated or cut short."""
     lines = text.split("\n")
-    k, j = rng.randrange(len(lines)), rng.randrange(len(lines))
-    how = rng.randrange(6)
-    if how == 0:
-        del lines[k]
-    elif how == 1:
-        lines.insert(j, lines[k])
-    elif how == 2:
-        lines[k], lines[j] = lines[j], lines[k]
-    elif how == 3:
-        lines[k] = lines[k][: rng.randint(0, len(lines[k]))]
-    elif how == 4:
-        lines[k:k] = [lines[k]] * rng.choice((2, 50, 3000))
-    else:
-        del lines[min(k, j) : max(k, j)]
+    k = rng.randrange(len(lines))
+    some = lines[k : k + rng.choice((1, 1, 2, 10, 100))]
+    short = some[0][: rng.randint(0, len(some[0]))]
+    lines[k : k + len(some)] = rng.choice(
+        ([], some[::-1], some * 2, some[:1] * rng.choice((2, 50, 3000)), [short, *some[1:]])
+    )
     return "\n".join(lines)
 
 
@@ -159,39 +142,32 @@ def lines_changed(text: str, rng: Random) -> str:
 
 
 def table_changed(text: str, rng: Random) -> str:
+    """One change of the header, of what stands below it, of all rows, or of one row."""
     delimiter = next((d for d in ",;\t" if d in text.split("\n")[0]), ",")
+    if rng.random() < 0.08:
+        return text.replace(delimiter, rng.choice(";\t|  "))
     rows = [line.split(delimiter) for line in text.split("\n")]
-    width = max(len(rows[0]), 1)
+    width, n = len(rows[0]), len(rows)
     a, b = rng.randrange(width), rng.randrange(width)
-    how = rng.randrange(12)
-    value = rng.choice(rng.choice((READ, READ, UNREAD)))
+    value, name = rng.choice(rng.choice((READ, READ, UNREAD))), rng.choice(NAMES)
     factor = rng.choice((1e3, 1e-3, 1e6, 57.29578, 0.0174533, -1.0, 0.0))
-    line = rng.randrange(len(rows))
-    for i, row in enumerate(rows):
-        if len(row) < width:
-            continue
-        if how == 0:
-            del row[a]
-        elif how == 1:
-            row.insert(b, row[a])
-        elif how == 2 or (how == 3 and i):  # swapped, with the header or without it
-            row[a], row[b] = row[b], row[a]
-        elif how == 4 and i:
-            row[a] = value
-        elif how == 5 and i:
-            row[a] = _times(row[a], factor)
-        elif how == 6 and i:
-            row[:] = [_times(cell, factor) for cell in row]
-        elif how == 7 and i == line:
-            row[a] = rng.choice((*NUMBERS, *NAMES))
-        elif how == 8 and i == line:
-            row.append("1")
-        elif how == 9:
-            row[a] = f'"{row[a]}"' if rng.random() < 0.9 else f'"{row[a]}'
-        elif how == 10 and not i:
-            row[a] = rng.choice(NAMES)
-    text = "\n".join(delimiter.join(row) for row in rows)
-    return text.replace(delimiter, rng.choice(";\t|  ")) if how == 11 else text
+    of_cell: tuple[Callable[[str], str], ...] = (
+        lambda cell: value, lambda cell: name, lambda cell: _times(cell, factor),
+        lambda cell: f'"{cell}"', lambda cell: f'"{cell}',
+    )  # fmt: skip
+    in_cell = rng.choice(of_cell)
+    of_row: tuple[Callable[[list[str]], list[str]], ...] = (
+        lambda row: row[:a] + row[a + 1 :],
+        lambda row: [*row[:b], row[a], *row[b:]],
+        lambda row: [row[{a: b, b: a}.get(k, k)] for k in range(len(row))],
+        lambda row: [_times(cell, factor) for cell in row],
+        lambda row: [*row, "1"],
+        *[lambda row: [*row[:a], in_cell(row[a]), *row[a + 1 :]]] * 7,
+    )
+    in_row, line = rng.choice(of_row), rng.randrange(n)
+    where = rng.choice((range(1), range(1, n), range(1, n), range(n), range(line, line + 1)))
+    rows = [in_row(row) if i in where and len(row) >= width else row for i, row in enumerate(rows)]
+    return "\n".join(delimiter.join(row) for row in rows)
 
 
 def _times(cell: str, factor: float) -> str:
@@ -205,35 +181,31 @@ def _times(cell: str, factor: float) -> str:
 
 
 def toml_changed(text: str, rng: Random) -> str:
+    """One key or one header is another one, another value's, nested, doubled or elsewhere."""
     lines = text.split("\n")
     keys = [i for i, line in enumerate(lines) if "=" in line]
     headers = [i for i, line in enumerate(lines) if line.startswith("[")]
-    how = rng.randrange(9)
-    if not keys or (how in (5, 6) and not headers):
+    if not keys:
         return text
+    if headers and rng.random() < 0.25:
+        i = rng.choice(headers)
+        line = lines[i]
+        lines[i] = rng.choice((f"[{line}]", line.strip("[]"), "[robot]", "[a.b.c]", "[]"))
+        return "\n".join(lines if rng.random() < 0.5 else [*lines, line])
     i = rng.choice(keys)
     name, _, value = lines[i].partition("=")
-    nested = rng.choice((3, 40, 400))
-    if how == 0:
-        lines[i] = f"{name}= {'[' * nested}{value.strip()}{']' * nested}"
-    elif how == 1:
-        lines[i] = f"{name}= {rng.choice((*NUMBERS, *map(json.dumps, NAMES)))}"
-    elif how == 2:
-        lines.insert(i, lines[i])
-    elif how == 3:
+    deep, many = rng.choice((3, 40, 400)), rng.choice((2, 7, 5000))
+    other = lines[rng.choice(keys)].partition("=")[2]
+    lines[i] = rng.choice((
+        f"{name}= {'[' * deep}{value.strip()}{']' * deep}",
+        f"{name}= {rng.choice((*NUMBERS, *map(json.dumps, NAMES)))}",
+        f"{lines[i]}\n{lines[i]}",
+        f"{name.strip()}.{name.strip()} = {value}",
+        f"{name}={other}",
+        f"{name}= [{', '.join([value.strip() or '0'] * many)}]",
+    ))  # fmt: skip
+    if rng.random() < 0.1:
         lines.append(lines.pop(i))
-    elif how == 4:
-        lines[i] = f"{name.strip()}.{name.strip()} = {value}"
-    elif how == 5:
-        j = rng.choice(headers)
-        lines[j] = rng.choice((f"[{lines[j]}]", lines[j].strip("[]"), "[robot]", "[a.b.c]", "[]"))
-    elif how == 6:
-        lines.append(lines[rng.choice(headers)])
-    elif how == 7:
-        words = [lines[k].partition("=")[2] for k in keys]
-        lines[i] = f"{name}={rng.choice(words)}"
-    else:
-        lines[i] = f"{name}= [{', '.join([value.strip() or '0'] * rng.choice((2, 7, 5000)))}]"
     return "\n".join(lines)
 
 
@@ -317,43 +289,18 @@ def xml_changed(text: str, rng: Random) -> str:
     return text[: a.start()] + new + text[a.end() :]
 
 
-# Files as the system has them; the file is absent when these are called
-
-
-def _folder(path: Path) -> None:
-    path.mkdir()
-
-
-def _nothing(path: Path) -> None:
-    pass
-
-
-def _loop(path: Path) -> None:
-    path.symlink_to(path.name)
-
-
-def _pipe(path: Path) -> None:
-    os.mkfifo(path)
-
-
-def _device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def _binary(path: Path) -> None:
-    path.write_bytes(bytes(Random(1).randrange(256) for _ in range(5000)))
-
-
-def _large(path: Path) -> None:
-    with open(path, "wb") as handle:  # sparse: it takes no room
-        handle.truncate(3_000_000_000)
-
-
-KINDS: tuple[Callable[[Path], None], ...] = (
-    _folder, _nothing, _loop, _pipe, _device, _binary, _large,
-)  # fmt: skip
-
-ON_BYTES = (flip_bits, flip_bits, truncate, cut, double, insert_bytes, encode_anew, empty)
+# Kinds of file; it is absent when these make it
+KINDS: dict[str, Callable[[Path], object]] = {
+    "a folder": Path.mkdir,
+    "absent": lambda path: None,
+    "a loop": lambda path: path.symlink_to(path.name),
+    "a pipe": os.mkfifo,
+    "a device": lambda path: path.symlink_to("/dev/zero"),
+    "binary": lambda path: path.write_bytes(Random(1).randbytes(5000)),
+    # sparse: it takes no room
+    "large": lambda path: (path.touch(), os.truncate(path, 3_000_000_000)),
+}
+ON_BYTES = (flip_bits, flip_bits, truncate, cut_or_double, insert_bytes, encode_anew, empty)
 ON_TEXT = (
     other_number, other_number, scaled_number, scaled_number, nudged_number, nudged_number,
     other_word, other_unit, lines_changed,
@@ -371,9 +318,9 @@ def spoil(path: Path, rng: Random) -> str:
     """Change one file; what was done, in words."""
     if rng.random() < 0.02:
         path.unlink()
-        kind = rng.choice(KINDS)
-        kind(path)
-        return f"{path.name} is {kind.__name__[1:]}"
+        kind = rng.choice(tuple(KINDS))
+        KINDS[kind](path)
+        return f"{path.name} is {kind}"
     data, done = path.read_bytes(), []
     for _ in range(rng.choice((1, 1, 1, 1, 1, 2, 4))):
         if rng.random() < 0.15:

@@ -7,15 +7,16 @@ Exit code 1 where something broke.
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
-import pickle
 import platform
 import shutil
 import sys
 import tempfile
 import time
-import traceback
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -38,126 +39,79 @@ def main() -> int:
     parser.add_argument("--interrupts", type=int, default=0, help="Ctrl-C in each so many times")
     parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
     parser.add_argument("--write", type=Path, help="page whose table this run replaces")
-    parser.add_argument("--record", type=Path, help="keep what was tried in this file")
-    parser.add_argument(
-        "--add", type=Path, action="append", default=[], help="add such a file; repeatable"
-    )
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
     base = folder / "campaign"
     base.mkdir()
-    anything = asked.cases or asked.kills or asked.full or asked.interrupts
-    if anything or asked.case is not None:
-        campaign.write(base)
-        harness.load_everything()
+    campaign.write(base)
+    harness.load_everything()
     if asked.case is not None:
         case = harness.run(harness.make(asked.case, base, folder / "case", tuple(asked.verb)))
         print(f"cd {case.folder}\n{case.told()}\nstdout:\n{case.stdout[-3000:]}")
         return int(bool(case.complaints))
-    begun = time.monotonic()
-    parts = {fork(asked, base, folder, k): k for k in range(asked.jobs if anything else 0)}
-    tally = Tally()
-    while parts:
-        child, status = os.wait()
-        part = parts.pop(child, None)
-        if part is not None and status:
-            raise RuntimeError(f"part {part} of {asked.jobs} ended with {status}")
-        if part is not None:
-            tally.add(pickle.loads((folder / f"part{part}").read_bytes()))
+    told, broken = everything(asked, base, folder)
     shutil.rmtree(folder, ignore_errors=True)
-    if tally.count:
-        tally.close(asked.seed, time.monotonic() - begun)
-    if asked.record is not None:
-        asked.record.write_bytes(pickle.dumps(tally))
-    for path in asked.add:
-        tally.add(pickle.loads(path.read_bytes()))
-    told = "\n\n".join((tally.table(), *tally.runs))
     print(told)
     if asked.write is not None:
         page = asked.write.read_text(encoding="utf-8")
         before, rest = page.split(f"{BEGIN}\n")
         _, after = rest.split(END)
         asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n\n{END}{after}", encoding="utf-8")
-    return int(bool(tally.broken))
+    return int(broken > 0)
 
 
-def fork(asked: argparse.Namespace, base: Path, folder: Path, part: int) -> int:
-    """A process that runs every `jobs`-th case and kill, and leaves its tally in `folder`."""
-    sys.stdout.flush()
-    if child := os.fork():
-        return child
-    status = 1
-    try:
-        tally, until = Tally(), time.monotonic() + asked.seconds
-        for seed in range(asked.seed, asked.seed + asked.cases)[part :: asked.jobs]:
-            if time.monotonic() > until:
-                break
-            tally.take(harness.run(harness.make(seed, base, folder / str(seed), tuple(asked.verb))))
-            shutil.rmtree(folder / str(seed), ignore_errors=True)
-        times = {
-            "killed": asked.kills, "disk full": asked.full, "interrupted": asked.interrupts,
-        }  # fmt: skip
-        if any(times.values()):
-            own, share = folder / f"kills{part}", slice(part, None, asked.jobs)
-            verbs = asked.verb or kills.KILLED
-            found, tried = kills.run_kills(base, own, asked.seed, times, verbs, share, until)
-            tally.count.update(tried)
-            tally.broken += found
-        (folder / f"part{part}").write_bytes(pickle.dumps(tally))
-        status = 0
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        sys.stdout.flush()
-        os._exit(status)
+def everything(asked: argparse.Namespace, base: Path, folder: Path) -> tuple[str, int]:
+    """Cases and harms, whose findings are printed as they come: the table of how they ended with a
+    sentence on the run (Markdown), and how many broke something."""
+    begun = time.monotonic()
+    until = begun + asked.seconds
+    count, broken, done, slowest, largest = Counter[tuple[str, str]](), 0, 0, 0.0, 0
+    with ProcessPoolExecutor(asked.jobs, multiprocessing.get_context("fork")) as pool:
+        spoilt = partial(one, base, folder, tuple(asked.verb), until)
+        for case in pool.map(spoilt, range(asked.seed, asked.seed + asked.cases)):
+            if case is None:
+                continue
+            count[case.command.verb, f"exit {case.code}"] += 1
+            done, slowest = done + 1, max(slowest, case.seconds)
+            largest = max(largest, case.resident)
+            if case.complaints:
+                broken += 1
+                print(case.told(), flush=True)
+        times = dict(zip(kills.HARMS, (asked.kills, asked.full, asked.interrupts), strict=True))
+        harm = partial(kills.do_harm, base, folder, asked.seed, times, until)
+        verbs = asked.verb or kills.KILLED
+        for found, tried in pool.map(harm, verbs if any(times.values()) else ()):
+            print("\n".join(found), end="", flush=True)
+            count, broken = count + tried, broken + len(found)
+    told = [f"{done} cases from {asked.seed} on"] * bool(done)
+    if others := count.total() - done:
+        told.append(f"{others} kills, interrupts and full disks (seed {asked.seed})")
+    run = f"{', '.join(told)}, with Python {platform.python_version()}: {broken} with a finding; "
+    run += f"{time.monotonic() - begun:.0f} s in all."
+    if done:
+        run += f" Slowest case {slowest:.1f} s of processor time, largest {largest / 1e6:.0f} MB."
+    return f"{table(count)}\n\n{run}", broken
 
 
-class Tally:
-    """What was tried and how it ended."""
+def one(
+    base: Path, folder: Path, verbs: tuple[str, ...], until: float, seed: int
+) -> harness.Case | None:
+    if time.monotonic() > until:
+        return None
+    case = harness.run(harness.make(seed, base, folder / str(seed), verbs))
+    shutil.rmtree(folder / str(seed), ignore_errors=True)
+    return case
 
-    def __init__(self) -> None:
-        self.count: Counter[tuple[str, str]] = Counter()
-        self.broken, self.slowest, self.largest = 0, 0.0, 0
-        self.runs: list[str] = []
 
-    def take(self, case: harness.Case) -> None:
-        self.count[case.command.verb, f"exit {case.code}"] += 1
-        self.slowest = max(self.slowest, case.seconds)
-        self.largest = max(self.largest, case.resident)
-        if case.complaints:
-            self.broken += 1
-            print(case.told(), flush=True)
-
-    def add(self, other: Tally) -> None:
-        """What another process or run has tried."""
-        self.count += other.count
-        self.runs += other.runs
-        self.broken += other.broken
-        self.slowest = max(self.slowest, other.slowest)
-        self.largest = max(self.largest, other.largest)
-
-    def table(self) -> str:
-        """One row per verb (Markdown)."""
-        columns = ("exit 0", "exit 1", "exit 2", *kills.HARMS)
-        rows = ["| verb | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
-        for verb in sorted({verb for verb, _ in self.count}):
-            numbers = (self.count[verb, column] for column in columns)
-            rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
-        return "\n".join(rows)
-
-    def close(self, seed: int, seconds: float) -> None:
-        """Say what this run was."""
-        cases = sum(n for (_, how), n in self.count.items() if how.startswith("exit"))
-        others = self.count.total() - cases
-        told = [f"{cases} cases from {seed} on"] * bool(cases)
-        told += [f"{others} kills, interrupts and full disks (seed {seed})"] * bool(others)
-        found = f"{', '.join(told)}, with Python {platform.python_version()}: {self.broken} with a "
-        found += f"finding; {seconds:.0f} s in all."
-        if cases:
-            found += f" Slowest case {self.slowest:.1f} s of processor time, "
-            found += f"largest {self.largest / 1e6:.0f} MB."
-        self.runs.append(found)
+def table(count: Counter[tuple[str, str]]) -> str:
+    """One row per verb (Markdown)."""
+    columns = ("exit 0", "exit 1", "exit 2", *kills.HARMS)
+    rows = ["| verb | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    for verb in sorted({verb for verb, _ in count}):
+        numbers = (count[verb, column] for column in columns)
+        rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
+    return "\n".join(rows)
 
 
 if __name__ == "__main__":

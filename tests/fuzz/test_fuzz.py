@@ -46,7 +46,7 @@ def test_many_spoilt_inputs() -> None:
 
 @pytest.mark.long
 def test_many_kills_and_full_disks() -> None:
-    fuzzed("--cases", "0", "--kills", "200", "--full", "20", "--interrupts", "40")
+    fuzzed("--cases", "0", "--kills", "60", "--full", "20", "--interrupts", "40")
 
 
 def test_every_verb_is_among_the_commands() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
@@ -10,10 +11,28 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.expressions import X, Y, built
 
 from elastocal.errors import InputError
 from elastocal.model.evaluate import CHUNK, FEW, BatchFunction, chosen_backend
+
+X, Y = ca.SX.sym("x"), ca.SX.sym("y")
+
+
+def built(tree, symbols: Mapping[str, ca.SX], operations: Mapping[str, ca.SX]) -> ca.SX:
+    """A tree of symbols' names, numbers and (operation, operand, ...) as an expression.
+
+    `operations` are expressions in X, or in X and Y.
+    """
+    if isinstance(tree, str):
+        return symbols[tree]
+    if isinstance(tree, float):
+        return ca.SX(tree)
+    operation, *operands = tree
+    parts = [built(operand, symbols, operations) for operand in operands]
+    return ca.substitute(
+        operations[operation], ca.vertcat(*[X, Y][: len(parts)]), ca.vertcat(*parts)
+    )
+
 
 UNARY = {
     "neg": -X, "exp": ca.exp(X), "log": ca.log(X), "sqrt": ca.sqrt(X), "sq": X * X,
