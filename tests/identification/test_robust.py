@@ -15,10 +15,10 @@ from elastocal.identification.faulty_readings import outlier_report
 from elastocal.identification.outliers import (
     FALSE_ALARM,
     HUBER,
+    L1,
     FitToGood,
     covariance_of,
     huber,
-    least_absolute,
     majority,
 )
 
@@ -114,7 +114,7 @@ def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
     lengths = [cp.norm(y[k : k + size] - B[k : k + size] @ x) for k in range(0, len(y), size)]
     problem = cp.Problem(cp.Minimize(cp.sum(cp.hstack(lengths))))
     problem.solve(solver=cp.CLARABEL)
-    found = least_absolute(B, y, size)
+    found = huber(B, y, size, L1)
     total = np.linalg.norm(found.residual.reshape(-1, size), axis=1).sum()
     assert total <= problem.value * (1 + 1e-6)
     np.testing.assert_allclose(found.x, x.value, atol=1e-4)
@@ -134,7 +134,7 @@ def test_intervals_hold_the_truth(arm):
     """
     rng = np.random.default_rng(0)
     tables = (arm.observed(arm.errors(rng, 0.05, 100, 1000)[0]) for _ in range(20))
-    held = sum(covers(least_absolute(arm.B, y, 3), arm) for y in tables)
+    held = sum(covers(huber(arm.B, y, 3, L1), arm) for y in tables)
     low, high = binomial_band(20 * 9 // 3, 0.95)
     assert low <= held / 3 <= high
 

@@ -22,6 +22,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.noise_structure import CONFIGURATION, TURNED, Readings
 from elastocal.identification.options import MethodResult
 from elastocal.identification.outliers import kept_of
+from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import (
     inverse_factor,
@@ -84,10 +85,8 @@ def single_readings(
     rest = residual.size - spent - dof
     if dof < FEWEST or rest < 1 or square <= 0:
         return None
-    F = max(float((e**2).sum()) - square, 0.0) / rest / (square / dof)
-    return SingleReadings(
-        float(np.sqrt(square / dof)), dof, by, float(special.fdtrc(rest, dof, F))
-    )  # fmt: skip
+    p = f_test(max(float((e**2).sum()) - square, 0.0), rest, square, dof)[1]
+    return SingleReadings(float(np.sqrt(square / dof)), dof, by, float(p))
 
 
 def _of_bodies(observed: Observations, root: Array, e: Array, visit: IntArray) -> tuple[float, int]:
@@ -140,8 +139,8 @@ def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> L
     if dof_pure < 1 or dof_between < 1 or pure <= 0:
         return None
     between = max(float((residual**2).sum()) - pure, 0.0)
-    F = (between / dof_between) / (pure / dof_pure)
-    return LackOfFit(F, float(special.fdtrc(dof_between, dof_pure, F)), dof_between, dof_pure)
+    F, p = f_test(between, dof_between, pure, dof_pure)
+    return LackOfFit(float(F), float(p), dof_between, dof_pure)
 
 
 # The noise of a result: which model, its size, why, and whether repeats agree.

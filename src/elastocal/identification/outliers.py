@@ -652,10 +652,6 @@ def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstima
     return RobustEstimate(Q, factors.V, r, size, c, z, scale, converged)
 
 
-def least_absolute(B: Array, y: Array, size: int) -> RobustEstimate:
-    return huber(B, y, size, L1)
-
-
 # Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
 #
 # With r_i = e_i/σ and u = r/|r| the derivative of an observation's score is

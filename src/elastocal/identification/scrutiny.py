@@ -235,7 +235,7 @@ class ParameterSet:
 
 
 CHOSEN = "chosen"
-RESAMPLED = 1000
+DRAWS = 1000
 
 
 def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
@@ -281,12 +281,11 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     ]
     first = next(k for k, (name, _) in enumerate(sets) if name == CHOSEN)
     _, code = np.unique(observed.configuration, return_inverse=True)
-    share = np.random.default_rng(0).dirichlet(np.ones(code.max() + 1), RESAMPLED)
-    draws = share @ np.bincount(code)
-    rms = [np.sqrt(share @ np.bincount(code, h) / draws) for h in held]
+    squares = np.array([np.bincount(code, h) for h in held])
+    rms = _drawn_rms(squares, np.bincount(code), np.random.default_rng(0))
     found = []
     for k, (name, chosen) in enumerate(sets):
-        over = rms[k] - rms[first] if np.isfinite(held[k]).all() else np.full(RESAMPLED, np.inf)
+        over = rms[k] - rms[first] if np.isfinite(held[k]).all() else np.full(DRAWS, np.inf)
         low, high = (float(v) for v in np.quantile(over, [0.025, 0.975], method="nearest"))
         whole = float(np.sqrt(held[k].mean())), float(np.sqrt(held[first].mean()))
         found.append(
@@ -370,7 +369,6 @@ def uncertainty_budget(
 
 STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
 MOST_BUDGETED = 30_000_000  # numbers of a regressor held at once; larger tables get no budget
-DRAWS = 1000
 
 
 @dataclass(frozen=True)
@@ -482,10 +480,13 @@ def pose_accuracy(observed: Observations, errors: Array) -> Array:
 def resampled_rms(
     squares: NDArray[Any], count: NDArray[Any], rng: np.random.Generator
 ) -> tuple[float, tuple[float, float]]:
-    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
-    a Dirichlet distribution draws for them (the Bayesian bootstrap)."""
-    rms = float(np.sqrt(squares.sum() / count.sum()))
-    weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
-    drawn = np.sqrt((weight @ squares) / (weight @ count))
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return rms, (float(low), float(high))
+    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval."""
+    low, high = np.quantile(_drawn_rms(squares, count, rng), [0.025, 0.975])
+    return float(np.sqrt(squares.sum() / count.sum())), (float(low), float(high))
+
+
+def _drawn_rms(squares: Array, count: IntArray, rng: np.random.Generator) -> Array:
+    """The rms (…, draws) by weights of configurations that a Dirichlet distribution draws for
+    squares (…, C) and count (C,): the Bayesian bootstrap."""
+    weight = rng.dirichlet(np.ones(len(count)), DRAWS)
+    return np.asarray(np.sqrt(squares @ weight.T / (weight @ count)))
