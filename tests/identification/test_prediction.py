@@ -50,6 +50,9 @@ def test_regions_hold_the_tool_as_often_as_they_say(fits):
         held.append(at.holds(true).mean())
         assert (at.half_axes() >= at.half_axes(0.5)).all()
         assert at.holds(at.position).all()
+        twice = replace(at, visit=at.covariance)
+        np.testing.assert_allclose(twice.half_axes(visit=True), np.sqrt(2) * at.half_axes())
+        assert twice.holds(at.position + 1.4 * at.half_axes()[:, 2:] * [1, 0, 0], visit=True).all()
     assert 0.85 < np.mean(held) <= 1.0
 
 

@@ -206,6 +206,12 @@ def test_loads_and_noise_that_no_arm_has(tmp_path, force, sigma, words):
     assert [any(w.startswith(t) for t in words) for w in told] == [True] * len(words)
 
 
+def test_a_row_that_identify_would_refuse_is_told_with_its_place_in_the_export(tmp_path):
+    data = DATA.replace("\n", ",5\n").replace("a,5", "a,S", 1).replace("28,5", "28,-5")
+    noise = "\n".join(f"sigma_{axis}_um = 'S'" for axis in "xyz")
+    refused(tmp_path, r"line 5.*\(from .*data.csv, line 5", GOOD + noise, **{"data.csv": data})
+
+
 def test_deflections_need_both_states(tmp_path, readings):
     cell, degrees, points = readings
     cell = replace(cell, model=replace(cell.model, observe="deflection"))

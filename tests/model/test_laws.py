@@ -97,7 +97,7 @@ def test_what_is_not_recorded_is_asked_for(effect: str, column: str, spec) -> No
 # --- gears ---------------------------------------------------------------------------------
 
 Q = np.radians([-170.0, -90.0, -20.0, 0.0, 35.0, 90.0, 160.0])
-LINES = {"order_1": 12.5, "order_3": 80.25, "order_sd_3": 0.2, "spectrum_centre_rad": 0.4}
+LINES = {"order_1": 12.5, "order_40": 80.25, "order_sd_40": 0.2, "spectrum_centre_rad": 0.4}
 
 
 @pytest.mark.parametrize("orders, second", [((40.0,), 40.0), ((10.0, 20.0), 20.0)])
@@ -113,15 +113,15 @@ def test_a_spectrum_has_the_lines_that_the_cell_names() -> None:
     """Beside a line stands its derivative by the order: of one a little off, turned about the
     middle of the angles, they are the sum."""
     m = model(stick("z"), "gear_spectrum", settings={"joint1": LINES})
-    keys = ["line_1_sin", "line_1_cos", "line_3_sin", "line_3_cos", "line_3_sin_shift",
-            "line_3_cos_shift"]  # fmt: skip
+    keys = ["line_1_sin", "line_1_cos", "line_40_sin", "line_40_cos", "line_40_sin_shift",
+            "line_40_cos_shift"]  # fmt: skip
     assert [name.partition(".")[2] for name in m.names] == keys
     assert [p.typical for p in m.parameters] == [5e-5] * 4 + [5e-5 * 0.2] * 2
     assert all(p.shrunk for p in m.parameters)
     off, a, b = 1e-4, 2e-4, 3e-4
     phase = 80.25 * Q + off * (Q - 0.4)
-    shifts = {"line_3_sin_shift": a * off, "line_3_cos_shift": b * off}
-    x, y, _ = positions(m, rows(Q), line_1_sin=a, line_3_sin=a, line_3_cos=b, **shifts).T
+    shifts = {"line_40_sin_shift": a * off, "line_40_cos_shift": b * off}
+    x, y, _ = positions(m, rows(Q), line_1_sin=a, line_40_sin=a, line_40_cos=b, **shifts).T
     found = np.angle(np.exp(1j * (np.arctan2(y, x) - Q)))
     expected = a * np.sin(12.5 * Q) + a * np.sin(phase) + b * np.cos(phase)
     np.testing.assert_allclose(found, expected, atol=1e-3 * a * off + 1e-11)
