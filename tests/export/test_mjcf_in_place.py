@@ -126,7 +126,6 @@ def test_a_tilting_pedestal_stands_before_the_first_joint(base, tmp_path):
 
 
 HINDERED = {
-    "position": ("</default>", '<position kp="500" ctrlrange="-6 6"/></default>'),
     "general": ("</default>", '<general biastype="affine" biasprm="1 -5 -1" forcerange="-1 1"/>'
                 "</default>"),
     "site": ("</default>", '<site type="box" size="1 1 1" euler="1 2 3"/></default>'),

@@ -253,8 +253,7 @@ def test_writing_is_whole_or_not_at_all_and_names_what_was_read(
     assert sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "r.html"]
 
 
-@pytest.mark.parametrize("largest", [1.66e3, 270.0, 1.9e4])
-@pytest.mark.parametrize("ratio", [1.3, 5.0, 40.0])
+@pytest.mark.parametrize(("largest", "ratio"), [(1.66e3, 1.3), (270.0, 5.0), (1.9e4, 40.0)])
 def test_lengths_along_an_axis_do_not_overlap(largest, ratio):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

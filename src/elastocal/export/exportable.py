@@ -4,7 +4,7 @@ the file can do instead."""
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -57,7 +57,6 @@ def placed_body(name: str, T: Array) -> dict[str, str]:
 
 
 def origin_attributes(T: Array) -> dict[str, str]:
-    """xyz and rpy of an <origin> for a transform (4, 4)."""
     return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy_from_rotation(T[:3, :3]))}
 
 
@@ -270,7 +269,6 @@ class ExportNumbers:
 
 
 def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
-    """The pieces of an exported model at its values, at the stated time and temperature."""
     model = part.model
     symbolic = SymbolicArm(model.chain, model.cell)
     arm = symbolic.arm
@@ -494,13 +492,12 @@ class JointCorrection:
 
     def csv(self, comments: Sequence[str] = ()) -> str:
         """The table as text; positions and deltas in rad, of prismatic joints in m."""
-        return csv_text(HEADER, self._rows(), comments)
-
-    def _rows(self) -> Iterator[tuple[str, ...]]:
-        for curve in self.curves:
-            for position, delta in zip(curve.position, curve.delta, strict=True):
-                name = f"{JOINT}{curve.joint + 1}"
-                yield name, curve.follows, f"{position:.6g}", f"{delta + 0.0:.4e}"
+        rows = [
+            (f"{JOINT}{curve.joint + 1}", curve.follows, f"{position:.6g}", f"{delta + 0.0:.4e}")
+            for curve in self.curves
+            for position, delta in zip(curve.position, curve.delta, strict=True)
+        ]
+        return csv_text(HEADER, rows, comments)
 
 
 def read_joint_correction(path: str | Path) -> JointCorrection:
@@ -769,7 +766,6 @@ class _Curves:
         return np.hstack([bent, B * np.repeat(self.side, size, axis=0)])
 
     def correction(self, start: JointCorrection, c: Array) -> JointCorrection:
-        """`start` and the curves of coefficients c (count,)."""
         bent = c[: -self.n].reshape(self.n, len(self.moving), KNOTS)
         curves = [
             CorrectionCurve(j, f"joint{i + 1}", self.places[:, i], bent[j, k])

@@ -460,6 +460,10 @@ def stated(parameter: Parameter) -> bool:
     return parameter.nominal != 0 or parameter.typical is not None
 
 
+def nominal_text(e: Estimate, parameter: Parameter) -> str:
+    return say.plain(say.display(e.nominal, e.unit)[0]) if stated(parameter) else "–"
+
+
 def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason; `most` names."""
     standing, known = standings(result), {p.name: p for p in result.model.parameters}
@@ -502,7 +506,7 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.S
             why = f"{NO_VALUE[kind]}: {limits(result, e)}"
         else:
             why = WITHOUT.get(kind, why)
-        nominal = say.plain(say.display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–"
+        nominal = nominal_text(e, known[e.name])
         true = [texts(e, truth.get(e.name))[3]] if truth else []
         rows.append((printable(e.name), nominal, say.display(0.0, e.unit)[1], *true, why))
     return say.ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
@@ -541,10 +545,7 @@ def parameter_table(
 ) -> say.ShownTable:
     own = [e for e in result.ordinary if e.identifiable]
     known = {p.name: p for p in result.model.parameters}
-    shown = [
-        say.plain(say.display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–" for e in own
-    ]
-    after = {"nominal": shown}
+    after = {"nominal": [nominal_text(e, known[e.name]) for e in own]}
     if published:
         given = [(published.get(e.name), e.unit) for e in own]
         after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])

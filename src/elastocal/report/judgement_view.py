@@ -272,7 +272,6 @@ def intervals_line(result: Calibration) -> str:
 
 
 def constraints_line(result: Calibration) -> str | None:
-    """Which constraints hold with equality, and what the intervals make of them."""
     active = result.active
     if not active:
         return None
@@ -579,12 +578,8 @@ def smooth_table(result: Calibration) -> say.ShownTable:
                 say.significant(say.display(v, unit)[0]) for v in (rms, low, high, half)
             )
             worth = f"{say.significant(part.effective, 2)} of {part.coefficients}"
-            rows.append(
-                (
-                    printable(part.group.name), size, " to ".join(ends), known,
-                    say.display(0.0, unit)[1], worth,
-                )
-            )  # fmt: skip
+            named, shown = printable(part.group.name), say.display(0.0, unit)[1]
+            rows.append((named, size, " to ".join(ends), known, shown, worth))
     note = (
         "What the arm does besides, as smooth functions of joint angles or time: they correct it "
         "where it was measured, and explain nothing. Each takes as many of its coefficients as "
