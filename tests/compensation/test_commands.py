@@ -228,6 +228,8 @@ def test_too_soft_an_arm_has_no_equilibrium():
     found = commanded(arm, at_postures(n=2))
     assert set(found.status) == {"no equilibrium"}
     assert np.isnan(found.after).all()
+    place = targets_at("targets.csv", found.goals.position, None, "base", DOWN)
+    assert set(commanded(arm, place).status) == {"no equilibrium"}
 
 
 # Paths

@@ -117,6 +117,11 @@ def test_a_range_of_angles_has_one_unit():
     assert told == "from 0° to 0.224°, size 0.100 mrad"
 
 
+def test_of_many_orders_the_rest_is_counted():
+    told = settings_text({f"order_{k}": float(k) for k in range(1, 10)})
+    assert told.startswith("orders 1.000, 2.000") and told.endswith("6.000 and 3 more")
+
+
 def test_budget_changes_add_up():
     """Change of every step, read back from its text, is the difference of the errors."""
     table = gap_table(EXPLAINED).rows
