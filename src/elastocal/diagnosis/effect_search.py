@@ -201,18 +201,21 @@ class ForwardSelection:
         nothing = current = fit_set(dataset, (), self.noise)
         scanned = first = alone = self._scan(current, beside=current)
         slots: list[Slot] = []
+        start: list[Slot] = []
         p_values: list[float] = []
         while True:
             best, slot = self._best_addition(current, scanned)
+            if not current.items:
+                start = [slot]
             if best is None or len(current.items) + 1 >= MANY:
                 break
             # Score all again under the noise beside the winner: an effect that is still missing
             # looks like noise, and hides others with it.
             observed = self._scan(current, best.noise, best)
-            if not current.items:
-                alone = observed
             better, again = self._best_addition(current, observed)
             best, slot = better, slot.best_of(again)
+            if not current.items:
+                alone, start = observed, [slot]
             if best is None or not slot.claimable:
                 break
             if current.items and slot.probabilities()[1] > DOUBT_MORE:
@@ -220,7 +223,7 @@ class ForwardSelection:
             p = exceedance(observed.flipped, observed.odds)
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
-            if p > self.level or key in self._visited or not self._lowers(current, best):
+            if p > self.level or key in self._visited:
                 break
             self._visited.add(key)
             current, scanned = best, self._scan(best)
@@ -233,11 +236,13 @@ class ForwardSelection:
                 scanned = self._scan(current)
             if len(current.items) > 1:
                 current, slots, scanned = self._reexamined(current, slots, scanned)
+        if current.items:
+            current, slots, p_values = self._paying(current, slots, p_values)
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         self._forget()
         return SelectedEffects(
-            self.dataset, current, tuple(slots or [slot]), tuple(p_values), nothing, first, alone
+            self.dataset, current, tuple(slots or start), tuple(p_values), nothing, first, alone
         )
 
     def settled(self, found: SelectedEffects) -> SelectedEffects:
@@ -261,13 +266,28 @@ class ForwardSelection:
             found, dataset=self.dataset, chosen=chosen, slots=tuple(slots), p_values=named.p_values
         )
 
-    def _lowers(self, current: ModelSet, best: ModelSet) -> bool:
-        """Whether the error of configurations left out of the fit falls by the last item: a name
-        that does not pay there is none."""
-        noise = best.noise.of_instrument()
-        together = left_out_together(self.dataset, best)
-        after, before = (left_out_square(s.data, noise, together) for s in (best, current))
-        return after < before
+    def _paying(
+        self, current: ModelSet, slots: list[Slot], p_values: list[float]
+    ) -> tuple[ModelSet, list[Slot], list[float]]:
+        """The set without items beside whose others the error of configurations left out of the
+        fit does not fall: a name that does not pay there is none.
+
+        Judged once all are found: beside a large effect that is still missing nothing pays.
+        """
+        while current.items:
+            noise = current.noise.of_instrument()
+            together = left_out_together(self.dataset, current)
+            without = [
+                fit_set(self.dataset, current.without(k), current.noise)
+                for k in range(len(current.items))
+            ]
+            now = left_out_square(current.data, noise, together)
+            gains = [left_out_square(each.data, noise, together) - now for each in without]
+            k = int(np.argmin(gains))
+            if gains[k] > 0:
+                break
+            current, slots = without[k], slots[:k] + slots[k + 1 :]
+        return current, slots, p_values[: len(slots)]
 
     def _forget(self) -> None:
         """What was fitted and scanned about another fit is void, and after a search only fills the
