@@ -40,6 +40,11 @@ def listed(names: Iterable[str], limit: int = 40) -> str:
     return ", ".join(names[:limit]) + more
 
 
+def counted(n: int, one: str, many: str | None = None) -> str:
+    """ "1 pose", "2 poses"."""
+    return f"{n} {one if n == 1 else many or one + 's'}"
+
+
 def gathered(names: Iterable[str]) -> str:
     """Parameters by their places: "compliance of joints 1, 2 and 5, dx of link 3"."""
     found: dict[tuple[str, str], list[str]] = {}

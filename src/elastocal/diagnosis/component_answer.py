@@ -62,6 +62,11 @@ TOLD = 0.02  # share of the gap from which it matters which of several effects i
 SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
 
 
+def pays(without: Array, now: Array) -> bool:
+    """Whether the squared errors of left-out configurations say that a name lowers the error."""
+    return bool(without.sum() > (1 + PAYS) ** 2 * now.sum())
+
+
 @dataclass(frozen=True)
 class SumAnswer:
     """The pieces of a diagnosis that a sum of components fills.
@@ -258,8 +263,7 @@ class SumAnswer:
 
     def _missed(self, k: int) -> bool:
         """Whether the error of left-out configurations grows by PAYS without component k."""
-        without, now = self._left_out_without([k])[0], self._left_out[0]
-        return bool(without.sum() > (1 + PAYS) ** 2 * now.sum())
+        return pays(self._left_out_without([k])[0], self._left_out[0])
 
     def _without(self, gone: Sequence[int]) -> SumAnswer:
         removed = [self.found.components[k] for k in gone]
@@ -284,7 +288,7 @@ class SumAnswer:
         while named:
             without = {key: self._left_out_without([*gone, *own])[0] for key, own in named.items()}
             key = min(without, key=lambda key: without[key].sum())
-            if without[key].sum() > (1 + PAYS) ** 2 * now.sum():
+            if pays(without[key], now):
                 break
             change = without[key] - now
             out[key] = float(change.sum() / max(change.std() * math.sqrt(len(change)), 1e-300))

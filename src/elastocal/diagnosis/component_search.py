@@ -493,6 +493,9 @@ class Rivals:
         return own, dict(zip(self.keys, others, strict=True))
 
 
+SWAPS = 4
+
+
 def with_likelier_names(
     dataset: DiagnosisData, found: FittedSum, components: Sequence[Component]
 ) -> FittedSum:
@@ -519,9 +522,6 @@ def with_likelier_names(
             break
         found = _refitted(better)
     return found
-
-
-SWAPS = 4
 
 
 def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:

@@ -205,17 +205,15 @@ class ForwardSelection:
         p_values: list[float] = []
         while True:
             best, slot = self._best_addition(current, scanned)
-            if not current.items:
-                start = [slot]
             if best is None or len(current.items) + 1 >= MANY:
                 break
             # Score all again under the noise beside the winner: an effect that is still missing
             # looks like noise, and hides others with it.
             observed = self._scan(current, best.noise, best)
+            if not current.items:
+                alone = observed
             better, again = self._best_addition(current, observed)
             best, slot = better, slot.best_of(again)
-            if not current.items:
-                alone, start = observed, [slot]
             if best is None or not slot.claimable:
                 break
             if current.items and slot.probabilities()[1] > DOUBT_MORE:
@@ -226,6 +224,8 @@ class ForwardSelection:
             if p > self.level or key in self._visited:
                 break
             self._visited.add(key)
+            if not current.items:
+                start = [slot]
             current, scanned = best, self._scan(best)
             slots.append(slot)
             p_values.append(p)
@@ -236,14 +236,16 @@ class ForwardSelection:
                 scanned = self._scan(current)
             if len(current.items) > 1:
                 current, slots, scanned = self._reexamined(current, slots, scanned)
-        if current.items:
-            current, slots, p_values = self._paying(current, slots, p_values)
+        current, slots = self._paying(current, slots)
+        if not current.items:
+            self.dataset, current = dataset, nothing
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         self._forget()
         return SelectedEffects(
-            self.dataset, current, tuple(slots or start), tuple(p_values), nothing, first, alone
-        )
+            self.dataset, current, tuple(slots or start or [slot]), tuple(p_values[: len(slots)]),
+            nothing, first, alone,
+        )  # fmt: skip
 
     def settled(self, found: SelectedEffects) -> SelectedEffects:
         """What effects of the catalogue alone would make of it, where that is clearly better.
@@ -266,9 +268,7 @@ class ForwardSelection:
             found, dataset=self.dataset, chosen=chosen, slots=tuple(slots), p_values=named.p_values
         )
 
-    def _paying(
-        self, current: ModelSet, slots: list[Slot], p_values: list[float]
-    ) -> tuple[ModelSet, list[Slot], list[float]]:
+    def _paying(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
         """The set without items beside whose others the error of configurations left out of the
         fit does not fall: a name that does not pay there is none.
 
@@ -287,7 +287,7 @@ class ForwardSelection:
             if gains[k] > 0:
                 break
             current, slots = without[k], slots[:k] + slots[k + 1 :]
-        return current, slots, p_values[: len(slots)]
+        return current, slots
 
     def _forget(self) -> None:
         """What was fitted and scanned about another fit is void, and after a search only fills the

@@ -27,6 +27,7 @@ from elastocal.errors import InsufficientDataError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
+from elastocal.text import counted
 from elastocal.units import Array, Progress
 
 # The fewest candidates that tell the rivals apart: greedy addition, then exchange.
@@ -251,9 +252,9 @@ def _chosen(
         if after < enough:
             reachable = covered * expected(tasks, range(len(pool)))
             notes.append(
-                f"with {len(chosen)} pose{'s' * (len(chosen) != 1)} the probability is "
-                f"{covered * after:.2f} only; many more would reach {reachable:.2f}: allow more "
-                f"poses ({option('poses')}), or repeat each of them"
+                f"with {counted(len(chosen), 'pose')} the probability is {covered * after:.2f} "
+                f"only; many more would reach {reachable:.2f}: allow more poses "
+                f"({option('poses')}), or repeat each of them"
             )
         notes += _pull_notes(base, pool, suspects, seed, tasks, hopeless, len(chosen), after)
     if not worthwhile:
@@ -316,10 +317,10 @@ def _pull_notes(
         chosen = fewest(same, n)
         reached = expected(same, chosen)
         if reached > after + GAIN:
-            also = f"{len(chosen)} pose{'s' * (len(chosen) > 1)}, measured also under"
+            poses = counted(len(chosen), "pose")
             notes.append(
-                f"pull horizontally: {also} {newton:.3g} N along x and along y, e.g. by a rope "
-                "over a pulley, would raise the probability from "
+                f"pull horizontally: {poses}, measured also under {newton:.3g} N along x and "
+                "along y, e.g. by a rope over a pulley, would raise the probability from "
                 f"{suspects.covered * after:.2f} to {suspects.covered * reached:.2f}"
             )
     return notes

@@ -37,7 +37,7 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
-from elastocal.text import listed
+from elastocal.text import counted, listed
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.
@@ -573,7 +573,7 @@ def spare_equations(result: Calibration) -> int:
 def _faulty(result: Calibration) -> Iterator[Finding]:
     n, fitted, kept = len(result.faulty), len(result.observations.lead), len(result.outliers)
     if n:
-        remedy = f"Check the {n} reading{'s' * (n > 1)} beyond the noise."
+        remedy = f"Check the {counted(n, 'reading')} beyond the noise."
         shifted = result.faulty_report.shifted if result.faulty_report else []
         if shifted:
             remedy += (

@@ -22,6 +22,7 @@ from elastocal.errors import InputError
 from elastocal.model.chain import numbered
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of
 from elastocal.model.manipulator import load_chain
+from elastocal.text import counted as counted
 from elastocal.text import printable
 from elastocal.units import Array
 
@@ -288,11 +289,6 @@ def _fixed(value: float, decimals: int) -> str:
 def short_name(name: str, most: int = 12) -> str:
     text = printable(name)
     return text if len(text) <= most else text[: most - 1] + "…"
-
-
-def counted(n: int, one: str, many: str | None = None) -> str:
-    """ "1 pose", "2 poses"."""
-    return f"{n} {one if n == 1 else many or one + 's'}"
 
 
 def signed(value: float, told: Callable[[float], str] = significant) -> str:
