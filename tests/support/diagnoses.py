@@ -307,6 +307,7 @@ VERDICTS = {
     "planned": replace(AMBIGUOUS, extra=EXTRA),
     "inseparable": replace(AMBIGUOUS, extra=INSEPARABLE),
     "nothing": NOTHING,
+    "none named": replace(NOTHING, probability_nothing=0.004),
     "unknown": UNKNOWN,
     "unlocated": replace(UNKNOWN, location=None, curves=(), structure=()),
     "many": MANY,
