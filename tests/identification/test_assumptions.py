@@ -50,26 +50,20 @@ def clean():
     return model, table, x, identify(model, table)
 
 
-def doubled(table, lines, configurations=False):
-    """The table with rows twice, as repeats or as other configurations."""
-    lines = np.asarray(lines)
+def doubled(table, lines, labels=0):
+    """The table with rows twice, as repeats or, with so many `labels`, as other configurations."""
     both = table.take(np.r_[np.arange(len(table)), lines])
     both = replace(both, row=np.arange(len(both)) + 2)
-    if not configurations:
+    if not labels:
         return replace(both, repeat=np.r_[table.repeat, table.repeat[lines] + 1])
-    n = len(table.configuration_labels)
-    return replace(
-        both, configuration=np.r_[table.configuration, table.configuration[lines] + n],
-        configuration_labels=tuple(map(str, range(2 * n))),
-    )  # fmt: skip
-
-
-# Copies.
+    again = np.r_[table.configuration, table.configuration[lines] + labels]
+    names = tuple(map(str, range(2 * labels)))
+    return replace(both, configuration=again, configuration_labels=names)
 
 
 def test_copies_under_new_labels_are_counted_once(clean):
     model, table, _, alone = clean
-    result = identify(model, doubled(table, np.arange(len(table)), configurations=True))
+    result = identify(model, doubled(table, np.arange(len(table)), len(table.configuration_labels)))
     assert result.copies == tuple(range(len(table) + 2, 2 * len(table) + 2))
     assert np.allclose(result.covariance, alone.covariance, rtol=1e-3, atol=0)
     assert result.finding("copied_readings").numbers["copies"] == len(table)
@@ -79,43 +73,28 @@ def test_copies_under_new_labels_are_counted_once(clean):
 
 def test_repeats_that_rounding_makes_equal_are_no_copies():
     """Hardly any clean table loses a reading; nearly every one does of which a third is copied."""
-    model, plan = arm(poses=8, nominal=None, effects=("base_frame",))
+    _, plan = arm(poses=8, nominal=None, effects=("base_frame",))
     found, caught = [], []
     for seed in range(60):
-        table, _ = campaign_of_repeats(model, plan, seed)
+        table = of_repeats(plan, np.random.default_rng(seed))
+        third = np.arange(len(table) // 3)
         found.append(copied(observe(table, "position")).any())
-        n = len(table)
-        caught.append(
-            copied(observe(doubled(table, np.arange(n // 3)), "position")).sum() >= n // 3
-        )
+        caught.append(copied(observe(doubled(table, third), "position")).sum() >= len(third))
     assert sum(found) <= 3 and sum(caught) >= 54
 
 
-def campaign_of_repeats(model, plan, seed):
+def of_repeats(plan, rng):
     """Six repeats, rounded to 1.5 times their noise."""
-    rng = np.random.default_rng(seed)
-    rows = np.repeat(np.arange(len(plan)), 6)
-    table = plan.take(rows)
-    step = 1.5 * SIGMA
+    rows, step = np.repeat(np.arange(len(plan)), 6), 1.5 * SIGMA
     position = rng.normal(size=(len(plan), 3))[rows] + SIGMA * rng.normal(size=(len(rows), 3))
-    position = np.round(position / step) * step
-    return replace(table, repeat=np.tile(np.arange(6), len(plan)), position=position), rows
-
-
-# Numbers that the data cannot support.
-
-
-def weak_arm(joint=5, size=3.0):
-    """Light loads, which hardly show the compliance of one joint: `size` times its std."""
-    model, plan = arm(nominal=None)
-    stiffness = np.array(STIFF)
-    stiffness[joint] = 0.0
-    table, _ = campaign(model, plan, 1, stiffness)
-    return model, table
+    repeat = np.tile(np.arange(6), len(plan))
+    return replace(plan.take(rows), repeat=repeat, position=np.round(position / step) * step)
 
 
 def test_a_compliance_that_hardly_shows_has_no_value():
-    model, table = weak_arm()
+    """Light loads, which hardly show the compliance of the last joint."""
+    model, plan = arm(nominal=None)
+    table, _ = campaign(model, plan, 1, np.array([*STIFF[:5], 0.0]))
     result = identify(model, table)
     e = result["joint6.compliance"]
     assert e.value is None and e.std is None and e.ci95 is None
@@ -143,9 +122,6 @@ def test_the_nominal_stands_where_the_readings_hardly_tell_better():
                 held.append((e.held - true) ** 2)
                 free.append((np.mean(e.limits) - true) ** 2)
     assert len(held) >= 4 and np.mean(held) < 0.5 * np.mean(free)
-
-
-# Assumptions that fail.
 
 
 def test_noise_stated_far_too_large_is_no_noise_that_explains_the_residual(clean):

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import optimize, sparse, stats
+from scipy import optimize, sparse
 from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.constrained import Minimum, Reduced, minimise
+from elastocal.identification.constrained import Minimum, minimise
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
@@ -28,15 +28,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 
 NONE = Constraints()
-CHI2 = float(stats.chi2.ppf(0.95, 1))
-
-
-def non_negative(*names: str) -> Constraints:
-    return Constraints(tuple(Bounds(name, lower=0.0) for name in names))
-
-
-def equal(first: str, other: str) -> Constraints:
-    return Constraints(equalities=(LinearEquality({first: 1.0, other: -1.0}),))
 
 
 def solve(
@@ -44,17 +35,6 @@ def solve(
 ) -> Minimum:
     """The least |y − B x|² under the constraints."""
     return minimise(B, y, stated.resolve(names))
-
-
-def ends(
-    B: np.ndarray, y: np.ndarray, names: Sequence[str], stated: Constraints, name: str,
-    rise: float = CHI2,
-) -> tuple[float, float]:  # fmt: skip
-    """The profile interval of one parameter for rows of unit noise, by default of 95 %."""
-    reduced, index = Reduced.of(B, y, stated.resolve(names)), names.index(name)
-    best = reduced.minimum()
-    low, high = (float(reduced.farthest(index, best, rise, side)[index]) for side in (-1, 1))
-    return low, high
 
 
 def breach(B: np.ndarray, y: np.ndarray, system: System, found: Minimum) -> float:
@@ -84,6 +64,7 @@ def breach(B: np.ndarray, y: np.ndarray, system: System, found: Minimum) -> floa
 NAMES = tuple("abcdef")
 # Parameters of the sizes that an arm has: compliances of 1e-7 beside lengths of 1e-3.
 SIZES = np.array([1e-7, 3e-7, 1e-6, 1e-3, 1e-3, 2e-4])
+NON_NEGATIVE = Constraints(tuple(Bounds(name, lower=0.0) for name in NAMES))
 FULL = (("a", "d", "e"), ("d", "b", "f"), ("e", "f", "c"))
 
 
@@ -91,21 +72,6 @@ def problem(seed: int, rows: int = 60) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     B = rng.normal(size=(rows, 6)) @ (np.eye(6) + 0.5 * rng.normal(size=(6, 6))) / SIZES
     return B, B @ (SIZES * rng.normal(size=6)) + rng.normal(size=rows)
-
-
-def matrix(entries, label: str = "K") -> Constraints:
-    """A matrix inequality on parameters in units of SIZES."""
-    rows = tuple(
-        tuple({n: 1 / SIZES[NAMES.index(n)]} if isinstance(n, str) else n for n in row)
-        for row in entries
-    )
-    return Constraints(matrices=(SemidefiniteMatrix(label, rows),))
-
-
-def value(x: np.ndarray) -> np.ndarray:
-    """The matrix FULL at x."""
-    a, b, c, d, e, f = x / SIZES
-    return np.array([[a, d, e], [d, b, f], [e, f, c]])
 
 
 @settings(max_examples=30, deadline=None)
@@ -155,7 +121,7 @@ def test_prices_are_what_moving_the_constraints_costs():
 
 def test_contradicting_constraints_are_named_and_no_others():
     B, y = problem(0)
-    stated = non_negative(*NAMES) + Constraints(
+    stated = NON_NEGATIVE + Constraints(
         (Bounds("c", upper=1.0),),
         (
             LinearEquality({"a": 1.0, "b": 1.0}, -1e-7, label="sum of drives"),
@@ -175,16 +141,19 @@ def test_what_nothing_determines_is_named_and_an_equality_can_determine_it():
     B, y = problem(0)
     B[:, 1] = 2 * B[:, 0]
     with pytest.raises(InsufficientDataError, match="do not determine a, b:"):
-        solve(B, y, NAMES, non_negative(*NAMES))
-    found = solve(B, y, NAMES, equal("a", "b")).x
+        solve(B, y, NAMES, NON_NEGATIVE)
+    equal = LinearEquality({"a": 1.0, "b": -1.0})
+    found = solve(B, y, NAMES, Constraints(equalities=(equal,))).x
     assert found[0] == pytest.approx(found[1], rel=1e-12)
 
 
 def test_a_semidefinite_fit_is_the_best_factor():
     # Random truth is indefinite: the constraint binds, with a null space of one or two.
     B, y = problem(0)
-    found = solve(B, y, NAMES, matrix(FULL))
-    values = np.linalg.eigvalsh(value(found.x))
+    rows = tuple(tuple({n: 1 / SIZES[NAMES.index(n)]} for n in row) for row in FULL)
+    found = solve(B, y, NAMES, Constraints(matrices=(SemidefiniteMatrix("K", rows),)))
+    at = dict(zip(NAMES, found.x / SIZES, strict=True))
+    values = np.linalg.eigvalsh([[at[n] for n in row] for row in FULL])
     assert values[0] > -1e-8 * max(values[-1], 1)
     assert [a.kind for a in found.active] == ["semidefinite"] and found.active[0].multiplier > 0
 
@@ -205,91 +174,41 @@ def test_a_semidefinite_fit_is_the_best_factor():
     assert best * (1 - 1e-6) <= found.objective <= best * (1 + 1e-9)
 
 
-# Intervals.
-
-THREE = np.array([1e-7, 1e-6, 1e-3])
-RNG = np.random.default_rng(3)
-J = RNG.normal(size=(30, 3)) @ np.array([[1, 0.6, 0], [0, 1, 0.4], [0, 0, 1]]) / THREE
-COFACTOR = np.linalg.inv(J.T @ J * np.outer(THREE, THREE)) * np.outer(THREE, THREE)
-STD = np.sqrt(np.diag(COFACTOR))
-NOISE = RNG.normal(size=30)
-
-
-def readings(*truth_in_std: float) -> np.ndarray:
-    return J @ (STD * truth_in_std) + NOISE
-
-
-def test_one_bound_in_closed_form():
-    # With one bound S(v) = rss + (v − x̂)²/V still, and Ŝ is its value at the bound.
-    y = readings(-2.0, 5.0, 5.0)
-    free = THREE * np.linalg.lstsq(J * THREE, y)[0]
-    assert free[0] < 0
-    low, high = ends(J, y, NAMES[:3], non_negative("a"), "a")
-    assert low == 0.0
-    upper = free[0] + np.sqrt(CHI2 * STD[0] ** 2 + free[0] ** 2)
-    assert high == pytest.approx(upper, abs=1e-7 * STD[0])
-
-
 # A whole arm: the KR 270 at the poses of Table 2, nonlinear equilibrium.
 
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
-BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"
+BEARING_X = "joint2.off_axis_compliance_x"
 
 
 @lru_cache
-def arm() -> Model:
-    return Model(
-        kr270_cell(("joint_compliance", "off_axis_compliance:joint2"), observe="deflection")
-    )
-
-
-def of_arm(seed: int, **values: float) -> tuple:
-    """Readings of the arm with stiff bearings unless `values` say otherwise, start at nominal."""
-    model = arm()
-    truth = with_values(model, {"joint3.compliance": 5e-7} | values)
-    rng = np.random.default_rng(seed)
+def negative_bearing() -> tuple:
+    """Readings of the arm with stiff bearings, start at nominal: a problem whose unconstrained
+    estimate of BEARING_X is negative."""
+    cell = kr270_cell(("joint_compliance", "off_axis_compliance:joint2"), observe="deflection")
+    model, rng = Model(cell), np.random.default_rng(0)
+    truth = with_values(model, {"joint3.compliance": 5e-7})
     table = measured(model, table_of(TABLE_2, SLANTED, both=True), truth, SIGMA / 2**0.5, rng)
     observed = observe(table, "deflection")
     whiten = sparse.csr_array(sparse.eye_array(len(observed.value)) / SIGMA)
     sizes = model.sizes(model.regressor(table, model.nominal, None, observed).B)
     columns = np.arange(len(model.names))
-    weights = Weights("axis", whiten, True, "")
-    stated = Problem(model, observed, weights, model.nominal, columns)
-    return stated, columns, model.nominal, sizes
-
-
-def fitted(stated: tuple, constraints: Constraints = NONE, prior=None) -> KnownFit:
-    problem, columns, x, _ = stated
-    known = PriorRows.stated(problem.model.names, columns, x, constraints, prior, 1.0)
-    return KnownFit(fit(*stated, known=known), known, 1.0)
-
-
-@lru_cache
-def negative_bearing() -> tuple:
-    """A problem whose unconstrained estimate of BEARING_X is negative."""
-    found = of_arm(0)
-    assert fit(*found).x[arm().names.index(BEARING_X)] < 0
+    stated = Problem(model, observed, Weights("axis", whiten, True, ""), model.nominal, columns)
+    found = stated, columns, model.nominal, sizes
+    assert fit(*found).x[model.names.index(BEARING_X)] < 0
     return found
 
 
-def test_a_coupled_matrix_binds_and_the_fit_stays_inside():
-    # Bearing compliances as a matrix with a known coupling: x·y ≥ coupling² keeps both positive.
-    stated = negative_bearing()
-    coupling = 2e-8
-    K = SemidefiniteMatrix("bearing", ((BEARING_X, coupling), (coupling, BEARING_Y)))
-    found = fitted(stated, Constraints(matrices=(K,)))
-    x, y = (found.fit.x[arm().names.index(n)] for n in (BEARING_X, BEARING_Y))
-    assert x > 0 and y > 0
-    assert x * y == pytest.approx(coupling**2, rel=1e-6)
-    assert found.fit.converged
-    free = fit(*stated)
-    assert found.objective > free.whitened @ free.whitened
+def fitted(constraints: Constraints) -> KnownFit:
+    problem, columns, x, sizes = negative_bearing()
+    known = PriorRows.stated(problem.model.names, columns, x, constraints, None, 1.0)
+    return KnownFit(fit(problem, columns, x, sizes, known=known), known, 1.0)
 
 
 @pytest.mark.parametrize("name", [BEARING_X, "joint3.compliance"])
 def test_ends_of_a_profile_are_where_the_objective_has_risen_as_far_as_allowed(name):
-    stated, physics = negative_bearing(), physical_constraints(arm())
-    found, i = fitted(stated, physics), arm().names.index(name)
+    model = negative_bearing()[0].model
+    physics, i = physical_constraints(model), model.names.index(name)
+    found = fitted(physics)
     for side in (-1, 1):
         end = profile_end(found, i, 3.84, side)
         if name == BEARING_X and side < 0:
@@ -297,19 +216,15 @@ def test_ends_of_a_profile_are_where_the_objective_has_risen_as_far_as_allowed(n
             continue
         assert side * (end - found.fit.x[i]) > 0
         at_end = Constraints((Bounds(name, end, end),))
-        rise = fitted(stated, physics + at_end).objective - found.objective
+        rise = fitted(physics + at_end).objective - found.objective
         assert rise == pytest.approx(3.84, abs=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("covariance", "says"),
-    [
+def test_an_impossible_covariance_of_a_prior_is_refused():
+    for covariance, says in (
         (np.array([[1.0, 2.0], [2.0, 1.0]]), "not positive definite"),
-        (np.diag([1.0, 0.0]), "not positive definite"),
         (np.eye(3), "2 × 2 covariance"),
         (np.diag([1.0, np.nan]), "finite"),
-    ],
-)
-def test_an_impossible_covariance_of_a_prior_is_refused(covariance, says):
-    with pytest.raises(InputError, match=says):
-        GaussianPrior(("a", "b"), np.zeros(2), covariance)
+    ):
+        with pytest.raises(InputError, match=says):
+            GaussianPrior(("a", "b"), np.zeros(2), covariance)

@@ -1,4 +1,5 @@
-"""The fit of an arm on NIST's nonlinear and linear reference sets, and the published least squares.
+"""The fit of an arm on NIST's nonlinear and linear reference sets, and the published least squares;
+a profile interval against Fieller's set; a descent that turns back.
 
 Data and certified values: NIST Statistical Reference Datasets, nonlinear and linear least squares,
 https://www.itl.nist.gov/div898/strd/.  Both starts that NIST gives are used, the first of which is
@@ -14,9 +15,11 @@ from types import SimpleNamespace
 import casadi as ca
 import numpy as np
 import pytest
-from scipy import sparse
+from scipy import sparse, stats
 
-from elastocal.identification.least_squares import Problem, fit
+from elastocal.errors import ElastocalError
+from elastocal.identification.knowledge import Bounds, Constraints
+from elastocal.identification.least_squares import KnownFit, PriorRows, Problem, fit, profile_end
 from elastocal.identification.published import ols
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Regression
@@ -52,6 +55,7 @@ class AnyModel:
         y = function(b, at)
         self.f = ca.Function("f", [b, at], [y, ca.jacobian(y, b)])
         self.at, self.parameters, self.shrunk = x, [None] * n, np.zeros(n, dtype=bool)
+        self.names = tuple(f"b{k}" for k in range(n))
 
     def regressor(self, table, x, columns, observed):
         y, J = (np.asarray(v) for v in self.f(x, self.at))
@@ -69,15 +73,16 @@ def digits(value, certified):
 TABLE = SimpleNamespace(source="data")
 
 
-def fitted(model, y, start, sizes, sigma=None):
+def fitted(model, y, start, sizes, sigma=None, known=None):
     """The fit from a start, and the standard deviations of its parameters."""
     n, p = len(y), len(start)
     observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), TABLE)
     whiten = None if sigma is None else sparse.csr_array(np.eye(n) / sigma)
     weights = Weights("test", whiten, sigma is not None, "")
     problem = Problem(model, observed, weights, start, np.arange(p))
-    found = fit(problem, problem.free, start, sizes, max_steps=2000, tolerance=1e-13)
-    variance = found.whitened @ found.whitened / (n - p)
+    steps = {"max_steps": 2000, "tolerance": 1e-13, "known": known}
+    found = fit(problem, problem.free, start, sizes, **steps)
+    variance = found.whitened @ found.whitened / max(n - p, 1)
     return found, np.sqrt(variance * np.diag(found.cofactor()))
 
 
@@ -135,3 +140,71 @@ def test_linear_sets_through_the_fit_under_noise_that_was_estimated(name):
     sigma = 0.7 * given["residual_std"] or 1
     found, _ = fitted(model, y, np.zeros(len(certified)), np.abs(certified), sigma)
     assert digits(found.x, certified) > DIGITS.get(name, 9)
+
+
+class Reciprocal(AnyModel):
+    """1/x, which has no value below zero."""
+
+    def regressor(self, table, x, columns, observed):
+        if x[0] <= 0:
+            raise ElastocalError("no equilibrium")
+        return super().regressor(table, x, columns, observed)
+
+
+def test_descent_turns_back_where_there_is_no_prediction():
+    """The full step from 3 towards 1/x = 2 leads below zero."""
+    model = Reciprocal(lambda b, _: 1 / b, 1, np.ones(1))
+    found, _ = fitted(model, np.array([2.0]), np.array([3.0]), np.ones(1))
+    assert found.converged and found.x[0] == pytest.approx(0.5, rel=1e-9)
+
+
+# The profile interval of where a line crosses zero is Fieller's set (1954), in closed form.
+
+X = np.linspace(-1, 2, 12)
+F = stats.f.ppf(0.95, 1, 10)
+
+
+def line(seed, slope):
+    return 0.8 + slope * X + 0.3 * np.random.default_rng(seed).normal(size=12)
+
+
+def profile(y, constraints=()):
+    """θ of y = b (x − θ), and the ends of its 95 % interval."""
+    (b1, b0), (rss,), *_ = np.polyfit(X, y, 1, full=True)
+    model, start = AnyModel(lambda b, x: b[1] * (x - b[0]), 2, X), np.array([-b0 / b1, b1])
+    sigma = float(np.sqrt(rss / 10))
+    stated = model.names, np.arange(2), start, Constraints(constraints), None, sigma
+    known = PriorRows.stated(*stated)
+    found = KnownFit(fitted(model, y, start, np.ones(2), known=known)[0], known, sigma)
+    return found.fit.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
+
+
+def fieller(y):
+    """(b₀ + θ b₁)² ≤ F (v₀₀ + 2θ v₀₁ + θ² v₁₁)"""
+    B = np.column_stack([np.ones(12), X])
+    (b0, b1), (rss,), *_ = np.linalg.lstsq(B, y)
+    v = np.linalg.inv(B.T @ B) * F * rss / 10
+    return np.sort(np.roots([b1**2 - v[1, 1], 2 * (b0 * b1 - v[0, 1]), b0**2 - v[0, 0]]))
+
+
+def test_equals_fieller():
+    y = line(3, 0.8)
+    theta, ends = profile(y)
+    np.testing.assert_allclose(ends, fieller(y), rtol=1e-5)
+    assert not np.isclose(sum(ends) / 2, theta, rtol=0.02)
+
+
+def test_a_flat_side_is_unbounded():
+    """A slope that may be zero: the set is the outside of its roots."""
+    y = line(1, 0.12)
+    theta, ends = profile(y)
+    roots = fieller(y)
+    assert np.iscomplexobj(roots) or theta < roots[0] or theta > roots[1]
+    assert np.isinf(ends).any()
+
+
+def test_bounds_end_the_interval():
+    y = line(3, 0.8)
+    low = fieller(y)[0] / 2 + profile(y)[0] / 2
+    _, ends = profile(y, (Bounds("b0", low),))
+    assert ends == pytest.approx([low, fieller(y)[1]], rel=1e-5)
