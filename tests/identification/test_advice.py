@@ -12,6 +12,7 @@ from support.calibration import (
     planar_chain,
     table_at,
     true_values,
+    with_values,
 )
 from support.cells import random_poses
 
@@ -25,9 +26,8 @@ SIGMA = 5e-5
 def identified(effects, seed=0, poses=30, sigma=SIGMA, q=None, change=lambda table: table):
     model, rng = Model.assembled(planar_chain(), cell_of(effects)), np.random.default_rng(seed)
     q = random_poses(model.chain, poses, seed) if q is None else q
-    return identify(
-        model, change(measured(model, table_at(q), true_values(model, rng), sigma, rng))
-    )
+    table = measured(model, table_at(q), true_values(model, rng), sigma, rng)
+    return identify(model, change(table))
 
 
 def test_a_clean_adequate_case_has_no_warning():
@@ -55,6 +55,19 @@ def test_ill_conditioned():
     assert len(named) == 3 and set(named) <= set(result.determined)
 
 
+STIFF = {"nominal": Nominal(joint_compliance=(2e-5,) * 3)}
+STATES = [[0, 0, 0], [200, 0, -400]]
+
+
+def test_a_parameter_beyond_its_bound():
+    model = Model.assembled(planar_chain(), cell_of(("base_frame", "joint_compliance"), **STIFF))
+    truth = with_values(model, {"joint3.compliance": -1e-5})
+    plan, rng = table_at(random_poses(model.chain, 30, 0), STATES), np.random.default_rng(0)
+    (warning,) = identify(model, measured(model, plan, truth, 20 * SIGMA, rng)).warnings
+    assert warning.startswith("joint3.compliance = -1")
+    assert "lies beyond its physical bound 0: check load direction and torque signs" in warning
+
+
 @pytest.mark.parametrize("alike", [False, True])
 def test_too_many_outliers_are_no_reading_errors_unless_one_shift_explains_them(alike):
     rows = np.arange(10, 16)
@@ -77,10 +90,9 @@ def test_too_many_outliers_are_no_reading_errors_unless_one_shift_explains_them(
 
 def test_a_missing_effect_in_one_load_state_is_no_shift():
     """Compliances that the model lacks move a loaded fifth of the readings, each otherwise."""
-    stiff = {"nominal": Nominal(joint_compliance=(2e-5,) * 3)}
-    true = Model.assembled(planar_chain(), cell_of((*PLACED, "joint_compliance"), **stiff))
+    true = Model.assembled(planar_chain(), cell_of((*PLACED, "joint_compliance"), **STIFF))
     rng = np.random.default_rng(0)
-    plan = table_at(random_poses(true.chain, 60, 0), [[0, 0, 0], [200, 0, -400]])
+    plan = table_at(random_poses(true.chain, 60, 0), STATES)
     loaded = plan.force.any(axis=1)
     plan = plan.take(np.flatnonzero(loaded == (plan.configuration >= 48)))
     rigid = Model.assembled(true.chain, cell_of(PLACED))

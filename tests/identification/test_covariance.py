@@ -21,8 +21,6 @@ from elastocal.identification.covariance import (
     orthogonal,
 )
 
-KINDS = ("CR0", "CR1", "CR2", "CR3")
-
 
 def hc(B, e, kind):
     return of_rows(cluster_robust(B, e, np.arange(len(e)), f"CR{kind[2]}"), len(e), kind)
@@ -67,8 +65,7 @@ def test_clusters_are_those_of_statsmodels():
     np.testing.assert_allclose(cluster_robust(B, e, cluster, "CR1").matrix, theirs, rtol=1e-8)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_rows_may_come_in_parts(kind):
+def test_rows_may_come_in_parts(kind="CR2"):
     B, e, cluster = problem(6)
     whole, factors = cluster_robust(B, e, cluster, kind), orthogonal(B)
     some = np.isin(cluster, np.unique(cluster)[:3])
@@ -136,7 +133,7 @@ def test_each_parameter_has_its_own_t():
     np.testing.assert_array_equal(found.std, [2.0, 3.0, np.inf])
 
 
-@pytest.mark.parametrize("sizes", [(1.0, 1.0, 1.0), (0.5, 1.0, 2.0), (0.3, 1.0, 4.0)])
+@pytest.mark.parametrize("sizes", [(1.0, 1.0, 1.0), (0.3, 1.0, 4.0)])
 def test_a_mixture_of_models_holds_what_it_says(sizes):
     """Errors that are normal with one of several variances: t with their variance and kurtosis."""
     weights = (0.3, 0.5, 0.2)

@@ -26,12 +26,14 @@ PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
 
 @pytest.fixture(scope="module")
 def result():
-    """A clean, adequate identification with its noise stated."""
+    """A clean, adequate identification with its noise stated: it has no warning."""
     tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
     model = Model.assembled(planar_chain(), cell_of(GEOMETRY, tracker=tracker))
     rng = np.random.default_rng(0)
     plan = table_at(random_poses(model.chain, 40, 0), [[0, 0, 0]])
-    return identify(model, measured(model, plan, true_values(model, rng), SIGMA, rng))
+    found = identify(model, measured(model, plan, true_values(model, rng), SIGMA, rng))
+    assert found.warnings == ()
+    return found
 
 
 def with_noise(result, **changed):

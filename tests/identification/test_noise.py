@@ -1,11 +1,18 @@
-"""Weights: W Σ Wᵀ = I for every way of stating the noise, and what weighting gains."""
+"""Weights: W Σ Wᵀ = I for every way of stating the noise."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import linalg, stats
-from support.calibration import cell_of, measured, planar_chain, table_at, true_values
+from support.calibration import (
+    PLACED,
+    cell_of,
+    measured,
+    planar_chain,
+    table_at,
+    true_values,
+)
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
@@ -15,7 +22,6 @@ from elastocal.identification.options import Options
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.simulation import simulate
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 3e-5])))
@@ -101,25 +107,18 @@ def test_whitens_poses_and_distances():
     assert_whitens(weights_for(observe(table, "distance"), tracker), 16e-10 * np.eye(5))
 
 
-@pytest.mark.parametrize(
-    ("sigma", "tracker", "kind"),
-    [
-        (True, AXIS, "rows"),
-        (True, POLAR, "rows"),
-        (True, Tracker(), "rows"),
-        (False, AXIS, "axis"),
-        (False, POLAR, "polar"),
-        (False, Tracker(), "none"),
-    ],
-)
-def test_auto_takes_the_tables_sigmas_then_the_cells_then_none(sigma, tracker, kind):
-    table = with_sigma(some_table(), "cartesian") if sigma else some_table()
-    weights = weights_for(observe(table, "position"), tracker)
-    assert weights.kind == kind
-    assert weights.absolute == (kind != "none")
-    rows = np.ones(36)
-    if kind == "none":
-        assert weights.whiten is None and weights.apply(rows) is rows
+def test_auto_takes_the_tables_sigmas_then_the_cells_then_none():
+    table, rows = some_table(), np.ones(36)
+    stated = with_sigma(table, "cartesian")
+    for given, tracker, kind in (
+        (stated, AXIS, "rows"),
+        (stated, Tracker(), "rows"),
+        (table, AXIS, "axis"),
+        (table, Tracker(), "none"),
+    ):
+        weights = weights_for(observe(given, "position"), tracker)
+        assert weights.kind == kind and weights.absolute == (kind != "none")
+    assert weights.whiten is None and weights.apply(rows) is rows
 
 
 def test_distances_and_poses_need_their_own_sigma():
@@ -130,28 +129,14 @@ def test_distances_and_poses_need_their_own_sigma():
         weights_for(observe(table, "pose"), AXIS, "axis")
 
 
-# --- what weighting gains -------------------------------------------------------------------
-
-
-def chi2_band(dof, level=1e-3):
-    return stats.chi2.ppf(level / 2, dof), stats.chi2.isf(level / 2, dof)
-
-
-def test_ratio_to_stated_noise():
-    """The stated sigma is true: s² · dof is χ²(dof)."""
+def test_unit_weights_do_not_make_the_stated_noise_forgotten():
+    """20, 20 and 50 µm are stated, 50 µm are true: s² · dof is χ²(dof)."""
     tracker = Tracker(noise=CartesianNoise(np.array([2e-5, 2e-5, 5e-5])))
-    model = Model.assembled(
-        planar_chain(), cell_of(("base_frame", "marker_position"), tracker=tracker)
-    )
+    model = Model.assembled(planar_chain(), cell_of(PLACED, tracker=tracker))
     rng = np.random.default_rng(7)
-    truth = true_values(model, rng)
     plan = table_at(random_poses(model.chain, 30, 7))
-    result = identify(model, simulate(model, plan, truth, rng))
-    low, high = chi2_band(result.dof)
-    assert low < result.noise.ratio_to_stated**2 * result.dof < high
-    assert result.noise.sigma is None
-    unit = identify(model, measured(model, plan, truth, 5e-5, rng), Options(weights="none"))
-    # Unit weights do not make the stated 20, 20, 50 µm forgotten.
+    table = measured(model, plan, true_values(model, rng), 5e-5, rng)
+    unit = identify(model, table, Options(weights="none"))
     assert unit.noise.ratio_to_stated == pytest.approx(np.sqrt((6.25 + 6.25 + 1) / 3), rel=0.2)
-    low, high = chi2_band(unit.dof)
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], unit.dof)
     assert low < (unit.noise.sigma / 50e-6) ** 2 * unit.dof < high

@@ -10,7 +10,6 @@ from scipy import sparse, stats
 from support.calibration import binomial_band, table_at
 
 from elastocal.identification.residuals import (
-    ResidualSummary,
     normal_scores,
     summarise_residuals,
 )
@@ -30,15 +29,9 @@ def noise(observed: Observations, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=len(observed.value))
 
 
-def summary(*arguments: Any, **options: Any) -> ResidualSummary:
-    found = summarise_residuals(*arguments, **options)
-    assert found is not None
-    return found
-
-
 def test_every_value_is_counted_once_in_every_grouping() -> None:
     observed = readings(10)
-    found = summary(observed, noise(observed, 0))
+    found = summarise_residuals(observed, noise(observed, 0))
     assert [g.by for g in found.groupings] == ["component", "marker", "configuration", "load state"]
     for g in found.groupings:
         assert sum(group.n for group in g.groups) == len(observed.value)
@@ -53,7 +46,7 @@ def test_every_value_is_counted_once_in_every_grouping() -> None:
 def test_statistics_are_those_of_scipy() -> None:
     observed = readings(40)
     e = noise(observed, 1)
-    found = summary(observed, e).groupings[0].groups[1]
+    found = summarise_residuals(observed, e).groupings[0].groups[1]
     y = e.reshape(-1, 3)[:, 1]
     assert found.mean_square == pytest.approx(np.mean(y**2))
     assert found.skewness == pytest.approx(stats.skew(y))
@@ -72,7 +65,7 @@ def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
     for _ in range(120):
         e = rng.normal(size=96)
         e -= Q @ (Q.T @ e)
-        whole = summary(observed, e, h).whole
+        whole = summarise_residuals(observed, e, h).whole
         p.append(whole.p)
         below += whole.p < 0.05
     low, high = binomial_band(120, 0.05)
@@ -84,16 +77,16 @@ def test_a_group_that_scatters_more_is_named_and_clean_tables_name_none() -> Non
     observed = readings(12)
     wrong = 0
     for seed in range(80):
-        wrong += bool(summary(observed, noise(observed, seed)).deviating)
+        wrong += bool(summarise_residuals(observed, noise(observed, seed)).deviating)
     assert wrong <= binomial_band(80, 0.05)[1]  # Holm: at most 5 % of clean tables
     e = noise(observed, 7)
     e[np.repeat(observed.configuration, 3) == 4] *= 3
-    assert [(by, g.name) for by, g in summary(observed, e).deviating][:1] == [
+    assert [(by, g.name) for by, g in summarise_residuals(observed, e).deviating][:1] == [
         ("configuration", "5")
     ]
     quiet = noise(observed, 7)
     quiet.reshape(-1, 3)[:, 2] *= 0.3
-    found = dict((g.name, g) for _, g in summary(observed, quiet).deviating)
+    found = dict((g.name, g) for _, g in summarise_residuals(observed, quiet).deviating)
     assert found["z"].mean_square < 1
 
 
