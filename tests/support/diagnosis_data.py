@@ -90,16 +90,6 @@ FAULTS = {
             "tracker",
             {"azimuth_sin": 5e-5, "azimuth_cos": -4e-5, "elevation_sin": 5e-5},
         ),
-        # The anchor stands 120° about the joint from where the example has it.
-        Fault(
-            "gravity_compensator",
-            "joint2",
-            {
-                "compensator_stiffness": 8e4,
-                "compensator_anchor_x": -0.447,
-                "compensator_anchor_y": 0.534,
-            },
-        ),
         Fault(
             "thermal_expansion",
             "link2",
