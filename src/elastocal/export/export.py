@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.export import exportable, mjcf_file, rigid_files
 from elastocal.export.exportable import (
     Cost,
@@ -25,17 +25,18 @@ from elastocal.export.exportable import (
     Refit,
     refitted,
 )
-from elastocal.export.mjcf_file import HeldArm, MujocoRest, NotInPlace
+from elastocal.export.mjcf_file import MujocoRest, NotInPlace
 from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import SmoothGroup, smooth_groups
+from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
-from elastocal.units import Array, rpy_from_rotation
+from elastocal.units import Array, microns, rpy_from_rotation
 
 # The parameters as YAML or JSON, to be read by people and by programs of their own.
 
@@ -43,7 +44,9 @@ PARAMETERS = "elastocal/parameters/1"
 KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
 
 
-def _parameters(calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost) -> dict[str, Any]:
+def _parameters(
+    calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost, format: str
+) -> str:  # fmt: skip
     """Everything to be written: estimates, the geometry they make, and that geometry's cost.
 
     Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
@@ -51,7 +54,12 @@ def _parameters(calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost) ->
     """
     chain = pieces.calibrated_chain()
     cell = calibrated.model.cell
-    return {
+
+    def placed(T: Array) -> dict[str, list[float]]:
+        rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
+        return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
+
+    document = {
         "schema": PARAMETERS,
         "robot": chain.name,
         "cell": None if cell.path is None else Path(cell.path).name,
@@ -62,25 +70,23 @@ def _parameters(calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost) ->
             for name, entry in zip(calibrated.model.names, calibrated.entries, strict=True)
         ],
         "geometry": {
-            "tracker_to_base": _placed(pieces.T_tracker_base),
+            "tracker_to_base": placed(pieces.T_tracker_base),
             "joints": [
-                {"name": joint.name, "kind": joint.kind, **_placed(joint.placement),
+                {"name": joint.name, "kind": joint.kind, **placed(joint.placement),
                  "axis": [float(v) for v in joint.axis]}
                 for joint in chain.joints
             ],
-            "flange": _placed(chain.flange_placement),
-            "markers": {name: _placed(T) for name, T in pieces.markers.items()},
+            "flange": placed(chain.flange_placement),
+            "markers": {name: placed(T) for name, T in pieces.markers.items()},
             "load_point_m": [float(v) for v in pieces.load_point],
         },
         "geometry_alone": cost.to_json(),
     }  # fmt: skip
+    if format == "json":
+        return json_text(document) + "\n"
+    import yaml
 
-
-def _placed(T: Array) -> dict[str, list[float]]:
-    return {
-        "xyz_m": [float(v) + 0.0 for v in T[:3, 3]],
-        "rpy_rad": [v + 0.0 for v in rpy_from_rotation(T[:3, :3])],
-    }
+    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf))
 
 
 # Smooth functions as a table: what no format of geometry holds, for controllers of one's own.
@@ -94,7 +100,7 @@ FEWEST, MOST = 21, 5001
 MICRO = {"rad": "urad", "m": "um"}
 
 
-def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
+def _corrections(calibrated: CalibratedArm, wish: Wish, kept: Kept, _: ExportNumbers) -> Written:
     """Every smooth function over its range, with the half width of its 95 % band.
 
     A row says by how much (urad or um) the place has moved beyond its commanded or identified
@@ -110,7 +116,7 @@ def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
             f"{calibrated.source}: this arm has no smooth function to be written as corrections; "
             "elastocal diagnose finds those that the readings show"
         )
-    return csv_text(CORRECTIONS_HEADER, rows, [note])
+    return Written(csv_text(CORRECTIONS_HEADER, rows, [_note(calibrated, kept)]))
 
 
 def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:
@@ -216,17 +222,13 @@ class Exported(Written):
     correction: JointCorrection = field(default_factory=lambda: JointCorrection(()))
 
     def to_json(self) -> dict[str, Any]:
-
-        def um(metres: float | None) -> float | None:
-            return None if metres is None else metres * 1e6
-
         return {
             "schema": SCHEMA,
             "format": self.format,
             "cannot_hold": self.cost.to_json(),
             "refit": None if self.refit is None else self.refit.to_json(),
-            "read_back": {"with": self.checked_with, "max_um": um(self.checked)},
-            "without_beta_max_um": um(self.without_beta),
+            "read_back": {"with": self.checked_with, "max_um": microns(self.checked)},
+            "without_beta_max_um": microns(self.without_beta),
             "held": self.held,
             "of_the_measurement": list(self.of_the_measurement),
             "warnings": list(self.warnings),
@@ -242,9 +244,19 @@ def export(
     where no random pose has an equilibrium under the load, and ElastocalError where the text,
     read back, is another arm than the model.
     """
-    _check_options(calibrated, wish)
+    for asked, given, formats in (
+        (option("base_frame"), wish.base_frame, FRAMED),
+        (option("joint_correction"), wish.correct_joints, FITTED),
+    ):
+        if given and wish.format not in formats:
+            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.format}")
     # The visits measured, where they are known, count under the load that was asked for.
     visits, conditions = calibrated.visits, wish.conditions
+    require(
+        visits is not None or not wish.correct_joints,
+        f"{calibrated.source} does not say where the arm was measured, which "
+        f"{option('joint_correction')} needs; identify anew",
+    )
     if visits is not None and (wish.load_stated or conditions.force.any()):
         visits = replace(visits, force=np.broadcast_to(conditions.force, visits.force.shape))
     conditions = replace(conditions, visits=visits)
@@ -260,13 +272,7 @@ def export(
     if wish.format in WRITERS:
         found = WRITERS[wish.format](calibrated, wish, kept, pieces)
     else:
-        document = _parameters(calibrated, pieces, cost)
-        text = json_text(document) + "\n"
-        if wish.format == "yaml":
-            import yaml
-
-            text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
-        found = Written(text)
+        found = Written(_parameters(calibrated, pieces, cost, wish.format))
     if found.checked is not None and not np.isfinite(found.checked):
         raise InsufficientDataError(
             f"{calibrated.source}: its corrections are larger than a file of a robot can hold; "
@@ -286,20 +292,6 @@ def export(
         refit=refit,
         correction=correction,
     )  # fmt: skip
-
-
-def _check_options(calibrated: CalibratedArm, wish: Wish) -> None:
-    for asked, given, formats in (
-        (option("base_frame"), wish.base_frame, FRAMED),
-        (option("joint_correction"), wish.correct_joints, FITTED),
-    ):
-        if given and wish.format not in formats:
-            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.format}")
-    if wish.correct_joints and calibrated.visits is None:
-        raise InputError(
-            f"{calibrated.source} does not say where the arm was measured, which "
-            f"{option('joint_correction')} needs; identify anew"
-        )
 
 
 def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
@@ -346,13 +338,11 @@ POSES_AT_REST = 20
 CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
 
 
-def _apart(found: Array, expected: Array, largest: float | None = LARGEST) -> float:
+def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
     """Largest distance in m between flanges (n, 4, 4), of origin and points on the axes, so that
-    orientations count.  Raises ElastocalError where it is more than `largest` (None: any will do).
-    """
+    orientations count.  Raises ElastocalError where it is more than `largest`."""
     apart = (found - expected)[:, :3] @ CORNERS
-    worst = float(np.linalg.norm(apart, axis=1).max())
-    return worst if largest is None else _accepted(worst, largest)
+    return _accepted(float(np.linalg.norm(apart, axis=1).max()), largest)
 
 
 def _accepted(distance: float, largest: float) -> float:
@@ -372,12 +362,9 @@ def _read_back(text: str, ending: str, read: Callable[[Path], Chain]) -> Chain:
 
 
 def _check_rest(
-    at_rest: Callable[[Array, Array], Array],
-    pieces: ExportNumbers,
-    kept: Kept,
-    T_world_base: Array,
-    seed: int,
-) -> float:
+    at_rest: Callable[[Array, Array], Array], pieces: ExportNumbers, kept: Kept,
+    T_world_base: Array, seed: int,
+) -> float:  # fmt: skip
     """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
 
     `at_rest`: `pieces.points` (k, 3) in the MJCF's world by commanded joints and force;
@@ -497,8 +484,14 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
     text, warnings = mjcf_file.corrected_mjcf(
         cell.robot, pieces, wish.frames, _note(calibrated, kept)
     )
-    arm = HeldArm(text, cell.robot, pieces)
-    distance = _check_rest(arm, pieces, kept, arm.T_world_base, wish.seed)
+    robot, added = cell.robot, mjcf_file.FLANGE
+    assert robot.mjcf is not None
+    flange = added if f'name="{added}"' in text else robot.flange
+    arm = MjcfArm.read(robot.mjcf, robot.base, flange, text)
+    if not pieces.masses:
+        arm.model.opt.gravity[:] = 0.0
+    at_rest = partial(MujocoRest(text, arm).points, pieces=pieces)
+    distance = _check_rest(at_rest, pieces, kept, arm.tree.placed(arm.base), wish.seed)
     if pieces.yielding and not pieces.masses:
         warnings.append(
             "the links weigh in this file and did not in the model that was identified: their "
@@ -511,8 +504,7 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
             "the springs stand in series with the joints: hold those by stiff actuators, whose "
             "own error would come on top"
         )
-    assert cell.robot.mjcf is not None
-    text, told = rigid_files.moved(cell.robot.mjcf, text, wish.folder)
+    text, told = rigid_files.moved(robot.mjcf, text, wish.folder)
     return Written(text, distance, "MuJoCo, at rest under the load", (*warnings, *told))
 
 
@@ -540,7 +532,7 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
     expected = nominal_flanges(pieces.calibrated_chain(), q)
 
-    def checked(text: str, largest: float | None = LARGEST) -> float:
+    def checked(text: str, largest: float = LARGEST) -> float:
         back = _read_back(text, ".csv", partial(read_dh, convention=convention))
         return _apart(nominal_flanges(back, q), expected, largest)
 
@@ -550,19 +542,12 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
         f"rounding of this table: {apart * 1e6:.2g} um at the flange",
     ]
     if any(line.row.beta for line in lines):
-        beta = checked(rigid_files.dh_csv(rigid_files.without_beta(lines)), largest=None)
+        four = [replace(line, row=replace(line.row, beta=0.0)) for line in lines]
+        beta = checked(rigid_files.dh_csv(four), largest=np.inf)
         comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
     text = rigid_files.dh_csv(lines, comments)
     checked(text)
     return Written(text, apart, "elastocal's own reader of DH tables", (), beta)
 
 
-def _corrections(
-    calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
-) -> Written:
-    return Written(corrections_csv(calibrated, _note(calibrated, kept)))
-
-
-WRITERS = {
-    "urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh, "corrections": _corrections,
-}  # fmt: skip
+WRITERS = {"urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh, "corrections": _corrections}

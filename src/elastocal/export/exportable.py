@@ -42,7 +42,7 @@ from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
-from elastocal.units import Array, rpy_from_rotation
+from elastocal.units import Array, microns, rpy_from_rotation
 
 
 def numbers(values: ArrayLike) -> str:
@@ -399,9 +399,7 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
         return Difference(*(float(v) for both in sizes for v in both))
 
     effects = [
-        o
-        if o.without is None
-        else replace(o, difference=apart(points_of(o.without, table, markers)))
+        replace(o, difference=apart(points_of(o.without, table, markers))) if o.without else o
         for o in kept.omissions
     ]
     effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
@@ -566,12 +564,9 @@ class Refit:
 
     def to_json(self) -> dict[str, Any]:
         sizes = {"before": self.before, "after": self.after, "nominal": self.nominal}
-        told = {f"marker_rms_{name}_um": size * 1e6 for name, size in sizes.items()}
-        corrected = None if self.correction is None else self.correction * 1e6
-        return {
-            "taken": self.taken, **told, "marker_rms_with_correction_um": corrected,
-            "poses": self.poses, "visits": self.visits,
-        }  # fmt: skip
+        sizes |= {"with_correction": self.correction}
+        told = {f"marker_rms_{name}_um": microns(size) for name, size in sizes.items()}
+        return {"taken": self.taken, **told, "poses": self.poses, "visits": self.visits}
 
 
 def refitted(
@@ -678,20 +673,7 @@ def _fitted(
         own = [c for c in part.model.cell.model.effects if effect_of(c.name).stage != "tool"]
         free = _with(part, own, Tool(part.model.cell.tool.load_point, places))
     target = points_of(kept.full, table, np.array(list(places.values())))
-    assert kept.conditions.visits is not None
-    measured = kept.conditions.visits.q if correct else None
-    x, correction = _least_squares(free, table, target, start, geometry, measured)
-    values = part.values | dict(zip(free.model.names, x, strict=True))
-    return replace(part, x=np.array([values[n] for n in part.model.names])), correction
-
-
-def _least_squares(
-    part: Valued, table: Measurements, target: Array, start: JointCorrection, geometry: bool,
-    measured: Array | None,
-) -> tuple[Array, JointCorrection]:  # fmt: skip
-    """Values (parameters,) that put the markers closest to `target` (poses, markers, 3), and the
-    correction, fitted with curves over the poses `measured` where they are given."""
-    model, x, names = part.model, part.x.copy(), tuple(part.model.cell.tool.markers)
+    model, x, names = free.model, free.x.copy(), tuple(free.model.cell.tool.markers)
     settled = np.isfinite(target).all(axis=(1, 2))
     settled &= np.isfinite(model.flange_poses(_commanded(table, start), x)).all(axis=(1, 2))
     poses = np.flatnonzero(settled)
@@ -700,41 +682,38 @@ def _least_squares(
     rows = replace(rows, marker=marker, marker_names=names, position=np.zeros((len(marker), 3)))
     effects = [p.effect for p in model.parameters]
     yields = [effect_of(e).registered or effect_of(e).elastic for e in effects]
-    free = [k for k, e in enumerate(effects) if (geometry if e in GEOMETRY else yields[k])]
-    turns = [k for k, e in enumerate(effects) if e == JointOffset.name]
-    curves = None if measured is None else _Curves(rows, measured)
-    asked = np.array(sorted({*free, *(turns if curves else ())}), dtype=np.int64)
+    fit = [k for k, e in enumerate(effects) if (geometry if e in GEOMETRY else yields[k])]
+    turns = [k for k, e in enumerate(effects) if e == JointOffset.name and correct]
+    assert kept.conditions.visits is not None
+    curves = _Curves(rows, kept.conditions.visits.q) if correct else None
+    asked = np.array(sorted({*fit, *turns}), dtype=np.int64)
     size = curves.count if curves else 0
-    least = np.full(len(free) + size, -np.inf)
-    least[: len(free)] = [
-        -np.inf if (p := model.parameters[k]).lower is None else p.lower for k in free
-    ]
-    u = np.concatenate([x[free], np.zeros(size)])
-    first, sizes = u.copy(), np.zeros(0)
+    lower = [model.parameters[k].lower for k in fit]
+    least = np.array([*(-np.inf if low is None else low for low in lower), *[-np.inf] * size])
+    u = np.concatenate([x[fit], np.zeros(size)])
+    first, sizes, correction = u.copy(), np.zeros(0), start
     for _ in range(STEPS):
-        correction = start if curves is None else curves.correction(start, u[len(free) :])
         regression = model.regressor(_commanded(rows, correction), x, asked)
-        B, r = regression.B[:, np.searchsorted(asked, free)], target[settled].ravel()
+        B, r = regression.B[:, np.searchsorted(asked, fit)], target[settled].ravel()
         r = r - regression.prediction
         if not sizes.size:
             whole = np.zeros((len(r), len(x)))
-            whole[:, free] = B
-            sizes = np.concatenate([model.sizes(whole)[free], np.full(size, SLOPPY)])
+            whole[:, fit] = B
+            sizes = np.concatenate([model.sizes(whole)[fit], np.full(size, SLOPPY)])
         if curves is not None:
             B = np.hstack([B, curves.columns(regression.B[:, np.searchsorted(asked, turns)])])
         sigma = max(float(np.sqrt(np.mean(r**2))), SMALLEST)
-        u = u + _step(B / sigma, r / sigma, sizes, u - first, least - u)
-        x[free] = u[: len(free)]
-    return x, start if curves is None else curves.correction(start, u[len(free) :])
-
-
-def _step(B: Array, r: Array, size: Array, away: Array, least: Array) -> Array:
-    """The step d that minimises |B d − r|² + Σ ((d + away) / size)², no less than `least`: a spring
-    that would yield the wrong way is rigid."""
-    A = np.vstack([B * size, np.eye(len(size))])
-    b = np.concatenate([r, -away / size])
-    found = lsq_linear(A, b, (least / size, np.inf), method="bvls")
-    return np.where(found.active_mask < 0, least, found.x * size)  # at its bound to the last bit
+        # The step d that minimises |B d − r|²/σ² + Σ ((d + u − first) / size)², with u + d no less
+        # than `least`: a spring that would yield the wrong way is rigid.
+        A = np.vstack([B / sigma * sizes, np.eye(len(sizes))])
+        b = np.concatenate([r / sigma, (first - u) / sizes])
+        step = lsq_linear(A, b, ((least - u) / sizes, np.inf), method="bvls")
+        # At its bound to the last bit.
+        u = u + np.where(step.active_mask < 0, least - u, step.x * sizes)
+        x[fit] = u[: len(fit)]
+        correction = start if curves is None else curves.correction(start, u[len(fit) :])
+    values = part.values | dict(zip(model.names, x, strict=True))
+    return replace(part, x=np.array([values[n] for n in part.model.names])), correction
 
 
 class _Curves:

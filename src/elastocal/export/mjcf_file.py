@@ -229,55 +229,70 @@ TOLERANCE, AT_REST = 1e-13, 1e-10  # rad or m: last step, and what may be left
 
 
 class MujocoRest:
-    def __init__(self, text: str) -> None:
-        mujoco = import_mujoco("the check")
-        try:
-            self.model = mujoco.MjModel.from_xml_string(text)
-        except ValueError as error:
-            raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
-        joint, kinds = mujoco.mjtTrn.mjTRN_JOINT, self.model.actuator_trntype
-        self._drives = [k for k in range(self.model.nu) if kinds[k] == joint]
-        self._driven = self.model.actuator_trnid[self._drives, 0]
-        stiffness = joint_stiffness(self.model)
-        stiffness[self._driven] = self.model.actuator_gainprm[self._drives, 0]
-        self._rest = Rest(self.model, np.arange(self.model.njnt), stiffness)
+    """A written arm in MuJoCo: a new file, whose joints its actuators drive, or the user's own as
+    it is read back (`arm`), whose joints are held where they are commanded, its springs at rest.
+
+    Of the user's own, joints beside the chain stay where they stand and only the springs move, so
+    what the file has besides to be seen or to move it plays no part.
+    """
+
+    def __init__(self, text: str, arm: MjcfArm | None = None) -> None:
+        self._mujoco = mujoco = import_mujoco("the check")
+        self._arm, self._drives = arm, np.zeros(0, dtype=int)
+        if arm is None:
+            try:
+                model = mujoco.MjModel.from_xml_string(text)
+            except ValueError as error:
+                raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
+            self._drives = np.flatnonzero(model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+            commanded, yielding = model.actuator_trnid[self._drives, 0], np.arange(model.njnt)
+        else:
+            model, commanded = arm.model, np.array(arm.joints)
+            # No contacts are sought: nothing touches a spring.
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
+            names = [model.joint(j).name for j in range(model.njnt)]
+            yielding = np.array([j for j, n in enumerate(names) if n.startswith(SPRING)], dtype=int)
+        self.model, self._data = model, mujoco.MjData(model)
+        # Newer MuJoCo states more of a joint's spring than the linear term.
+        stiffness = np.array(model.jnt_stiffness, dtype=float).reshape(model.njnt, -1)[:, 0]
+        stiffness[commanded[: len(self._drives)]] = model.actuator_gainprm[self._drives, 0]
+        self._compliance, self._dofs = 1.0 / stiffness[yielding], model.jnt_dofadr[yielding]
+        self._commanded, self._at = model.jnt_qposadr[commanded], model.jnt_qposadr[yielding]
 
     def sites(self, q: Array, force: Array, names: Sequence[str]) -> Array:
-        """Positions (len(names), 3) in m in the MJCF's world, at rest: commanded to q (n,) under
+        """Positions (len(names), 3) in m in a new file's world, at rest: commanded to q (n,) under
         `force` (3,) N.
 
         Raises ElastocalError where no rest is found.
         """
-        control = np.zeros(self.model.nu)
-        control[self._drives] = q
+        self._data.ctrl[self._drives] = q
         for axis, value in zip("xyz", force, strict=True):
-            control[self.model.actuator(f"load_{axis}").id] = value
-        self._rest.data.ctrl[:] = control
-        x = np.zeros(self.model.nv)
-        x[self._driven] = q
-        self._rest.settle(x, q)
-        return np.array([self._rest.data.site(name).xpos.copy() for name in names])
+            self._data.ctrl[self.model.actuator(f"load_{axis}").id] = value
+        self._settle(q, lambda: 0.0)
+        return np.array([self._data.site(name).xpos.copy() for name in names])
 
+    def points(self, q: Array, force: Array, pieces: ExportNumbers) -> Array:
+        """Positions (k, 3) of `pieces.points` in the world of the user's file, the same; `force` in
+        the tracker's axes."""
+        arm, data = self._arm, self._data
+        assert arm is not None
+        R = arm.tree.placed(arm.base)[:3, :3] @ pieces.T_tracker_base[:3, :3].T
+        load, flange = pieces.load_scale * R @ force, arm.flange_body
 
-def joint_stiffness(model: Any) -> Array:
-    """(joints,) N m/rad or N/m; newer MuJoCo states more than the linear term."""
-    return np.array(model.jnt_stiffness, dtype=float).reshape(model.njnt, -1)[:, 0]
+        def placed(points: Array) -> Array:
+            T = transform(data.xpos[flange], data.xquat[flange]) @ arm.flange_in_body
+            return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
+        def applied() -> Array:
+            found, at = np.zeros(self.model.nv), placed(pieces.load_point)
+            self._mujoco.mj_applyFT(self.model, data, load, np.zeros(3), at, flange, found)
+            return found
 
-class Rest:
-    """A model in MuJoCo in which the `springs`, numbers of joints, yield by their `stiffness`."""
+        self._settle(q, applied)
+        return placed(pieces.points)
 
-    def __init__(self, model: Any, springs: Any, stiffness: Array) -> None:
-        self.model, self.data = model, import_mujoco().MjData(model)
-        self._at, self._dofs = model.jnt_qposadr[springs], model.jnt_dofadr[springs]
-        self._compliance = 1.0 / stiffness
-
-    def settle(self, x: Array, q: Array, load: Callable[[], Any] = lambda: 0.0) -> None:
-        """Let the springs come to rest, from x on, under what actuators and `load` make.
-
-        Raises ElastocalError, which names the commanded q, where there is no such place.
-        """
-        mujoco, model, data = import_mujoco(), self.model, self.data
+    def _settle(self, q: Array, load: Callable[[], Any]) -> None:
+        mujoco, model, data = self._mujoco, self.model, self._data
 
         def residual(x: Array) -> Array:
             data.qpos[self._at] = x
@@ -287,7 +302,9 @@ class Rest:
             force = data.qfrc_passive + data.qfrc_actuator + load() - data.qfrc_bias
             return np.asarray(self._compliance * force[self._dofs])
 
-        found = root(residual, x, tol=TOLERANCE)
+        data.qpos[:] = model.qpos0
+        data.qpos[self._commanded] = q
+        found = root(residual, data.qpos[self._at], tol=TOLERANCE)
         if not (np.abs(residual(found.x)) <= AT_REST).all():
             raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
 
@@ -547,48 +564,3 @@ class _MjcfText(XmlFile):
 def _pose(T: Array) -> dict[str, str]:
     placed = placed_body("", T)
     return {name: placed[name] for name in ("pos", "quat")}
-
-
-class HeldArm:
-    """The written arm in MuJoCo, its joints held where they are commanded, its springs at rest.
-
-    Joints beside the chain stay where they stand; weights act where the model has them.  Only the
-    springs move, so what the file has besides to be seen or to move it plays no part.
-    """
-
-    def __init__(self, text: str, robot: Robot, pieces: ExportNumbers) -> None:
-        assert robot.mjcf is not None
-        flange = FLANGE if f'name="{FLANGE}"' in text else robot.flange
-        self._arm = arm = MjcfArm.read(robot.mjcf, robot.base, flange, text)
-        self._pieces, self._mujoco, model = pieces, import_mujoco(), arm.model
-        if not pieces.masses:
-            model.opt.gravity[:] = 0.0
-        # No contacts are sought: nothing touches a spring.
-        model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        springs = [j for j in range(model.njnt) if model.joint(j).name.startswith(SPRING)]
-        self._springs = len(springs)
-        self._rest = Rest(model, springs, joint_stiffness(model)[springs])
-        self._held = model.jnt_qposadr[arm.joints]
-        self.T_world_base = arm.tree.placed(arm.base)
-
-    def __call__(self, q: Array, force: Array) -> Array:
-        """Positions (k, 3) of `pieces.points` in the file's world: commanded to q (n,), under
-        `force` (3,) N in the tracker's axes.  Raises ElastocalError where no rest is found."""
-        model, data, mujoco = self._arm.model, self._rest.data, self._mujoco
-        pieces, flange = self._pieces, self._arm.flange_body
-        R = self.T_world_base[:3, :3] @ pieces.T_tracker_base[:3, :3].T
-        load = pieces.load_scale * R @ force
-        data.qpos[:] = model.qpos0
-        data.qpos[self._held] = q
-
-        def placed(points: Array) -> Array:
-            T = transform(data.xpos[flange], data.xquat[flange]) @ self._arm.flange_in_body
-            return np.asarray(points @ T[:3, :3].T + T[:3, 3])
-
-        def applied() -> Array:
-            found, at = np.zeros(model.nv), placed(pieces.load_point)
-            mujoco.mj_applyFT(model, data, load, np.zeros(3), at, flange, found)
-            return found
-
-        self._rest.settle(np.zeros(self._springs), q, applied)
-        return placed(pieces.points)

@@ -464,11 +464,6 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     return csv_text(header, rows, comments)
 
 
-def without_beta(lines: Sequence[Line]) -> list[Line]:
-    """The same table with β left out, as programs of four columns read it."""
-    return [replace(line, row=replace(line.row, beta=0.0)) for line in lines]
-
-
 def _decompose(
     chain: Chain, like: Sequence[DhRow | None], keep_last: bool = False
 ) -> tuple[list[DhRow], Array]:

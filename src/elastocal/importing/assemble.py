@@ -7,9 +7,11 @@ cell.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
 from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing import joining, mapping_file
-from elastocal.importing.exports import Records, Understood, joint_stems, read_records
+from elastocal.importing.exports import FORCES, Records, Understood, joint_stems, read_records
 from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import ImportMapping, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import load_chain
-from elastocal.tables import Family, column, csv_text
+from elastocal.tables import Labels, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
 GRAVITY = 9.80665  # m/s², standard
-FORCES = tuple(f"force_{axis}" for axis in "xyz")
 UNLOADED = ("none", "unloaded", "0")
 
 
@@ -48,16 +49,17 @@ def forces_of(
     """
     named = points.texts.get("load")
     if named is None:
-        if loads and not _forces(points.numbers):
-            raise InputError(
-                f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
-                "to; give load in [[source]], or a group (?P<load>…) in a pattern"
-            )
-        return None
-    if told := _forces(points.numbers):
-        raise InputError(
-            f"{points.files[0]}: the load is stated by name and in columns {listed(told)}; keep one"
+        require(
+            not loads or bool(points.forces),
+            f"{where}: [loads] names {listed(loads or ())}, but no file says which load it belongs "
+            "to; give load in [[source]], or a group (?P<load>…) in a pattern",
         )
+        return None
+    require(
+        not points.forces,
+        f"{points.source}: the load is stated by name and in columns {listed(points.forces)}; keep "
+        "one",
+    )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():
         if isinstance(stated, mapping_file.LoadStatesTable):
@@ -73,10 +75,6 @@ def forces_of(
                 f"{name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
             )
     return np.array([known[name] for name in named])
-
-
-def _forces(numbers: Mapping[str, Array]) -> list[str]:
-    return [stem for stem in FORCES if stem in numbers]
 
 
 # A load in a file's name: log_2600N, payload_2p5kg, load2.6kN.  A number that follows a letter is a
@@ -104,7 +102,7 @@ def with_loads_of_names(
     """The records with the loads that their files are named for, where nothing else states any, and
     what to tell.  They hang straight down."""
     made, every = dict(by_role), [r for role in by_role.values() for r in role]
-    if loads or any(r.load or "load" in r.texts or _forces(r.numbers) for r in every):
+    if loads or any(r.load or "load" in r.texts or r.forces for r in every):
         return made, []
     named = {r.source: load_in(Path(r.source).stem) for r in every}
     if not any(named.values()):
@@ -139,7 +137,6 @@ def with_loads_of_names(
 
 
 WHOLE = re.compile(r"-?[0-9]{1,15}")
-LABELS = ("configuration", "repeat", "marker")
 
 
 @dataclass(frozen=True)
@@ -195,8 +192,8 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
             numbers[stem], units[stem] = forces[:, k], "N"
     spread = points.spread(settings.same_pose_deg, settings.same_pose_mm)
     configuration, warnings = _configurations(points, spread)
-    if (stated := _forces(numbers)) and len(stated) < len(FORCES):
-        absent = [stem for stem in FORCES if stem not in stated]
+    stated = [stem for stem in FORCES if stem in numbers]
+    if stated and (absent := [stem for stem in FORCES if stem not in stated]):
         numbers |= dict.fromkeys(absent, np.zeros(n))
         units |= dict.fromkeys(absent, "N")
         warnings.append(f"{listed(absent)} in no column: taken as 0 N beside {listed(stated)}")
@@ -209,8 +206,14 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
         columns["marker"] = marker
     time = numbers.pop("time", None)
     for family in families(kinds).values():
-        if family.name not in LABELS:
-            columns |= _family(where, family, numbers, units)
+        own = {column(s, units[s]): numbers[s] for s in family.units if s in numbers}
+        missing = [stem for stem in family.units if stem not in numbers]
+        if own and missing:
+            raise InputError(
+                f"{where}: {listed(own)} without {listed(missing)}; the table needs all columns of "
+                f"the {family.meaning}: add them to [source.columns]"
+            )
+        columns |= own
     if time is not None:
         columns["time_s"] = np.round(time - time.min(), 6)
     if any(points.names):
@@ -223,23 +226,20 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
 def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str]]:
     names, q = points.texts.get("configuration"), points.q
     if names is None:
-        kinds, inverse = np.unique(q, axis=0, return_inverse=True)
-        first = np.full(len(kinds), len(q))
-        np.minimum.at(first, inverse.ravel(), np.arange(len(q)))
-        order = np.argsort(first)
-        codes = np.empty(len(kinds), dtype=np.int64)
-        codes[order] = joining.groups_alike(kinds[order], spread)
-        return [str(code + 1) for code in codes[inverse.ravel()]], []
-    _, code = np.unique(np.array(names, dtype=object).astype(str), return_inverse=True)
-    low = np.full((code.max() + 1, q.shape[1]), np.inf)
+        known = Labels.of(map(tuple, q.tolist()))
+        _, first = np.unique(known.codes, return_index=True)
+        codes = joining.groups_alike(q[first], spread)
+        return [str(code + 1) for code in codes[known.codes]], []
+    known = Labels.of(names)
+    low = np.full((len(known.names), q.shape[1]), np.inf)
     high = -low
-    np.minimum.at(low, code, q)
-    np.maximum.at(high, code, q)
-    apart = np.any(high - low > spread, axis=1)
-    if not apart.any():
+    np.minimum.at(low, known.codes, q)
+    np.maximum.at(high, known.codes, q)
+    span = high - low
+    which = [known.names[c] for c in np.flatnonzero(np.any(span > spread, axis=1))]
+    if not which:
         return names, []
-    which = list(dict.fromkeys(n for n, c in zip(names, code, strict=True) if apart[c]))
-    worst = float((high - low).max())
+    worst = float(span.max())
     return names, [
         f"{len(which)} configurations have rows whose joint values differ by up to {worst:.3g} "
         f"(in the columns' unit): {listed(which, 8)}; if these are different poses, name them apart"
@@ -247,20 +247,14 @@ def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str
 
 
 def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
-    stated = points.texts.get("repeat")
-    count: dict[tuple, int] = {}
-    known: dict[tuple, int] = {}
-    repeats = np.zeros(len(points), dtype=np.int64)
-    for k, key in enumerate(keys):
-        if stated is None:
-            repeats[k] = count.get(key, 0)
-            count[key] = int(repeats[k]) + 1
-            continue
-        text = stated[k]
+    stated, known = points.texts.get("repeat"), dict[tuple, int]()
+    if stated is None:
+        number = defaultdict[tuple, Iterator[int]](count)
+        return np.array([next(number[key]) for key in keys], dtype=np.int64)
+    for k, (text, key) in enumerate(zip(stated, keys, strict=True)):
         if not WHOLE.fullmatch(text):
             raise InputError(f"{points.where(k)}: repeat {quoted(text)} is no whole number; "
                              "correct the pattern or the column")  # fmt: skip
-        repeats[k] = int(text)
         first = known.setdefault((*key, int(text)), k)
         if first != k:
             raise InputError(
@@ -269,20 +263,7 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
                 f"{points.line[first]} too; leave the repeat out of the pattern to have "
                 "shots numbered in order"
             )
-    return repeats
-
-
-def _family(
-    where: str, family: Family, numbers: dict[str, Array], units: dict[str, str]
-) -> dict[str, Array]:
-    columns = {column(s, units[s]): numbers[s] for s in family.units if s in numbers}
-    missing = [stem for stem in family.units if stem not in numbers]
-    if columns and missing:
-        raise InputError(
-            f"{where}: {listed(columns)} without {listed(missing)}; the table needs all columns of "
-            f"the {family.meaning}: add them to [source.columns]"
-        )
-    return columns
+    return np.array([int(text) for text in stated], dtype=np.int64)
 
 
 def table_text(made: Assembled) -> str:

@@ -29,23 +29,20 @@ from elastocal.importing.mapping_file import (
 )
 from elastocal.tables import MAX_LINE, NUMBER, column, first_bad_cell
 from elastocal.text import quoted
-from elastocal.units import Array, IntArray, convert, known_unit, quantities
+from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
 
 MAX_BYTES = 300_000_000
 SAVE_AS = "set encoding in [source.text], or export as UTF-8"
 _MARKS = (
-    (codecs.BOM_UTF8, "utf-8-sig", "UTF-8"),
-    (codecs.BOM_UTF16_LE, "utf-16", "UTF-16"),
-    (codecs.BOM_UTF16_BE, "utf-16", "UTF-16"),
-)
+    (codecs.BOM_UTF8, "UTF-8"), (codecs.BOM_UTF16_LE, "UTF-16"), (codecs.BOM_UTF16_BE, "UTF-16"),
+)  # fmt: skip
 _BINARY = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0", b"PAR1", b"%PDF", b"#ROSBAG", b"SQLite format 3")
 DELIMITER_NAMES = {"tab": "\t", ";": ";", ",": ",", "space": " "}
 SAMPLE = 200  # lines that decide on the delimiter, and in which a header is looked for
 SHOWN = 120
 
-# Whether the cells of a line are the header that a mapping asks for, or numbers where it has them.
-Judge = Callable[[Sequence[str]], bool]
 Line = tuple[int, list[str]]  # its number and cells
+Header = tuple[str, int, tuple[str, ...]]  # the delimiter, the line (0: there is none) and cells
 
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"
@@ -81,12 +78,10 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
 
 
 def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
-    if encoding != "auto":
-        codec = "utf-8-sig" if encoding == "utf-8" else encoding
-        return decoded(source, data, SAVE_AS, codec, encoding), encoding
-    for mark, codec, name in _MARKS:
-        if data.startswith(mark):
-            return decoded(source, data, SAVE_AS, codec, name), name
+    marked = (name for mark, name in _MARKS if encoding == "auto" and data.startswith(mark))
+    if (name := next(marked, encoding)) != "auto":
+        codec = "utf-8-sig" if name.lower() == "utf-8" else name
+        return decoded(source, data, SAVE_AS, codec, name), name
     plain = "ASCII" if data.isascii() else "UTF-8"
     for codec, name in (("utf-8", plain), ("cp1252", "Windows-1252")):
         with suppress(UnicodeDecodeError):
@@ -113,9 +108,8 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
     try:
         return re.compile(pattern)
     except re.error as error:
-        raise InputError(
-            f"{where}: {key} = {quoted(pattern)} is no regular expression: {error}"
-        ) from None
+        told = f"{where}: {key} = {quoted(pattern)} is no regular expression: {error}"
+        raise InputError(told) from None
 
 
 PATIENCE = 2.0  # s of processor time; a letter and a text have theirs beside it
@@ -172,16 +166,22 @@ class Rows:
 
 
 def table_rows(
-    source: str, lines: list[str], settings: TextSourceKeys, is_header: Judge | None,
-    is_data: Judge,
-) -> Rows:  # fmt: skip
+    source: str, lines: list[str], settings: TextSourceKeys, asked: Sequence[ColumnKey]
+) -> Rows:
     """The rows of a delimited table.
 
-    `is_header` recognises the header where columns are asked for by name; without it the table
-    begins at the first line that `is_data`, and the line before it is its header if it has as many
-    cells.  Lines above the table, repeated headers and lines that match `ignore` are passed over
-    and listed.
+    Where columns are asked for by name the header is the line that has them; else the table begins
+    at the first line with numbers where they are asked for, and the line before it is its header if
+    it has as many cells.  Lines above the table, repeated headers and lines that match `ignore` are
+    passed over and listed.
     """
+    guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
+    places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
+
+    def is_data(cells: Sequence[str]) -> bool:
+        return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
+
+    named = mapping_file.by_name(asked)
     marks = tuple(settings.comments or ())
     skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
@@ -196,17 +196,18 @@ def table_rows(
                 content.append((number, line))
     if not content:
         raise InputError(f"{source}: only comments and blank lines; export the points again")
-    if is_header is not None:
-        delimiter, header_line, header = _named_header(
-            source, settings, content, comments, is_header
-        )
-    else:
-        delimiter = settings.delimiter or "auto"
-        delimiter = _by_numbers(content)[0] if delimiter == "auto" else delimiter
-        header_line, header = _unnamed_header(source, delimiter, content, is_data)
+    chosen: str = settings.delimiter or "auto"
+    tried = _by_numbers(content) if chosen == "auto" else [chosen]
+    # Some write the names of the columns as a comment.
+    mark = re.compile("".join(f"(?:{re.escape(m)})?" for m in sorted(marks, key=len, reverse=True)))
+    bare = [(number, mark.sub("", line, count=1)) for number, line in comments[:SAMPLE]]
+    delimiter, header_line, header = (
+        _named_header(source, tried, [*content[:SAMPLE], *bare], asked)
+        if named else _unnamed_header(source, tried[0], content, is_data)
+    )  # fmt: skip
     rows: list[Line] = []
     for number, cells in _split(source, delimiter, content):
-        if is_header is None and header_line == 0 and not rows and not is_data(cells):
+        if not named and header_line == 0 and not rows and not is_data(cells):
             ignored.append((number, "stands above the first reading"))
         elif number < header_line:
             ignored.append((number, "stands above the header"))
@@ -218,6 +219,8 @@ def table_rows(
             rows.append((number, cells))
     if not rows:
         raise InputError(f"{source}: a header but no readings below it; export the points")
+    if named and not header_line:
+        raise mapping_file.no_header(source, asked, rows[:SAMPLE])
     told = tuple(line for _, line in comments)
     return Rows(header, rows, ignored, header_line, delimiter, told)
 
@@ -254,40 +257,30 @@ def _by_numbers(content: list[tuple[int, str]]) -> list[str]:
 
 
 def _named_header(
-    source: str, settings: TextSourceKeys, content: list[tuple[int, str]],
-    comments: list[tuple[int, str]], is_header: Judge,
-) -> tuple[str, int, tuple[str, ...]]:  # fmt: skip
-    """The delimiter with which a line is the header, that line's number (0: none is) and cells."""
-    # Some write the names of the columns as a comment.
-    marks = sorted(settings.comments or (), key=len, reverse=True)
-    bare = []
-    for number, line in comments[:SAMPLE]:
-        for mark in marks:
-            line = line.removeprefix(mark)
-        bare.append((number, line))
-    chosen: str = settings.delimiter or "auto"
-    tried = _by_numbers(content) if chosen == "auto" else [chosen]
+    source: str, tried: Sequence[str], lines: list[tuple[int, str]], asked: Sequence[ColumnKey]
+) -> Header:
     for delimiter in tried:
         try:
-            for one in [*content[:SAMPLE], *bare]:
+            for one in lines:
                 ((number, cells),) = _split(source, delimiter, [one])
                 header = tuple(cell.strip() for cell in cells)
-                if is_header(header):
+                if not mapping_file.lacking(asked, header):
                     return delimiter, number, header
         except InputError:  # quotation marks that do not match with this one
-            if chosen != "auto":
+            if len(tried) == 1:
                 raise
     return tried[0], 0, ()
 
 
 def _unnamed_header(
-    source: str, delimiter: str, content: list[tuple[int, str]], is_data: Judge
-) -> tuple[int, tuple[str, ...]]:
+    source: str, delimiter: str, content: list[tuple[int, str]],
+    is_data: Callable[[Sequence[str]], bool],
+) -> Header:  # fmt: skip
     before: Line = 0, []
     for number, cells in _split(source, delimiter, content[:SAMPLE]):
         if is_data(cells):
-            alike = len(before[1]) == len(cells)
-            return (before[0], tuple(cell.strip() for cell in before[1])) if alike else (0, ())
+            known = before if len(before[1]) == len(cells) else (0, [])
+            return delimiter, known[0], tuple(cell.strip() for cell in known[1])
         before = number, cells
     number, line = content[0]
     raise InputError(
@@ -364,13 +357,11 @@ def seconds_of(
     """
     chosen, found = [*formats, ISO], list[float]()
     for line, text in zip(lines, texts, strict=True):
+        t = " ".join(text.split())
         for form in chosen:
             with suppress(ValueError, OverflowError):
-                bare = " ".join(text.split())
-                moment = (
-                    datetime.fromisoformat(bare) if form == ISO else datetime.strptime(bare, form)
-                )
-                found.append((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp())
+                read = datetime.fromisoformat(t) if form == ISO else datetime.strptime(t, form)
+                found.append((read if read.tzinfo else read.replace(tzinfo=UTC)).timestamp())
                 chosen = [form]
                 break
         else:
@@ -432,10 +423,9 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
             "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
-    header = ("name", *axes)
-    used = [i for i in range(len(header)) if i == 0 or any(cells[i] for _, cells in rows)]
+    used = [0, *(i for i in range(1, len(axes) + 1) if any(cells[i] for _, cells in rows))]
     rows = [(line, [cells[i] for i in used]) for line, cells in rows]
-    return Rows(tuple(header[i] for i in used), rows, ignored, split_at=kind.upper())
+    return Rows(tuple(("name", *axes)[i] for i in used), rows, ignored, split_at=kind.upper())
 
 
 # Offset into the text, name, and the values by axis or why there are none.
@@ -479,6 +469,7 @@ def _rapid(whole: str) -> Found:
 
 # Rows of a file as the mapping reads them.
 
+FORCES = tuple(f"force_{axis}" for axis in "xyz")
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
 UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are sizes
@@ -535,6 +526,10 @@ class Records:
     def where(self, i: int) -> str:
         return f"{self.files[self.file[i]]}, line {self.line[i]}"
 
+    @property
+    def forces(self) -> list[str]:
+        return [stem for stem in FORCES if stem in self.numbers]
+
     def shown(self, i: int) -> str:
         """Row i for a list in a message: its name and line."""
         name = self.names[i]
@@ -551,13 +546,10 @@ class Records:
         stems = joint_stems(self.numbers)
         return np.column_stack([np.zeros((len(self), 0)), *(self.numbers[s] for s in stems)])
 
-    @property
-    def q_units(self) -> tuple[str, ...]:
-        return tuple(self.units[stem] for stem in joint_stems(self.numbers))
-
     def spread(self, deg: float, mm: float) -> Array:
         """(joints,) these tolerances in the unit of each joint."""
-        return np.array([deg if unit == "deg" else mm for unit in self.q_units])
+        units = (self.units[stem] for stem in joint_stems(self.numbers))
+        return np.array([deg if unit == "deg" else mm for unit in units])
 
     def take(self, rows: IntArray) -> Records:
         return replace(
@@ -565,7 +557,7 @@ class Records:
             file=self.file[rows],
             line=self.line[rows],
             numbers={stem: values[rows] for stem, values in self.numbers.items()},
-            texts=taken(self.texts, rows),
+            texts={stem: [own[i] for i in rows] for stem, own in self.texts.items()},
         )
 
     @classmethod
@@ -586,21 +578,6 @@ class Records:
         )
 
 
-def taken(texts: dict[str, list[str]], rows: IntArray) -> dict[str, list[str]]:
-    return {stem: [own[i] for i in rows] for stem, own in texts.items()}
-
-
-# Units of the measurement table that import writes.
-_UNITS = {
-    "length": "mm", "angle": "deg", "time": "s", "force": "N", "torque": "Nm",
-    "temperature": "C", "number": "",
-}  # fmt: skip
-
-
-def table_unit(stem: str, unit: str) -> str:
-    return "um" if stem.startswith("sigma_") else _UNITS[quantities(unit)[0]]
-
-
 def joint_stems(numbers: Iterable[str]) -> list[str]:
     """q1, q2 … among the columns, in order."""
     found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
@@ -617,7 +594,10 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     settings, name = source.text or TextSourceKeys(), str(path)
     asked = mapping_file.wanted(where, source.columns or {}, source.optional or {})
     lines, encoding = read_lines(path, settings.encoding or "auto")
-    table = _table(name, lines, settings, asked)
+    if settings.format in ("krl", "rapid"):
+        table = program_rows(name, lines, settings.format)
+    else:
+        table = table_rows(name, lines, settings, asked)
     if len(table.rows) > MAX_ROWS:
         raise InputError(f"{name}: more than {MAX_ROWS:,} rows; thin the export out")
     hint = unit_in_comments(where, settings.unit_comment, table.comments)
@@ -712,12 +692,11 @@ def _numbers(
     for marker, own in columns.items():
         rows = np.flatnonzero(of_row == marker)
         for k, c in enumerate(c for c in own if not c.is_text):
-            of[c.stem] = table_unit(c.stem, c.unit)
-            found = convert(read[rows, k], c.unit, of[c.stem])
+            sigma = c.stem.startswith("sigma_")
+            of[c.stem] = "um" if sigma else next(iter(FACTORS[quantities(c.unit)[0]]))
+            found = convert(read[rows, k], c.unit, of[c.stem]) / (coverage if sigma else 1.0)
             # Seconds and nanoseconds of a time add up.
-            numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += (
-                found / coverage if c.stem.startswith("sigma_") else found
-            )
+            numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += found
     return numbers, of
 
 
@@ -746,24 +725,3 @@ def likely_presets(path: Path) -> list[str]:
             continue
         rows[name] = len(read)
     return [name for name, n in rows.items() if n == max(rows.values())]
-
-
-def _table(
-    source: str, lines: list[str], settings: TextSourceKeys, asked: Sequence[ColumnKey]
-) -> Rows:
-    if settings.format in ("krl", "rapid"):
-        return program_rows(source, lines, settings.format)
-    guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
-    named = mapping_file.by_name(asked)
-    places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
-
-    def is_header(cells: Sequence[str]) -> bool:
-        return not mapping_file.lacking(asked, cells)
-
-    def is_data(cells: Sequence[str]) -> bool:
-        return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
-
-    table = table_rows(source, lines, settings, is_header if named else None, is_data)
-    if named and not table.header_line:
-        raise mapping_file.no_header(source, asked, table.rows[:SAMPLE])
-    return table

@@ -20,7 +20,7 @@ from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
-from elastocal.model.chain import Chain, Joint, clashing, jaw_told, names_told
+from elastocal.model.chain import Chain, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.compliances import JointCompliance, usual_over_stated_mass
 from elastocal.model.effects.gears import JointOffset
@@ -39,7 +39,6 @@ ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
 FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
 MOST_SITES = 8  # listed as markers; of more most are something else
 THICKNESS = 15.0  # reach over a link's radius
-POSES, CANDIDATES = 20, 2000  # three markers read nine numbers in each pose and load state
 
 
 def init(
@@ -143,6 +142,7 @@ def first_cell(robot: Robot, folder: str | Path = ".") -> str:
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
     arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None
+    reach = max(reach_of(chain), 0.05)
     if clashing(chain) and robot.joint_names is None:
         robot = replace(robot, joint_names="order")
     lines = [
@@ -154,9 +154,9 @@ def first_cell(robot: Robot, folder: str | Path = ".") -> str:
         "",
         *_robot(robot, kind, path, Path(folder)),
         *_joints(chain),
-        _rest(chain, _mount(robot, arm), {} if arm is None else arm.sites()),
+        REST.format(**_guesses(chain, reach, *_mount(robot, arm)), markers=_markers(reach, arm)),
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)
 
 
 def notes_of(robot: Robot, chain: Chain) -> list[str]:
@@ -237,57 +237,86 @@ def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
 def _joints(chain: Chain) -> Iterator[str]:
     yield f"[limits]                               # of {chain.n_joints} joints, in their order"
     for i, joint in enumerate(chain.joints, 1):
-        unit, scale = ("deg", math.degrees(1.0)) if joint.kind == "revolute" else ("mm", 1e3)
-        low, high, guessed = _range(joint)
-        ends = ", ".join(f"{value * scale:.6g}" for value in (low, high))
+        turns, low, high = joint.kind == "revolute", joint.lower, joint.upper
+        unit, scale, whole = ("deg", math.degrees(1.0), 2 * math.pi) if turns else ("mm", 1e3, 1.0)
         told = f"{printable(joint.name)}, {joint.kind}"
-        told += "; the file has no limit: guess" if guessed else ""
+        if not (math.isfinite(low) and math.isfinite(high)):
+            told += "; the file has no limit: guess"
+            start = high - whole if math.isfinite(high) else -whole / 2
+            low = low if math.isfinite(low) else start
+            high = high if math.isfinite(high) else low + whole
+        ends = ", ".join(f"{value * scale:.6g}" for value in (low, high))
         yield f"joint{i}_{unit} = [{ends}]".ljust(38) + f" # {told}"
     yield ""
 
 
-def _range(joint: Joint) -> tuple[float, float, bool]:
-    half = math.pi if joint.kind == "revolute" else 0.5
-    low, high = joint.lower, joint.upper
-    guessed = not (math.isfinite(low) and math.isfinite(high))
-    low = low if math.isfinite(low) else (high - 2 * half if math.isfinite(high) else -half)
-    return low, (high if math.isfinite(high) else low + 2 * half), guessed
-
-
-def _markers(side: float, sites: dict[str, Array]) -> str:
-    stub = {
-        "M1": np.array([side, 0.0, side / 3]),
-        "M2": np.array([-side / 2, side * 0.9, side / 2]),
-        "M3": np.array([-side / 2, -side * 0.9, side]),
-    }
+def _markers(reach: float, arm: MjcfArm | None) -> str:
+    sites = {} if arm is None else arm.sites()
     usable = {n: p for n, p in sites.items() if n == n.strip() == printable(n)}
-    told = "guess; fitted below"
     if 0 < len(usable) <= MOST_SITES:
         stub, told = usable, "the model's sites; keep the reflectors"
-    head = f"{'[tool.markers_m]':<38} # {told}"
-    return "\n".join([head, *(f"{_key(name)} = {_vector(at)}" for name, at in stub.items())])
+    else:
+        places = {"M1": (1, 0.0, 1 / 3), "M2": (-0.5, 0.9, 0.5), "M3": (-0.5, -0.9, 1)}
+        stub = {name: reach / 12 * np.array(at) for name, at in places.items()}
+        told = "guess; fitted below"
+    lines = [f"{'[tool.markers_m]':<38} # {told}"]
+    for name, at in stub.items():
+        bare = name.isascii() and name.replace("-", "_").replace("_", "a").isalnum()
+        lines.append(f"{name if bare else _text(name)} = {_vector(at)}")
+    return "\n".join(lines)
 
 
-def _key(name: str) -> str:
-    bare = name.isascii() and name.replace("-", "_").replace("_", "a").isalnum()
-    return name if bare else _text(name)
+# What follows robot and limits: keys at their guesses, each line's remark in column 40.
+REST = """\
+[tool]                                 # all in m, in the flange frame
+{load_point:<38} # guess: where a load hangs
+
+{markers}
+
+[tracker]
+{station:<38} # guess: where it stands, in the data's frame
+sigma_um = 15                          # guess; or range_um, range_ppm, transverse_um, …
+
+[model]
+observe = "position"                   # or deflection, pose, distance
+# What is fitted; elastocal effects lists all that can be.
+effects = [
+    {effects}
+]
+{gravity:<38} # {weights}
+
+[model.nominal]                        # the robot's base in the data's frame
+base_position_m = [0, 0, 0]            # guess: the base is the origin of the data
+{turned:<38} # {whose}
+
+[workspace]                            # where the arm may be; design keeps to it
+{radii:<38} # guess
+clearance_mm = {clearance}
+
+[[workspace.keep_out]]
+name = "mounting plane"                # the arm stays above it, z of the base
+point_m = [0, 0, 0]
+normal = {up}
+
+# [[workspace.obstacle]]
+# name = "table"
+# shape = "box"
+# size_m = [1.0, 0.8, 0.7]
+# position_m = [1.2, 0.0, 0.35]
+
+[design]                               # elastocal design
+poses = 20
+candidates = 2000                      # to choose from; more take longer
+{loads:<38} # guess for a reach of {reach:.2f} m
+"""
 
 
-def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> str:
-    reach = max(reach_of(chain), 0.05)
-    side, n = reach / 12, chain.n_joints
-    turned, whose = mount
-    rpy_deg = f"base_rpy_deg = {_vector(np.degrees(rpy_from_rotation(turned)))}"
-    # Off the last joint's axis, which a load on it would not turn.
-    hangs = f"load_point_m = {_vector([side, 0, side])}"
-    station = f"position_m = {_vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])}"
-    placed, geometry = (
-        " ".join(f'"{effect.name}",' for effect in pair)
-        for pair in ((BaseFrame, MarkerPosition), (JointOffset, LinkGeometry))
-    )
-    loaded = [j + 1 for j in range(n) if feels_weight(chain, j, turned[2])]
-    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in loaded]
-    springs = "\n    ".join(" ".join(sprung[k : k + 2]) for k in range(0, len(sprung), 2))
+def _guesses(chain: Chain, reach: float, turned: Array, whose: str) -> dict[str, Any]:
+    n, side = chain.n_joints, reach / 12
+    names = [effect.name for effect in (BaseFrame, MarkerPosition, JointOffset, LinkGeometry)]
+    sprung = [j + 1 for j in range(n) if feels_weight(chain, j, turned[2])]
+    names += [f"{JointCompliance.name}:joint{i}" for i in sprung]
+    effects = [f'"{name}",' for name in names]
     weighed = bool(chain.masses) and not placeholder_masses(chain)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"
     if chain.masses and not weighed:
@@ -301,47 +330,18 @@ def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> st
     # What stands on the mounting plane is no body that could strike it.
     if chain.joints[0].placement[2, 3] * 1e3 <= radii[0]:
         radii[0] = 0
-    load = suitable_load(reach)
-    return f"""\
-[tool]                                 # all in m, in the flange frame
-{hangs:<38} # guess: where a load hangs
-
-{_markers(side, sites)}
-
-[tracker]
-{station:<38} # guess: where it stands, in the data's frame
-sigma_um = 15                          # guess; or range_um, range_ppm, transverse_um, …
-
-[model]
-observe = "position"                   # or deflection, pose, distance
-# What is fitted; elastocal effects lists all that can be.
-effects = [
-    {placed}
-    {geometry}
-    {springs}
-]
-{f"link_gravity = {str(weighed).lower()}":<38} # {told}
-
-[model.nominal]                        # the robot's base in the data's frame
-base_position_m = [0, 0, 0]            # guess: the base is the origin of the data
-{rpy_deg:<38} # {whose}
-
-[workspace]                            # where the arm may be; design keeps to it
-{f"link_radius_mm = [{', '.join(map(str, radii))}]":<38} # guess
-clearance_mm = {thin}
-
-[[workspace.keep_out]]
-name = "mounting plane"                # the arm stays above it, z of the base
-point_m = [0, 0, 0]
-normal = {_vector(turned[:, 2])}
-
-# [[workspace.obstacle]]
-# name = "table"
-# shape = "box"
-# size_m = [1.0, 0.8, 0.7]
-# position_m = [1.2, 0.0, 0.35]
-
-[design]                               # elastocal design
-poses = {POSES}
-{f"candidates = {CANDIDATES}":<38} # to choose from; more take longer
-{f"loads_N = [[0, 0, 0], [0, 0, -{load:g}]]":<38} # guess for a reach of {reach:.2f} m"""
+    return {
+        # Off the last joint's axis, which a load on it would not turn.
+        "load_point": f"load_point_m = {_vector([side, 0, side])}",
+        "station": f"position_m = {_vector([round(2 * reach, 1), 0, round(0.5 * reach, 1)])}",
+        "effects": "\n    ".join(" ".join(effects[k : k + 2]) for k in range(0, len(effects), 2)),
+        "gravity": f"link_gravity = {str(weighed).lower()}",
+        "weights": told,
+        "turned": f"base_rpy_deg = {_vector(np.degrees(rpy_from_rotation(turned)))}",
+        "whose": whose,
+        "radii": f"link_radius_mm = [{', '.join(map(str, radii))}]",
+        "clearance": thin,
+        "up": _vector(turned[:, 2]),
+        "loads": f"loads_N = [[0, 0, 0], [0, 0, -{suitable_load(reach):g}]]",
+        "reach": reach,
+    }

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError, require
 from elastocal.importing import exports
-from elastocal.importing.exports import Records, joint_stems, taken
+from elastocal.importing.exports import Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, NamesTable
 from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, IntArray
@@ -43,7 +43,20 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     numbers = dict(records.numbers)
     d = numbers.pop("range")
     alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
-    _check_spherical(records, d, height, angle)
+    if not (d > 0).all():
+        i = int(np.argmin(d > 0))
+        raise InputError(
+            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
+            "positive: correct the line, or the column of range in [source.columns]"
+        )
+    low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
+    off = (angle < low) | (angle > high)
+    if off.any():
+        i = int(np.argmax(off))
+        raise InputError(
+            f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
+            f"{high:g}°; is it an angle of another unit, or {other}_deg?"
+        )
     zeta = np.radians(angle if height == "zenith" else 90.0 - angle)
     level = d * np.sin(zeta)
     y = level * np.sin(alpha)
@@ -76,23 +89,6 @@ def _height(records: Records) -> str:
     return heights[0]
 
 
-def _check_spherical(records: Records, d: Array, height: str, angle: Array) -> None:
-    if not (d > 0).all():
-        i = int(np.argmin(d > 0))
-        raise InputError(
-            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
-            "positive: correct the line, or the column of range in [source.columns]"
-        )
-    low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
-    off = (angle < low) | (angle > high)
-    if off.any():
-        i = int(np.argmax(off))
-        raise InputError(
-            f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
-            f"{high:g}°; is it an angle of another unit, or {other}_deg?"
-        )
-
-
 GROUPS = ("configuration", "marker", "repeat", "load")
 NAMED = "write pattern in [source.names]"
 
@@ -108,15 +104,12 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
     if names.pattern is not None and named is not None:
         found, bad = _labels_of_names(where, records, names, named)
         if bad:
-            keep = np.setdiff1d(np.arange(len(records)), bad)
-            reasons = [
-                (int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad
-            ]
-            before = records.understood
-            ignored = tuple(sorted([*before.ignored, *reasons]))
-            understood = replace(before, rows=len(keep), ignored=ignored)
+            keep, old = np.setdiff1d(np.arange(len(records)), bad), records.understood
+            told = ((int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad)
+            ignored = tuple(sorted([*old.ignored, *told]))
+            understood = replace(old, rows=len(keep), ignored=ignored)
             records = replace(records.take(keep), understood=understood)
-            found = taken(found, keep)
+            found = {stem: [texts[i] for i in keep] for stem, texts in found.items()}
     labels = found | {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
     if names.markers and "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
@@ -150,26 +143,20 @@ def _labels_of_names(
                 f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
                 f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
             )
-    found: dict[str, list[str]] = {stem: [] for stem in GROUPS}
-    bad: list[int] = []
     with exports.bounded(where, named):
-        for i, name in enumerate(named):
-            match = next((m for e in expressions if (m := e.search(name))), None)
-            if match is None:
-                bad.append(i)
-            groups = match.groupdict() if match else {}
-            for stem in GROUPS:
-                found[stem].append((groups.get(stem) or "").strip())
+        matches = [next((m for e in expressions if (m := e.search(n))), None) for n in named]
+    groups = [match.groupdict() if match else {} for match in matches]
+    bad = [i for i, match in enumerate(matches) if match is None]
     if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
         raise InputError(
             f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
             f"({listed(map(quoted, patterns), 3)}), as do not {len(bad) - 1} others; {NAMED}, or "
             'unmatched = "ignore" to leave such points out'
         )
-    unnamed = set(bad)
+    found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}
     present = {stem: texts for stem, texts in found.items() if any(texts)}
     for stem, texts in present.items():
-        empty = [i for i, text in enumerate(texts) if not text and i not in unnamed]
+        empty = [i for i, text in enumerate(texts) if not text and matches[i]]
         if empty and stem in ("configuration", "marker"):
             raise InputError(
                 f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "
@@ -212,7 +199,15 @@ def with_joints(
         values = [per_row[taken[:, j], np.arange(len(records))] for j in range(taken.shape[1])]
         units = [units[int(taken[0, j])] for j in range(taken.shape[1])]
     n = len(values)
-    _check_lengths(where, joints, n)
+    for key in ("sign", "offset_deg", "offset_mm"):
+        given = getattr(joints, key)
+        if given is not None and len(given) != n:
+            raise InputError(
+                f"{where}: [joints] {key} has {len(given)} numbers, but there are {n} joints; give "
+                "one per joint"
+            )
+    for value in joints.sign or ():
+        require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
     for j, unit in enumerate(units):
         given = joints.offset_deg if unit == "deg" else joints.offset_mm
         values[j] = values[j] * (joints.sign or [1] * n)[j] + (given or [0.0] * n)[j]
@@ -234,9 +229,12 @@ def with_joints(
         values[j] = values[j] + coupling.factor * before[i]
     numbers = {s: v for s, v in records.numbers.items() if s not in stems}
     own = {s: u for s, u in records.units.items() if s not in stems}
-    for j in range(n):
-        numbers[f"q{j + 1}"], own[f"q{j + 1}"] = values[j], units[j]
-    return replace(records, numbers=numbers, units=own)
+    made = [f"q{j + 1}" for j in range(n)]
+    return replace(
+        records,
+        numbers=numbers | dict(zip(made, values, strict=True)),
+        units=own | dict(zip(made, units, strict=True)),
+    )
 
 
 def _order(
@@ -277,46 +275,29 @@ def _order(
     return np.array(rows)
 
 
-def _check_lengths(where: str, joints: JointsTable, n: int) -> None:
-    for key in ("sign", "offset_deg", "offset_mm"):
-        given = getattr(joints, key)
-        if given is not None and len(given) != n:
-            raise InputError(
-                f"{where}: [joints] {key} has {len(given)} numbers, but there are {n} joints; give "
-                "one per joint"
-            )
-    for value in joints.sign or ():
-        require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
-
-
 def pooled(records: Sequence[Records]) -> Records:
     if any(r.load is not None for r in records):
-        records = [replace(r, texts=r.texts | {"load": _loads(r)}) for r in records]
+        for r in records:
+            require(
+                "load" in r.texts or r.load is not None,
+                f"{r.source}: says no load, other files do; give load in its [[source]], or a "
+                "group (?P<load>…) in its pattern",
+            )
+        records = [replace(r, texts={"load": [str(r.load)] * len(r)} | r.texts) for r in records]
     first, *others = records
     for other in others:
-        _same("columns", first, other, set(first.numbers), set(other.numbers))
-        _same("labels", first, other, *({*GROUPS} & {*r.texts} for r in (first, other)))
+        for what, one, two in (
+            ("columns", set(first.numbers), set(other.numbers)),
+            ("labels", {*GROUPS} & {*first.texts}, {*GROUPS} & {*other.texts}),
+        ):
+            if one != two:
+                has, lacks = (first, other) if one - two else (other, first)
+                raise InputError(
+                    f"{lacks.source}: has no {listed(sorted(one ^ two))}, but {has.source} has; "
+                    f"files of one kind need the same {what}: correct [[source]], or import them "
+                    "one by one"
+                )
     return Records.stacked(records)
-
-
-def _loads(records: Records) -> list[str]:
-    named = records.texts.get("load")
-    require(
-        named is not None or records.load is not None,
-        f"{records.source}: says no load, other files do; give load in its [[source]], or a "
-        "group (?P<load>…) in its pattern",
-    )
-    return named if named is not None else [str(records.load)] * len(records)
-
-
-def _same(what: str, first: Records, other: Records, one: set[str], two: set[str]) -> None:
-    if one == two:
-        return
-    has, lacks = (first, other) if one - two else (other, first)
-    raise InputError(
-        f"{lacks.source}: has no {listed(sorted(one ^ two))}, but {has.source} has; files of one "
-        f"kind need the same {what}: correct [[source]], or import them one by one"
-    )
 
 
 CHUNK = 1024
@@ -365,16 +346,12 @@ def _over(q: Array, still: Array) -> NDArray[np.bool_]:
 def groups_alike(q: Array, tolerance: Array) -> NDArray[np.int64]:
     """(m,) codes by first appearance: rows of q (m, n) within `tolerance` (n,) of a group's first
     row are of that group."""
-    codes = np.empty(len(q), dtype=np.int64)
-    firsts: list[Array] = []
+    codes, firsts = np.empty(len(q), dtype=np.int64), list[Array]()
     for i, row in enumerate(q):
-        if firsts:
-            near = np.flatnonzero((np.abs(np.array(firsts) - row) <= tolerance).all(axis=1))
-            if len(near):
-                codes[i] = near[0]
-                continue
-        codes[i] = len(firsts)
-        firsts.append(row)
+        near = (np.abs(np.reshape(firsts, (-1, q.shape[1])) - row) <= tolerance).all(axis=1)
+        codes[i] = np.argmax(near) if near.any() else len(firsts)
+        if not near.any():
+            firsts.append(row)
     return codes
 
 
@@ -399,23 +376,25 @@ class Joined:
 
 
 def join(where: str, points: Records, log: Records, settings: JoinTable | None) -> Joined:
+    """By name where names agree, by time where both have one, else by order, unless stated."""
     settings = settings or JoinTable()
-    how = settings.by or _obvious(points, log)
+    named = points.texts.get("configuration")
+    both = points.time is not None and log.time is not None
+    obvious = "time" if both else "order"
+    how = settings.by or ("name" if named and _keys(named, _names_of(log)) else obvious)
     if how in ("time", "standstill"):
         found = _by_clock(points, log, settings, how)
     else:
         found = (_by_name if how == "name" else _by_order)(points, log, settings)
-    if found.left_out and settings.unmatched != "leave_out":
+    strict = bool(found.left_out) and settings.unmatched != "leave_out"
+    if strict or (found.row < 0).all():
+        head = f"{len(found.left_out)} of {len(points)} points have" if strict else "no point has"
+        no = "no " if strict else ""
+        lost = f": {listed(found.left_out, SHOWN)}" if strict else ""
+        way = ', or set unmatched = "leave_out" in [join]' if strict else ""
         raise InputError(
-            f"{points.files[0]}: {len(found.left_out)} of {len(points)} points have no joint "
-            f"values in {listed(log.files, 3)} (joined by {how}): {listed(found.left_out, SHOWN)}; "
-            f'{_ADVICE[how]}, or set unmatched = "leave_out" in [join]'
-            f"{_likely_offset(points, log, settings, how)}"
-        )
-    if (found.row < 0).all():
-        raise InputError(
-            f"{points.files[0]}: no point has joint values in {listed(log.files, 3)} (joined by "
-            f"{how}); {_ADVICE[how]}{_likely_offset(points, log, settings, how)}"
+            f"{points.files[0]}: {head} {no}joint values in {listed(log.files, 3)} (joined by "
+            f"{how}){lost}; {_ADVICE[how]}{way}{_likely_offset(points, log, settings, how)}"
         )
     return found
 
@@ -455,13 +434,6 @@ _ADVICE = {
     "time": "correct offset_s or tolerance_s in [join]",
     "standstill": "correct offset_s, tolerance_s, still_deg or still_s in [join]",
 }
-
-
-def _obvious(points: Records, log: Records) -> str:
-    """By name where names agree, by time where both have one, else by order."""
-    if "configuration" in points.texts and _keys(points.texts["configuration"], _names_of(log)):
-        return "name"
-    return "time" if points.time is not None and log.time is not None else "order"
 
 
 def _names_of(log: Records) -> list[str]:
@@ -514,13 +486,13 @@ def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray
     markers = [points.texts["marker"][i] for i in chosen] if "marker" in points.texts else []
     if len(set(markers)) < 2:
         return np.arange(n)
-    visit, measured, codes = 0, set[str](), []
+    begins, measured = [], set[str]()
     for k, marker in enumerate(markers):
-        if marker in measured and marker != markers[k - 1]:
-            visit, measured = visit + 1, set()
+        begins.append(marker in measured and marker != markers[k - 1])
+        if begins[-1]:
+            measured = set()
         measured.add(marker)
-        codes.append(visit)
-    return np.array(codes)
+    return np.cumsum(begins)
 
 
 def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
@@ -530,19 +502,18 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
         count = int(visits.max()) + 1
         per = settings.points_per_pose
         if count != len(rows) or (per is not None and len(chosen) % per):
-            of = f" under load {load}" if load else ""
+            of, hint = f" under load {load}" if load else "", ""
             sizes = np.bincount(visits)
-            odd = np.flatnonzero(sizes != np.bincount(sizes).argmax())
-            start = chosen[np.flatnonzero(visits == odd[0])[0]] if len(odd) else None
-            hint = "" if start is None else (
-                f"; the visit that begins at {points.shown(int(start))} has {sizes[odd[0]]} "
-                f"points, most have {np.bincount(sizes).argmax()}"
-            )  # fmt: skip
+            most = np.bincount(sizes).argmax()
+            for odd in np.flatnonzero(sizes != most)[:1]:
+                start = points.shown(int(chosen[np.argmax(visits == odd)]))
+                hint = (
+                    f"; the visit that begins at {start} has {sizes[odd]} points, most have {most}"
+                )
             raise InputError(
                 f"{points.files[0]}: {len(chosen)} points{of} in {count} visits, but "
                 f"{listed(log.files, 3)} has {len(rows)} poses, and they are joined by "
-                f"order{hint}; "
-                f"{_ADVICE['order']}"
+                f"order{hint}; {_ADVICE['order']}"
             )
         row[chosen] = rows[visits]
     names = _names_of(log)

@@ -27,7 +27,7 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError, option
+from elastocal.errors import InputError, option, require
 from elastocal.measurements import families
 from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
@@ -203,11 +203,11 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Import
     table = checked(MappingTable, merged, where)
     sources = table.source or []
     for k, source in enumerate(sources):
-        if not source.columns:
-            raise InputError(
-                f"{where}: {place('source', k)} has neither preset nor columns; say where the "
-                'numbers stand, as in x_mm = "X"'
-            )
+        require(
+            bool(source.columns),
+            f"{where}: {place('source', k)} has neither preset nor columns; say where the "
+            'numbers stand, as in x_mm = "X"',
+        )
     return ImportMapping(where, table, tuple(sources))
 
 
@@ -248,7 +248,12 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
 
 TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
 AUTO = "auto"
-_NUMBERED = re.compile(r"(q|torque_|approach_|joint)([1-9]\d?|#)((?:_[A-Za-z]+)?)")
+_NUMBERED = re.compile(r"^(q|torque_|approach_|joint)([1-9]\d?|#)(?=_|$)")
+
+
+def _of_any_joint(name: str) -> str:
+    """q# for q3, q#_deg for q3_deg."""
+    return _NUMBERED.sub(r"\1#", name)
 
 
 def _quantities() -> dict[str, tuple[str, ...]]:
@@ -257,8 +262,7 @@ def _quantities() -> dict[str, tuple[str, ...]]:
     for kind in ("revolute", "prismatic"):
         for family in families((kind,)).values():
             for stem, units in family.units.items():
-                name = re.sub(r"^(q|torque_|approach_)1$", r"\1#", stem)
-                if name not in TEXTS:
+                if (name := _of_any_joint(stem)) not in TEXTS:
                     known = found.get(name, ())
                     found[name] = tuple(dict.fromkeys((*known, *quantities(units[0]))))
     return found
@@ -299,7 +303,7 @@ class ColumnKey:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        return _QUANTITIES[re.sub(r"^(q|torque_|approach_)\d+$", r"\1#", self.stem)]
+        return _QUANTITIES[_of_any_joint(self.stem)]
 
     @property
     def default(self) -> str:
@@ -317,20 +321,12 @@ class ColumnKey:
 
 
 def column_key(where: str, key: str) -> ColumnKey:
-    numbered = _NUMBERED.fullmatch(key)
-    if numbered:
-        family, number, tail = numbered.groups()
-        if family == "joint" and not tail:
-            return ColumnKey(key, key, "", is_text=True)
-        stem, unit, general = f"{family}{number}", tail[1:], f"{family}#"
-    else:
-        if key in TEXTS:
-            return ColumnKey(key, key, "", is_text=True)
-        stem, unit = key, ""
-        if key not in _QUANTITIES:
-            stem, _, unit = key.rpartition("_")
-        general = stem
-    if general not in _QUANTITIES:
+    if _of_any_joint(key) in TEXTS:
+        return ColumnKey(key, key, "", is_text=True)
+    stem, unit = key, ""
+    if _of_any_joint(key) not in _QUANTITIES:
+        stem, _, unit = key.rpartition("_")
+    if (general := _of_any_joint(stem)) not in _QUANTITIES:
         ways = [column(stem, next(iter(FACTORS[q[0]]))) for stem, q in _QUANTITIES.items()]
         valid = [*TEXTS, *ways]
         raise InputError(
@@ -416,9 +412,8 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
     found = {target: _marker_names(target, free) for target in asked if target.of_each_marker}
     names = list(dict.fromkeys(name for t, own in found.items() if t.required for name in own))
     for name in names:  # what is optional is there for all of them or for none
-        absent = [t for t, own in found.items()
-                  if name not in own and (t.required or {*own} & {*names})]  # fmt: skip
-        if absent:
+        if absent := [t for t, own in found.items()
+                      if name not in own and (t.required or {*own} & {*names})]:  # fmt: skip
             raise InputError(
                 f"{source}: {quoted(name)} has no column for {listed(t.key for t in absent)}, as "
                 f"{quoted(str(absent[0].of_marker(name).at))}; write the places so that {EACH} "
@@ -488,13 +483,10 @@ def resolve(
 
 
 def _no_unit(source: str, columns: Sequence[ColumnKey]) -> InputError:
-    usual = {c: USUAL.get(q := c.default) or next(iter(FACTORS[q])) for c in columns}
-    keys = {c: f"{c.stem}_{unit}" for c, unit in usual.items()}
-    options = [option(f"{c.default}_unit", usual[c]) for c in columns
-               if c.default in USUAL]  # fmt: skip
-    by_key = [key for c, key in keys.items() if c.default not in USUAL]
-    needed = list(dict.fromkeys(options))
-    if by_key:
+    keys = {c: column(c.stem, next(iter(FACTORS[c.default]))) for c in columns}
+    needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in columns
+                             if (unit := USUAL.get(q := c.default)))]  # fmt: skip
+    if by_key := [key for c, key in keys.items() if c.default not in USUAL]:
         needed.append(f"{listed(by_key)} in [source.columns]")
     several = len(columns) > 1
     return InputError(
