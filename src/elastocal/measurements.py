@@ -6,8 +6,9 @@ Beside it, what the noise that is stated for the table or its tracker means for 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -202,10 +203,7 @@ class Measurements(Result):
         }
         return replace(self, **changes)
 
-    def __getitem__(self, index: NDArray | slice) -> Measurements:
-        """The same as `take`: `data[data.marker == 0]`, `data[:90]`."""
-        return self.take(index)
-
+    __getitem__ = take  # data[data.marker == 0], data[:90]
     __iter__ = None  # rows have no form of their own
 
 
@@ -430,32 +428,29 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
 
     def per_joint(stem: str, revolute: tuple[str, ...], prismatic: tuple[str, ...]) -> dict:
         return {
-            stem.format(i): prismatic if kind == "prismatic" else revolute for i, kind in numbered
+            f"{stem}{i}": prismatic if kind == "prismatic" else revolute for i, kind in numbered
         }
 
-    def same(units: tuple[str, ...], *stems: str) -> dict[str, tuple[str, ...]]:
-        return dict.fromkeys(stems, units)
-
-    def sigmas(*axes: str) -> dict[str, tuple[str, ...]]:
-        return same(("um", "mm", "m"), *(f"sigma_{axis}" for axis in axes))
-
+    sigma, cartesian = ("um", "mm", "m"), ("sigma_x", "sigma_y", "sigma_z")
+    polar = ("sigma_range", "sigma_azimuth", "sigma_elevation")
+    same = dict.fromkeys
     known = (
-        Family("configuration", "configuration", same(NO_UNIT, "configuration"), is_label=True),
-        Family("repeat", "repeat", same(NO_UNIT, "repeat")),
-        Family("marker", "marker", same(NO_UNIT, "marker"), is_label=True),
-        Family("q", "joint positions", per_joint("q{}", ANGLE, LENGTH[:2])),
-        Family("force", "forces", same(("N",), "force_x", "force_y", "force_z")),
-        Family("position", "positions", same(LENGTH, "x", "y", "z")),
-        Family("rotation", "rotation vector", same(ANGLE, "rx", "ry", "rz")),
-        Family("quaternion", "quaternion", same(NO_UNIT, "qw", "qx", "qy", "qz")),
-        Family("distance", "distances", same(LENGTH[:2], "distance")),
-        Family("torque", "joint torques", per_joint("torque_{}", ("Nm",), ("N",))),
-        Family("sigma_cartesian", "Cartesian sigmas", sigmas("x", "y", "z")),
-        Family("sigma_polar", "polar sigmas", sigmas("range", "azimuth", "elevation")),
-        Family("time", "time", same(TIME, "time")),
-        Family("approach", "approach directions", per_joint("approach_{}", NO_UNIT, NO_UNIT)),
-        Family("before", "joints of the pose before", per_joint("before_{}", ANGLE, LENGTH[:2])),
-        Family("temperature", "temperature", same(("C",), "temperature")),
+        Family("configuration", "configuration", {"configuration": NO_UNIT}, is_label=True),
+        Family("repeat", "repeat", {"repeat": NO_UNIT}),
+        Family("marker", "marker", {"marker": NO_UNIT}, is_label=True),
+        Family("q", "joint positions", per_joint("q", ANGLE, LENGTH[:2])),
+        Family("force", "forces", same(("force_x", "force_y", "force_z"), ("N",))),
+        Family("position", "positions", same("xyz", LENGTH)),
+        Family("rotation", "rotation vector", same(("rx", "ry", "rz"), ANGLE)),
+        Family("quaternion", "quaternion", same(("qw", "qx", "qy", "qz"), NO_UNIT)),
+        Family("distance", "distances", {"distance": LENGTH[:2]}),
+        Family("torque", "joint torques", per_joint("torque_", ("Nm",), ("N",))),
+        Family("sigma_cartesian", "Cartesian sigmas", same(cartesian, sigma)),
+        Family("sigma_polar", "polar sigmas", same(polar, sigma)),
+        Family("time", "time", {"time": TIME}),
+        Family("approach", "approach directions", per_joint("approach_", NO_UNIT, NO_UNIT)),
+        Family("before", "joints of the pose before", per_joint("before_", ANGLE, LENGTH[:2])),
+        Family("temperature", "temperature", {"temperature": ("C",)}),
     )
     return {family.name: family for family in known}
 
@@ -499,15 +494,13 @@ def _wrong_joint(text: str, header: Sequence[str], known: Mapping[str, Family]) 
 
 def _wrong_count(header: Sequence[str], family: Family) -> str:
     n = len(family.units)
-    found = [t for t in header if (m := NUMBERED.fullmatch(t)) and m[1] == "q"]
-    stems = {"q" + NUMBERED.fullmatch(t)[2] for t in found}  # type: ignore[index]
+    found = {t: f"q{m[2]}" for t in header if (m := NUMBERED.fullmatch(t)) and m[1] == "q"}
+    stems = set(found.values())
     missing = [family.columns(stem)[0] for stem in family.units if stem not in stems]
     names = f" ({listed(found, 8)})" if found else ""
-    remedy = f"; add {listed(missing, 8)}" if missing else ""
-    return (
-        f"{len(stems)} joint columns{names}, but the robot has {n} joints{remedy or '; drop the'}"
-        f"{'' if remedy else ' columns too many, or use the cell of the right robot'}"
-    )
+    way = f"add {listed(missing, 8)}" if missing else (
+        "drop the columns too many, or use the cell of the right robot")  # fmt: skip
+    return f"{len(stems)} joint columns{names}, but the robot has {n} joints; {way}"
 
 
 # Reading
@@ -546,7 +539,12 @@ def read_measurements(
 
     raw = tables.read_table(path, choose, text=text)
     n = len(raw.row)
-    found = {name: _values(raw, name) for name in raw.columns}
+    numeric = [name for name, own in raw.columns.items() if not own[0].is_label]
+    found = {name: raw.si(name) for name in numeric}
+    for name, values in found.items():
+        if values is not None and name in RULES:
+            good, rule = RULES[name]
+            raw.check(name, good(values), rule)
     # A plan without the column is of all markers.
     marker = _marker(raw, marker_names if observe not in PLANS or "marker" in raw.labels else ())
     configuration = raw.labels.get("configuration")
@@ -594,17 +592,6 @@ RULES: dict[str, tuple[Callable[[Array], np.ndarray], str]] = {
         (lambda v: v > 0, "a standard deviation must be positive"),
     ),
 }
-
-
-def _values(raw: RawTable, family: str) -> Array | None:
-    """The numbers of a family (n, k) in SI units, where they keep its rule; None for labels."""
-    if raw.columns[family][0].is_label:
-        return None
-    values = raw.si(family)
-    if values is not None and family in RULES:
-        good, rule = RULES[family]
-        raw.check(family, good(values), rule)
-    return values
 
 
 def rotation_column(raw: RawTable) -> Array | None:
@@ -680,27 +667,21 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
                 "its ends"
             )
     columns = measurements.columns()
-    meaning = {
-        header: family.meaning
-        for family in families(measurements.kinds).values()
-        for stem in family.units
-        for header in family.columns(stem)
-    }
-    for header, values in columns.items():
-        if values.dtype != object and not np.isfinite(values).all():
-            raise InputError(f"{path}: the {meaning[header]} to write are not all finite")
+    infinite = {header for header, values in columns.items()
+                if values.dtype != object and not np.isfinite(values).all()}  # fmt: skip
+    for family in families(measurements.kinds).values():
+        require(
+            infinite.isdisjoint(name for stem in family.units for name in family.columns(stem)),
+            f"{path}: the {family.meaning} to write are not all finite",
+        )
     if Path(path).suffix.lower() in tables.PARQUET:
         return tables.write_parquet(path, columns)
+    # A few at a time as numbers of Python, which are written with the shortest digits that read
+    # back exactly.
+    pieces = (slice(start, start + AT_A_TIME) for start in range(0, len(measurements), AT_A_TIME))
+    rows = (zip(*(v[some].tolist() for v in columns.values()), strict=True) for some in pieces)
     with atomic_writer(path) as handle:
-        tables.write_csv(handle, columns, _rows(columns, len(measurements)))
-
-
-def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
-    """The rows, a few at a time as numbers of Python, which are written with the shortest digits
-    that read back exactly."""
-    for start in range(0, n, AT_A_TIME):
-        some = slice(start, start + AT_A_TIME)
-        yield from zip(*(values[some].tolist() for values in columns.values()), strict=True)
+        tables.write_csv(handle, columns, chain.from_iterable(rows))
 
 
 # A covariance of their noise.
@@ -708,7 +689,16 @@ def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
 
 def read_matrix(path: str | Path, what: str) -> Array:
     if Path(path).suffix.lower() == ".npy":
-        return _read_npy(path, what)
+        remedy = "save the matrix with numpy.save, or as CSV"
+        with open_input(path, what, tables.MOST_BYTES) as handle:
+            try:
+                # Mapped, so that a header which states more numbers than there are reads nothing.
+                found = np.lib.format.open_memmap(handle.name, mode="r")
+            except (ValueError, EOFError, OSError, OverflowError, SyntaxError, TypeError) as error:
+                raise InputError(f"{path}: not a matrix of numbers ({error}); {remedy}") from None
+        if found.dtype.kind not in "fiu" or not np.isfinite(found).all():
+            raise InputError(f"{path}: holds {found.dtype}, not finite numbers; {remedy}")
+        return np.array(found, dtype=float)
     lines = enumerate(read_text(path, what, tables.MOST_BYTES).splitlines(), start=1)
     rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if line.strip()]
     if not rows:
@@ -724,16 +714,3 @@ def read_matrix(path: str | Path, what: str) -> Array:
     if problem := tables.first_bad_cell(str(path), rows, columns, False):
         raise problem
     return np.array([cells for _, cells in rows], dtype=np.float64)
-
-
-def _read_npy(path: str | Path, what: str) -> Array:
-    remedy = "save the matrix with numpy.save, or as CSV"
-    with open_input(path, what, tables.MOST_BYTES) as handle:
-        try:
-            # Mapped, so that a header which states more numbers than the file has reads nothing.
-            found = np.lib.format.open_memmap(handle.name, mode="r")
-        except (ValueError, EOFError, OSError, OverflowError, SyntaxError, TypeError) as error:
-            raise InputError(f"{path}: not a matrix of numbers ({error}); {remedy}") from None
-    if found.dtype.kind not in "fiu" or not np.isfinite(found).all():
-        raise InputError(f"{path}: holds {found.dtype}, not finite numbers; {remedy}")
-    return np.array(found, dtype=float)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
+from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.export import exportable, mjcf_file, rigid_files
 from elastocal.export.exportable import (
     Cost,
@@ -219,7 +219,7 @@ class Exported(Written):
     held: dict[str, float]
     of_the_measurement: tuple[str, ...]
     refit: Refit | None = None
-    correction: JointCorrection = field(default_factory=lambda: JointCorrection(()))
+    correction: JointCorrection = field(default_factory=JointCorrection)
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -261,7 +261,7 @@ def export(
         visits = replace(visits, force=np.broadcast_to(conditions.force, visits.force.shape))
     conditions = replace(conditions, visits=visits)
     kept = exportable.keep(calibrated, elastic=wish.format == "mjcf", conditions=conditions)
-    refit, correction = None, JointCorrection(())
+    refit, correction = None, JointCorrection()
     if wish.format in FITTED:
         progress("fitting what the format holds")
         kept, refit, correction = refitted(kept, wish.poses, wish.seed, wish.correct_joints)
@@ -273,11 +273,6 @@ def export(
         found = WRITERS[wish.format](calibrated, wish, kept, pieces)
     else:
         found = Written(_parameters(calibrated, pieces, cost, wish.format))
-    if found.checked is not None and not np.isfinite(found.checked):
-        raise InsufficientDataError(
-            f"{calibrated.source}: its corrections are larger than a file of a robot can hold; "
-            "look at its values"
-        )
     # Smooth functions are zero where nothing shows them: no values that are held.
     model, entries = calibrated.model, calibrated.entries
     each = zip(model.names, entries, model.shrunk, strict=True)

@@ -4,8 +4,8 @@ the file can do instead."""
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -436,15 +436,8 @@ MOST_BYTES = 50_000_000
 SEEN = 1e-7  # rad or m: a curve that stays below moves a tool by 0.1 µm in a metre
 
 
-@dataclass(frozen=True)
-class CorrectionCurve:
-    """`delta` (k,) rad or m that joint `joint` (0-based) stands beyond its command, against
-    `position` (k,) of what it `follows`: "joint2" in rad or m, or "approach2", -1 or 1."""
-
-    joint: int
-    follows: str
-    position: Array
-    delta: Array
+# Joint (0-based), what it follows, positions (k,) of that and deltas (k,) of the joint.
+Curve = tuple[int, str, Array, Array]
 
 
 @dataclass(frozen=True)
@@ -453,6 +446,9 @@ class JointCorrection:
     motion: where an exported arm is to be commanded so that it stands where the real one does when
     commanded to q.  Curves are linear between their rows and constant beyond.
 
+    `curves`: joint (0-based) and what it follows, "joint2" in rad or m, or "approach2", -1 or 1 →
+    positions (k,) of that, and deltas (k,) in rad or m that the joint stands beyond its command.
+
     Examples:
         >>> from elastocal.export.exportable import read_joint_correction
         >>> effective = read_joint_correction("joints.csv")
@@ -460,7 +456,7 @@ class JointCorrection:
         array([ 0.4, -1. ,  1. ,  0. ,  0.5,  0. ])
     """
 
-    curves: tuple[CorrectionCurve, ...]
+    curves: Mapping[tuple[int, str], tuple[Array, Array]] = field(default_factory=dict)
 
     def __call__(self, q: ArrayLike, approach: ArrayLike | None = None) -> NDArray:
         """Joints to command (joints,) or (n, joints); without `approach`, like q, no curve that
@@ -468,64 +464,56 @@ class JointCorrection:
         given = np.asarray(q, dtype=float)
         sides = np.zeros_like(given) if approach is None else np.asarray(approach, dtype=float)
         found = given.copy()
-        for curve in self.curves:
-            kind = SIDE if curve.follows.startswith(SIDE) else JOINT
-            at = (sides if kind == SIDE else given)[..., int(curve.follows[len(kind) :]) - 1]
-            found[..., curve.joint] += np.interp(at, curve.position, curve.delta)
+        for (joint, follows), curve in self.curves.items():
+            kind = SIDE if follows.startswith(SIDE) else JOINT
+            at = (sides if kind == SIDE else given)[..., int(follows[len(kind) :]) - 1]
+            found[..., joint] += np.interp(at, *curve)
         return found
 
-    def merged(self) -> JointCorrection:
-        """The same with one curve for each joint and what it follows, without those too small to
-        be seen."""
-        alike: dict[tuple[int, str], list[CorrectionCurve]] = {}
-        for curve in self.curves:
-            alike.setdefault((curve.joint, curve.follows), []).append(curve)
-        found = []
-        for (joint, follows), parts in sorted(alike.items()):
-            x = np.unique(np.concatenate([part.position for part in parts]))
-            total = sum((np.interp(x, p.position, p.delta) for p in parts), np.zeros(len(x)))
+    def plus(self, more: Iterable[Curve]) -> JointCorrection:
+        """With these curves added, without those too small to be seen."""
+        alike = {key: [curve] for key, curve in self.curves.items()}
+        for joint, follows, position, delta in more:
+            alike.setdefault((joint, follows), []).append((position, delta))
+        found = {}
+        for key, parts in sorted(alike.items()):
+            x = np.unique(np.concatenate([position for position, _ in parts]))
+            total = sum((np.interp(x, *part) for part in parts), np.zeros(len(x)))
             if np.abs(total).max() > SEEN:
-                found.append(CorrectionCurve(joint, follows, x, total))
-        return JointCorrection(tuple(found))
+                found[key] = x, total
+        return JointCorrection(found)
 
     def csv(self, comments: Sequence[str] = ()) -> str:
         """The table as text; positions and deltas in rad, of prismatic joints in m."""
         rows = [
-            (f"{JOINT}{curve.joint + 1}", curve.follows, f"{position:.6g}", f"{delta + 0.0:.4e}")
-            for curve in self.curves
-            for position, delta in zip(curve.position, curve.delta, strict=True)
+            (f"{JOINT}{joint + 1}", follows, f"{position:.6g}", f"{delta + 0.0:.4e}")
+            for (joint, follows), curve in self.curves.items()
+            for position, delta in zip(*curve, strict=True)
         ]
         return csv_text(HEADER, rows, comments)
 
 
 def read_joint_correction(path: str | Path) -> JointCorrection:
     """The correction that `export --joint-correction` wrote."""
-    lines = [
-        line
-        for line in read_text(path, "joint correction", MOST_BYTES).splitlines()
-        if line[:1] != "#"
-    ]
+    text = read_text(path, "joint correction", MOST_BYTES)
+    lines = [line for line in text.splitlines() if line[:1] != "#"]
     require(
         bool(lines) and lines[0] == ",".join(HEADER),
         f"{path}: its columns are not {', '.join(HEADER)}; give the file that export wrote",
     )
-    rows: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    rows: dict[tuple[int, str], list[tuple[float, float]]] = {}
     for number, line in enumerate(lines[1:], start=2):
         try:
             name, follows, position, delta = line.split(",")
-            int(name.removeprefix(JOINT)), int(follows.removeprefix(JOINT).removeprefix(SIDE))
-            rows.setdefault((name, follows), []).append((float(position), float(delta)))
+            int(follows.removeprefix(JOINT).removeprefix(SIDE))
+            key = int(name.removeprefix(JOINT)) - 1, follows
+            rows.setdefault(key, []).append((float(position), float(delta)))
         except ValueError:
             raise InputError(
                 f"{path}, row {number}: '{line}' is no joint, what it follows and two numbers; "
                 "export it anew"
             ) from None
-    return JointCorrection(
-        tuple(
-            CorrectionCurve(int(name.removeprefix(JOINT)) - 1, follows, *np.array(pairs).T)
-            for (name, follows), pairs in rows.items()
-        )
-    )
+    return JointCorrection({key: tuple(np.array(pairs).T) for key, pairs in rows.items()})
 
 
 # A joint correction: q_effective = f(q_commanded).
@@ -583,7 +571,7 @@ def refitted(
     lacks = any(omission.without is not None for omission in kept.omissions)
     geometry = bool({choice.name for choice in own} & set(GEOMETRY))
     if visits is None or not lacks or not (geometry or correct):
-        return kept, None, JointCorrection(())
+        return kept, None, JointCorrection()
     rng, model = np.random.default_rng(seed), kept.full.model
     check = random_table(model, conditions, poses, seed)
     more = random_table(model, conditions, MORE_OF_CURVES if correct else MORE, seed + 1)
@@ -591,11 +579,10 @@ def refitted(
     table = table_at(model, conditions, q, force, rng)
     others = [choice for choice in own if choice.name not in GEOMETRY]
     whole = _with(part, [*others, *map(EffectChoice, GEOMETRY)])
-    start = _gears(kept) if correct else JointCorrection(())
+    start = _gears(kept) if correct else JointCorrection()
     best, curves = _fitted(kept, table, whole, start, geometry, correct)
-    placed = [choice for choice in own if effect_of(choice.name).registered]
-    without, nothing_more = _with(part, placed), JointCorrection(())
-    nominal, _ = _fitted(kept, table, without, nothing_more, False, False, tool=True)
+    placed = _with(part, [choice for choice in own if effect_of(choice.name).registered])
+    nominal, _ = _fitted(kept, table, placed, JointCorrection(), False, False, tool=True)
     before, alone, worst = (_rms(kept, each, check, check) for each in (part, best, nominal))
     corrected = _rms(kept, best, check, _commanded(check, curves)) if correct else None
     after = alone if correct else min(before, alone)
@@ -630,8 +617,8 @@ def _gears(kept: Kept) -> JointCorrection:
     others in the middle of what was measured: the whole of it but for what goes with a load."""
     full, conditions = kept.full, kept.conditions
     held = {choice.name for choice in kept.exported.model.cell.model.effects}
-    own = [c for c in full.model.cell.model.effects if c.name not in held]
-    part = _with(full, [c for c in own if effect_of(c.name).stage == "transmission"])
+    lost = (c for c in full.model.cell.model.effects if c.name not in held)
+    part = _with(full, (c for c in lost if effect_of(c.name).stage == "transmission"))
     chain, cell = part.model.chain, part.model.cell
     symbolic = SymbolicArm(chain, cell)
     arm = symbolic.arm
@@ -650,11 +637,9 @@ def _gears(kept: Kept) -> JointCorrection:
         still = np.zeros(q.shape)  # of no direction, though the joints have moved before
         table = replace(table, approach=still, direction=still + 1e-12, move=still)
         moved = np.broadcast_to(function(*row_inputs(arm, table), part.x)[0][..., 0], q.shape)
-        curves += [
-            CorrectionCurve(j, f"joint{i + 1}", x, moved[1:, j] - (moved[0, j] if j != i else 0.0))
-            for j in range(len(middle))
-        ]
-    return JointCorrection(tuple(curves)).merged()
+        own = moved[1:] - moved[0] * (np.arange(len(middle)) != i)
+        curves += [(j, f"{JOINT}{i + 1}", x, own[:, j]) for j in range(len(middle))]
+    return JointCorrection().plus(curves)
 
 
 def _fitted(
@@ -746,13 +731,11 @@ class _Curves:
 
     def correction(self, start: JointCorrection, c: Array) -> JointCorrection:
         bent = c[: -self.n].reshape(self.n, len(self.moving), KNOTS)
-        curves = [
-            CorrectionCurve(j, f"joint{i + 1}", self.places[:, i], bent[j, k])
+        curves: list[Curve] = [
+            (j, f"{JOINT}{i + 1}", self.places[:, i], bent[j, k])
             for j in range(self.n)
             for k, i in enumerate(self.moving)
         ]
-        sides = [
-            CorrectionCurve(j, f"approach{j + 1}", np.array([-1.0, 1.0]), np.array([-s, s]))
-            for j, s in enumerate(c[-self.n :])
-        ]
-        return JointCorrection((*start.curves, *curves, *sides)).merged()
+        ends = np.array([-1.0, 1.0])
+        sides = [(j, f"{SIDE}{j + 1}", ends, s * ends) for j, s in enumerate(c[-self.n :])]
+        return start.plus([*curves, *sides])

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from elastocal.cell.arm_description import Robot
-from elastocal.errors import InputError, option
+from elastocal.errors import InputError, option, require
 from elastocal.export.exportable import ExportNumbers, nothing, numbers, origin_attributes
 from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint, LinkMass
@@ -47,72 +47,55 @@ def calibrated_urdf(
     elastocal_load_point as links on the flange, `base_frame` elastocal_tracker as the new root.
     """
     assert robot.urdf is not None
-    text = _UrdfText(urdf_file(robot.urdf))
-    base, flange = text.tree.ends(robot.base, robot.flange, choose=False)
-    for i, joint in enumerate(text.tree.serial_chain(base, flange)):
-        if not nothing(correction := pieces.correction(i)):
-            text.place(joint.name, joint.origin @ correction)
-    lines = [comment(note), *text.correct_flange(pieces, flange)]
-    if tool:
-        for name, T in tool_frames(pieces).items():
-            lines += text.fixed(name, flange, name, T)
-    if base_frame:
-        lines += text.tracker_frame(pieces, base)
-    text.file.insert(text.file.end, "".join(f"  {line}\n" for line in lines))
-    return text.file.result()
+    file = urdf_file(robot.urdf)
+    tree, tags = tree_of(file), {tag.get("name").strip(): tag for tag in file.root.all("joint")}
+    base, flange = tree.ends(robot.base, robot.flange, choose=False)
+    lines = [comment(note)]
 
+    def place(joint: str, T: Array) -> None:
+        file.set_in(tags[joint], "origin", origin_attributes(T))
 
-class _UrdfText:
-    def __init__(self, file: XmlFile) -> None:
-        self.file, self.tree = file, tree_of(file)
-        self._joints = {tag.get("name").strip(): tag for tag in file.root.all("joint")}
-
-    def place(self, joint: str, T: Array) -> None:
-        self.file.set_in(self._joints[joint], "origin", origin_attributes(T))
-
-    def fixed(self, new: str, parent: str, child: str, T: Array) -> list[str]:
-        """Lines of link `new` and the fixed joint parent → child, one of which is `new`.
-
-        A frame of an earlier export is moved instead.
-        """
-        tree, name = self.tree, f"{new}_joint"
+    def add(new: str, parent: str, child: str, T: Array) -> None:
+        """Link `new` and the fixed joint parent → child, one of which is `new`; a frame of an
+        earlier export is moved instead."""
+        name = f"{new}_joint"
         old = next((joint for joint in tree.joints if joint.name == name), None)
         if old is not None and (old.kind, old.parent, old.child) == ("fixed", parent, child):
-            self.place(name, T)
-            return []
+            return place(name, T)
         if old is not None or new in tree.links:
             what = f"joint '{name}'" if old is not None else f"link '{new}'"
             raise InputError(
                 f"{tree.path}: {what} stands where export would add its own; rename it, "
                 f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
             )
-        return fixed_link(new, parent, child, T)
+        lines.extend(fixed_link(new, parent, child, T))
 
-    def correct_flange(self, pieces: ExportNumbers, flange: str) -> list[str]:
-        error = pieces.error(pieces.chain.n_joints - 1)
-        if nothing(error):
-            return []
-        last = self.tree.parent_joint[flange]
-        if last.kind == "fixed":
-            self.place(last.name, last.origin @ error)
-            return []
+    for i, joint in enumerate(tree.serial_chain(base, flange)):
+        if not nothing(correction := pieces.correction(i)):
+            place(joint.name, joint.origin @ correction)
+    last, error = tree.parent_joint[flange], pieces.error(pieces.chain.n_joints - 1)
+    if not nothing(error) and last.kind == "fixed":
+        place(last.name, last.origin @ error)
+    elif not nothing(error):
         # The flange is the link that the last joint moves: a link in between takes the correction.
-        self.file.set_in(self._joints[last.name], "child", {"link": MOUNT})
-        return self.fixed(MOUNT, MOUNT, flange, error)
-
-    def tracker_frame(self, pieces: ExportNumbers, base: str) -> list[str]:
-        tree = self.tree
-        if base == TRACKER:
-            raise InputError(
-                f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier "
-                "export; name the robot's own base link as [robot] base"
-            )
+        file.set_in(tags[last.name], "child", {"link": MOUNT})
+        add(MOUNT, MOUNT, flange, error)
+    for name, T in tool_frames(pieces).items() if tool else ():
+        add(name, flange, name, T)
+    if base_frame:
+        require(
+            base != TRACKER,
+            f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier "
+            "export; name the robot's own base link as [robot] base",
+        )
         T = pieces.T_tracker_base @ np.linalg.inv(tree.placed(base))
         if tree.root != TRACKER:
-            return self.fixed(TRACKER, TRACKER, tree.root, T)
-        below = next(joint for joint in tree.joints if joint.parent == TRACKER)
-        self.place(below.name, T @ below.origin)
-        return []
+            add(TRACKER, TRACKER, tree.root, T)
+        else:
+            below = next(joint for joint in tree.joints if joint.parent == TRACKER)
+            place(below.name, T @ below.origin)
+    file.insert(file.end, "".join(f"  {line}\n" for line in lines))
+    return file.result()
 
 
 def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
@@ -219,7 +202,13 @@ def moved(path: Path, text: str, folder: Path | None) -> tuple[str, list[str]]:
         if beside:
             return text, [f"copy it beside {path.name}: the files that it includes are there"]
         if xml.root.name == "mujoco":
-            _set_directories(xml, path, there.resolve())
+            stated = parsed(path).compiler
+            places = {key: _from(there.resolve(), home / (getattr(stated, key) or ""))
+                      for key in ("meshdir", "texturedir")}  # fmt: skip
+            if compilers := [tag for tag in xml.tags if tag.name == "compiler"]:
+                xml.set(compilers[-1], places)
+            else:
+                xml.insert_in(xml.root, f"\n  {element('compiler', places)}")
         for tag in (tag for tag in named if "filename" in tag.stated):
             place = home / tag.stated["filename"]
             if place.is_file():  # others are found in packages
@@ -234,17 +223,6 @@ def _is_file(tag: Tag, key: str) -> bool:
         relative = "://" not in name and not Path(name).is_absolute()
         return tag.name in ("mesh", "texture") and relative
     return key.startswith("file") and bool(name)
-
-
-def _set_directories(xml: XmlFile, path: Path, folder: Path) -> None:
-    stated = parsed(path).compiler
-    places = {key: _from(folder, path.parent.resolve() / (getattr(stated, key) or ""))
-              for key in ("meshdir", "texturedir")}  # fmt: skip
-    compilers = [tag for tag in xml.tags if tag.name == "compiler"]
-    if compilers:
-        xml.set(compilers[-1], places)
-    else:
-        xml.insert_in(xml.root, f"\n  {element('compiler', places)}")
 
 
 def _from(folder: Path, place: Path) -> str:
@@ -309,16 +287,12 @@ class DhRow:
     alpha: float = 0.0
     beta: float = 0.0
 
-    def leading(self) -> Array:
-        """Rz(θ) Tz(d) (4, 4): what belongs to the joint's own axis."""
-        return dh.turn(dh.Z, self.theta) @ dh.shift(dh.Z, self.d)
-
     def trailing(self) -> Array:
         """Tx(a) Rx(α) Ry(β) (4, 4)."""
         return dh.shift(dh.X, self.a) @ dh.turn(dh.X, self.alpha) @ dh.turn(dh.Y, self.beta)
 
     def transform(self) -> Array:
-        return self.leading() @ self.trailing()
+        return dh.turn(dh.Z, self.theta) @ dh.shift(dh.Z, self.d) @ self.trailing()
 
     def near(self, other: DhRow, tolerance: float = 1e-12) -> DhRow:
         """This row with the other's number wherever the two agree to rounding."""
@@ -338,11 +312,10 @@ def split(T: Array, near: DhRow | None = None, height: float = 0.0) -> tuple[DhR
     with the smaller θ.  Turns of `near` beyond π are kept.  Of nearly parallel axes d is that of
     `near`, else `height`.
     """
-    z = T[:3, 2]
-    if math.hypot(z[0], z[1]) > NEARLY_PARALLEL:
-        ways = [_skew(T, sign) for sign in (1.0, -1.0)]
-    else:
-        ways = [_parallel(T, sign, near, height) for sign in (1.0, -1.0)]
+    skew = math.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
+    height = height if near is None else near.d
+    alike = 0.0 if near is None else near.theta
+    ways = [_skew(T, s) if skew else _parallel(T, s, height, alike) for s in (1.0, -1.0)]
 
     def away(row: DhRow) -> float:
         if near is None:
@@ -365,14 +338,13 @@ def _skew(T: Array, sign: float) -> DhRow:
     return DhRow(theta, float(d), float(a), alpha)
 
 
-def _parallel(T: Array, sign: float, near: DhRow | None, height: float) -> DhRow:
+def _parallel(T: Array, sign: float, d: float, alike: float) -> DhRow:
     z, p = T[:3, 2], T[:3, 3]
-    d = height if near is None else near.d
     foot = p - (p[2] - d) / z[2] * z  # where the second axis passes through the height d
     a = sign * math.hypot(foot[0], foot[1])
     theta = math.atan2(sign * foot[1], sign * foot[0])
     if abs(a) < 1e-12:  # one axis in the other's line: any direction will do
-        theta, a = (0.0 if near is None else near.theta), 0.0
+        theta, a = alike, 0.0
     # z = Rz(θ) Rx(α) Ry(β) e_z = Rz(θ) (sin β, −sin α cos β, cos α cos β)
     c, s = math.cos(theta), math.sin(theta)
     u = (c * z[0] + s * z[1], -s * z[0] + c * z[1], z[2])
@@ -447,21 +419,18 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     """
     found = []
     for line in lines:
-        numbers = dict(zip(HEADER[2:], astuple(line.row), strict=True))
+        cells = {name: repr(value + 0.0)
+                 for name, value in zip(HEADER[2:], astuple(line.row), strict=True)}  # fmt: skip
         if (joint := line.joint) is not None:
             ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
-            numbers |= {name: value for name, value in ends if math.isfinite(value)}
-        found.append(numbers)
-    bounded = {name for numbers in found for name in numbers}
+            cells |= {name: repr(value + 0.0) for name, value in ends if math.isfinite(value)}
+        kind = dh.FIXED if joint is None else joint.kind
+        found.append(cells | dict(zip(HEADER[:2], (line.name, kind), strict=True)))
+    bounded = {name for cells in found for name in cells}
     limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
     with_beta = any(line.row.beta for line in lines)
     header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
-    rows = []
-    for line, numbers in zip(lines, found, strict=True):
-        kind = dh.FIXED if line.joint is None else line.joint.kind
-        cells = [repr(numbers[name] + 0.0) if name in numbers else "" for name in header[2:]]
-        rows.append([line.name, kind, *cells])
-    return csv_text(header, rows, comments)
+    return csv_text(header, ([cells.get(name, "") for name in header] for cells in found), comments)
 
 
 def _decompose(
@@ -509,10 +478,8 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     stems = ("theta0", "d", "a", "alpha", "beta")
     keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
     numbers = np.nan_to_num([[dh.dh_number(table, i, *key) for key in keys] for i in range(n)])
-    own = [DhRow(*row) for row in numbers.tolist()]
+    own = [DhRow(), *(DhRow(*row) for row in numbers.tolist())]
     if convention == "standard":
-        return [DhRow(), *own]
-    after = [*own[1:], DhRow()]
-    first = replace(own[0], theta=0.0, d=0.0)
-    pairs = zip(own, after, strict=True)
-    return [first, *(replace(a, theta=row.theta, d=row.d) for row, a in pairs)]
+        return own
+    pairs = zip(own, [*own[1:], DhRow()], strict=True)  # θ and d of one, the rest of the next
+    return [replace(after, theta=row.theta, d=row.d) for row, after in pairs]

@@ -82,7 +82,7 @@ class MjcfArm:
         """
         path = Path(path)
         if text is None:
-            file = mjcf_file(path)
+            file = XmlFile.read(path, "MuJoCo model", "an MJCF file")
             if path.suffix.lower() != ".xml" or file.data != path.read_bytes():
                 # MuJoCo's reader takes .xml in UTF-8 alone.
                 text = file.data.decode("utf-8-sig")
@@ -172,7 +172,13 @@ class MjcfArm:
         up = -gravity / size
         if np.abs(up - [0.0, 0.0, 1.0]).max() < 1e-9:
             return np.eye(3), f"of {base} in the file, z up"
-        return _turn(up), f"of {base}, up against the file's gravity"
+        from scipy.spatial.transform import Rotation
+
+        axis = np.cross(up, [0.0, 0.0, 1.0])
+        size = float(np.linalg.norm(axis))
+        axis = axis / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
+        turn = Rotation.from_rotvec(math.atan2(size, up[2]) * axis).as_matrix()
+        return turn, f"of {base}, up against the file's gravity"
 
     def _weights_told(self) -> list[str]:
         import mujoco
@@ -353,10 +359,6 @@ def import_mujoco(what: str = "a MuJoCo model") -> Any:
     return mujoco
 
 
-def mjcf_file(path: Path) -> XmlFile:
-    return XmlFile.read(path, "MuJoCo model", "an MJCF file")
-
-
 def parsed(path: Path, text: str | None = None) -> Any:
     mujoco = import_mujoco()
     try:
@@ -374,25 +376,8 @@ def parsed(path: Path, text: str | None = None) -> Any:
         raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(error)}") from None
 
 
-def compiled(spec: Any) -> tuple[Any, list[str]]:
-    """MuJoCo's model of a spec, and its warnings.  Raises ValueError as it does."""
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        model = spec.compile()
-    return model, [f"MuJoCo warns: {str(one.message).splitlines()[0]}" for one in found]
-
-
 def _sentence(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
-
-
-def _turn(up: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
-    axis = np.cross(up, [0.0, 0.0, 1.0])
-    size = float(np.linalg.norm(axis))
-    axis = axis / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
-    return Rotation.from_rotvec(math.atan2(size, up[2]) * axis).as_matrix()
 
 
 def _check_units(path: Path, spec: Any) -> None:
@@ -421,7 +406,9 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
     stated = [] if from_geoms else [b for b in spec.bodies if b.explicitinertial]
     strip(spec, [g for b in stated for g in b.geoms])
     first: ValueError | None = None
-    missing = _missing_meshes(path, spec)
+    used, folder = {g.meshname for g in spec.geoms}, path.parent / (spec.compiler.meshdir or "")
+    missing = {m.name: m.file for m in spec.meshes
+               if m.name in used and m.file and not (folder / m.file).is_file()}  # fmt: skip
     for lost in (missing, None):  # those, then all
         try:  # a spec that could not be compiled says so again at whatever is asked of it
             geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
@@ -429,10 +416,13 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
             strip(spec, geoms)
             if geoms:
                 spec.compiler.boundmass = spec.compiler.boundinertia = STAND_IN
-            model, notes = compiled(spec)
+            with warnings.catch_warnings(record=True) as found:
+                warnings.simplefilter("always")
+                model = spec.compile()
         except ValueError as error:
             first = first or error
             continue
+        notes = [f"MuJoCo warns: {str(one.message).splitlines()[0]}" for one in found]
         unweighed = frozenset(b.id for b in open_)
         if unweighed:
             names = listed((b.name or f"body {b.id}" for b in open_), 4)
@@ -443,16 +433,6 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
             )
         return model, unweighed, notes
     raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first or ValueError())}")
-
-
-def _missing_meshes(path: Path, spec: Any) -> dict[str, str]:
-    used = {geom.meshname for geom in spec.geoms}
-    folder = path.parent / (spec.compiler.meshdir or "")
-    return {
-        mesh.name: mesh.file
-        for mesh in spec.meshes
-        if mesh.name in used and mesh.file and not (folder / mesh.file).is_file()
-    }
 
 
 def strip(spec: Any, geoms: Iterable[Any]) -> None:

@@ -13,7 +13,7 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, reduce
 from pathlib import Path
 
 import numpy as np
@@ -235,26 +235,21 @@ class Tree:
             )
             if before < MIN_JOINTS or not 0 < after <= MOST_IN_A_FINGER:
                 continue
-            beside = [c for c in self._children[link] if c not in common and self._moves(c)]
-            if len(beside) > 1 or any(self._is_finger(c) for c in beside):
+            own = ([self.parent_joint[k] for k in self._below(child)]
+                   for child in self._children[link] if child not in common)  # fmt: skip
+            beside = [joints for joints in own if any(joint.moves for joint in joints)]
+            fingers = (j.follows is not None or FINGERS.search(j.name + j.child)
+                       for joints in beside for j in joints)  # fmt: skip
+            if len(beside) > 1 or any(fingers):
                 return link
         return common[-1]
-
-    def _moves(self, link: str) -> bool:
-        return any(self.parent_joint[below].moves for below in self._below(link))
-
-    def _is_finger(self, link: str) -> bool:
-        joints = [self.parent_joint[below] for below in self._below(link)]
-        return any(j.follows is not None or FINGERS.search(j.name + j.child) for j in joints)
 
     def _moving(self, base: str, flange: str) -> list[FileJoint]:
         return [j for j in self.joints_between(base, flange) or () if j.moves]
 
     def placed(self, link: str) -> Array:
-        T = np.eye(4)
-        for joint in self.joints_between(self.root, link) or ():
-            T = T @ joint.held
-        return T
+        held = (joint.held for joint in self.joints_between(self.root, link) or ())
+        return reduce(np.matmul, held, np.eye(4))
 
     def serial_chain(self, base: str, flange: str) -> tuple[FileJoint, ...]:
         joints = self.joints_between(base, flange)
@@ -420,9 +415,10 @@ def _check_root(file: XmlFile) -> None:
         values = [v for k, v in tag.stated.items() if k not in ("filename", "file")]
         macro = next((v for v in values if LEFT.search(v)), None)
         require(macro is None, xacro_left(path, f"'{macro}' in <{tag.name}>"))
-    other = {"mujoco": "MJCF", "sdf": "SDF"}.get(root)
-    way = 'give it as mjcf = "…"' if other == "MJCF" else "export it as URDF"
-    hint = f"; this is {other}, {way}" if other else ""
+    hint = {
+        "mujoco": '; this is MJCF, give it as mjcf = "…"',
+        "sdf": "; this is SDF, export it as URDF",
+    }.get(root, "")
     require(
         root == "robot",
         f'{path}: the root element is <{root}>, a URDF has <robot name="…">{hint}',
@@ -473,7 +469,8 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
     limit = None
     if (stated := tag.first("limit")) is not None:
         lower, upper = (
-            _limit(f"{where}, limit {side}", stated.get(side, "0")) for side in ("lower", "upper")
+            _number(f"{where}, limit {side}", stated.get(side, "0"), endless=True)
+            for side in ("lower", "upper")
         )
         limit = None if kind == "continuous" else (lower, upper)
     mimic, rpy = tag.first("mimic"), _vector(where, tag, "origin", "rpy")
@@ -518,15 +515,10 @@ def _vector(
     return x, y, z
 
 
-def _limit(what: str, text: str) -> float:
-    endless = ENDLESS_TEXT.fullmatch(text.strip())
-    if endless is None:
-        return _number(what, text)
-    return -math.inf if endless[1] == "-" else math.inf
-
-
-def _number(what: str, text: str) -> float:
+def _number(what: str, text: str, endless: bool = False) -> float:
     text = text.strip()
+    if endless and (found := ENDLESS_TEXT.fullmatch(text)):
+        return float(f"{found[1]}inf")
     value = float(text) if NUMBER.fullmatch(text) else math.nan
     require(
         math.isfinite(value), f"{what}: '{text}' is not a finite number; write e.g. 0.25 or -1.5e-3"

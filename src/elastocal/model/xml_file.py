@@ -201,17 +201,19 @@ def as_utf8(path: Path, data: bytes) -> bytes:
 
 
 def _around(data: bytes) -> str:
+    def first_line(text: bytes) -> str:
+        return printable(text.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+
     head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
     before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
-    if before.strip() or (before and head is not None and head[0] == b"<?xml"):
-        first = printable(before.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
-        told = f"'{first}' stands" if first else "blanks stand"
-        return f"{told} before {'<?xml …?>' if head and head[0] == b'<?xml' else 'it'}; remove that"
+    declared = head is not None and head[0] == b"<?xml"
+    if before.strip() or (before and declared):
+        told = f"'{first_line(before)}' stands" if before.strip() else "blanks stand"
+        return f"{told} before {'<?xml …?>' if declared else 'it'}; remove that"
     tail = re.search(rb"</(?:robot|mujoco)\s*>", data)
     after = data[tail.end() :] if tail else b""
     if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
-        first = printable(after.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
-        return f"'{first}' stands after the end of the robot; remove that"
+        return f"'{first_line(after)}' stands after the end of the robot; remove that"
     return ""
 
 
@@ -309,14 +311,26 @@ class _Model:
         for each in [v for k, v in tag.stated.items() if k.startswith("file") and v]:
             for found in self._places(file, each):
                 try:
-                    size = self._size_of(found)
+                    size = check_regular(found, "file")
+                    check_size(found, "file", size, MOST_MESH_BYTES)
+                    self._bytes += size
+                    require(
+                        self._bytes <= MOST_FILES_BYTES,
+                        f"{found}: with it the files that the model names have more than "
+                        f"{MOST_FILES_BYTES / 1e6:g} MB; keep the arm alone",
+                    )
                 except InputError as error:
                     told = f"{file.path}: <{printable(tag.name)}> names {error}"
                     raise InputError(told) from None
                 if tag.name == "flexcomp":
                     yield size / VERTEX_BYTES
                 elif tag.name == "hfield":
-                    self._count_cells(file.path, _pixels(found))
+                    # A PNG says its points where it begins, however small it is.
+                    with open_input(found, "file of <hfield>") as handle:
+                        head = handle.read(24)
+                    if head.startswith(b"\x89PNG") and len(head) == 24:
+                        sides = struct.unpack(">II", head[16:24])
+                        self._count_cells(file.path, math.prod(map(float, sides)))
 
     def _included(self, path: Path, name: str) -> Iterator[XmlFile]:
         """The files that an element of the file `path` includes by `name`: beside the model or
@@ -338,17 +352,6 @@ class _Model:
         places = {folder / place / each for folder in (file.path.parent, self._folder)
                   for place in ("", *stated) for each in names}  # fmt: skip
         return {place for place in places if os.path.lexists(place) and not place.is_dir()}
-
-    def _size_of(self, path: Path) -> int:
-        size = check_regular(path, "file")
-        check_size(path, "file", size, MOST_MESH_BYTES)
-        self._bytes += size
-        require(
-            self._bytes <= MOST_FILES_BYTES,
-            f"{path}: with it the files that the model names have more than "
-            f"{MOST_FILES_BYTES / 1e6:g} MB; keep the arm alone",
-        )
-        return size
 
     def _count_cells(self, path: Path, cells: float) -> None:
         self._cells += int(min(cells, 1e18))
@@ -387,12 +390,3 @@ def _count(tag: Tag) -> float:
     if tag.name == "replicate":
         return count
     return 5 * max(count, *(len(tag.get(k).split()) / 3 for k in ("point", "vertex")))
-
-
-def _pixels(path: Path) -> float:
-    """Points of a height field's file: a PNG says them where it begins, however small it is."""
-    with open_input(path, "file of <hfield>") as handle:
-        head = handle.read(24)
-    if head.startswith(b"\x89PNG") and len(head) == 24:
-        return math.prod(map(float, struct.unpack(">II", head[16:24])))
-    return 0.0
