@@ -50,10 +50,11 @@ def numbers(values: ArrayLike) -> str:
     return " ".join(repr(float(value)) for value in np.asarray(values, dtype=float))
 
 
-def placed_body(name: str, T: Array) -> dict[str, str]:
+def placed_body(name: str | None, T: Array) -> dict[str, str]:
     """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
-    return {"name": name, "pos": numbers(T[:3, 3]), "quat": numbers((w, x, y, z))}
+    called = {} if name is None else {"name": name}
+    return called | {"pos": numbers(T[:3, 3]), "quat": numbers((w, x, y, z))}
 
 
 def origin_attributes(T: Array) -> dict[str, str]:

@@ -4,6 +4,7 @@ or the user's own with the corrections in it."""
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 from xml.etree import ElementTree as ET
@@ -42,6 +43,7 @@ MOTIONS = {"revolute": "hinge", "prismatic": "slide"}
 # A moving body needs some mass and inertia in MuJoCo; these weigh 1e-13 N.
 NO_MASS, NO_INERTIA = 1e-14, 1e-12
 SHORTEST = 1e-3  # m; a shorter link is not drawn
+IDENTITY, NOTHING = np.eye(4), LinkMass(0.0, np.zeros(3))
 
 
 def calibrated_mjcf(
@@ -85,7 +87,7 @@ def calibrated_mjcf(
         compensated = compensator if compensator and compensator["joint"] == i else None
         if compensated:
             _compensate(root, body, T, joint.axis, compensated)
-        mass = pieces.masses[i] if pieces.masses else None
+        mass = pieces.masses[i] if pieces.masses else NOTHING
         body = _body(body, f"link{i + 1}", T @ offset, mass, inertias[i] if inertias else None)
         # Their axes stand before the body was turned by the joint's offset.
         _passive(body, in_series, np.asarray(np.linalg.inv(offset)))
@@ -124,11 +126,10 @@ def _drive(pieces: ExportNumbers, i: int) -> tuple[float, list[SpringValue]]:
 
 
 def _body(
-    parent: ET.Element, name: str, T: Array, mass: LinkMass | None = None,
+    parent: ET.Element, name: str, T: Array, mass: LinkMass = NOTHING,
     inertia: Array | None = None,
 ) -> ET.Element:  # fmt: skip
     body = ET.SubElement(parent, "body", placed_body(name, T))
-    mass = LinkMass(0.0, np.zeros(3)) if mass is None else mass
     inertial = {"pos": numbers(mass.com), "mass": repr(max(float(mass.mass), NO_MASS))}
     if inertia is not None and min(np.diag(inertia)) > NO_INERTIA:
         entries = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -139,24 +140,20 @@ def _body(
     return body
 
 
-def _passive(body: ET.Element, springs: Sequence[SpringValue], frame: Array | None = None) -> None:
+def _passive(body: ET.Element, springs: Sequence[SpringValue], frame: Array = IDENTITY) -> None:
     for spring in springs:
-        placed = np.eye(4) if frame is None else frame
-        ET.SubElement(body, "joint", spring_joint("spring_", spring, placed))
+        ET.SubElement(body, "joint", spring_joint("spring_", spring, frame))
 
 
 def spring_joint(prefix: str, spring: SpringValue, F: Array) -> dict[str, str]:
     """Attributes of the passive joint of a spring whose frame is F (4, 4) in the moved body's."""
     stiffness = 1.0 / spring.compliance
     return {
-        "name": prefix + spring.name,
-        "type": MOTIONS[spring.kind],
-        "pos": numbers(F[:3, 3]),
-        "axis": numbers(F[:3, :3] @ spring.axis),
-        "stiffness": repr(stiffness),
-        "damping": repr(SETTLING * stiffness),
+        "name": prefix + spring.name, "type": MOTIONS[spring.kind],
+        "pos": numbers(F[:3, 3]), "axis": numbers(F[:3, :3] @ spring.axis),
+        "stiffness": repr(stiffness), "damping": repr(SETTLING * stiffness),
         "armature": _armature(stiffness),
-    }
+    }  # fmt: skip
 
 
 def _armature(stiffness: float) -> str:
@@ -165,11 +162,9 @@ def _armature(stiffness: float) -> str:
 
 def motor_names(chain: Chain) -> list[str]:
     """The names of joints and their actuators: the file's, but for those that stand for others."""
-    taken = {f"load_{axis}" for axis in "xyz"}
     names = [joint.name for joint in chain.joints]
-    good = len(set(names)) == len(names) and not any(
-        name in taken or name.startswith("spring_") for name in names
-    )
+    taken = any(re.match("spring_|load_[xyz]$", name) for name in names)
+    good = len(set(names)) == len(names) and not taken
     return names if good else [f"joint{i}" for i in range(1, chain.n_joints + 1)]
 
 
@@ -351,10 +346,17 @@ def corrected_mjcf(
         raise NotInPlace("a spring behind the last joint has no joint to stand before")
     sprung: dict[int, int] = {}  # joint → springs put before it
     for i, j in enumerate(text.arm.joints):
-        text.correct_joint(i, j)
+        if not nothing(correction := pieces.correction(i)):
+            body = int(text.model.jnt_bodyid[j])
+            if joints_of(text.model, body)[0] != j:
+                name = pieces.chain.joints[i].name
+                raise NotInPlace(
+                    f"joint '{name}' shares its body with another; give it a body of its own"
+                )
+            X = before(text.model, j)
+            text.move(body, X @ correction @ np.linalg.inv(X))
         sprung[j] = text.add_springs(i, j)
-    if any(sprung.values()):
-        text.lengthen_keys(sprung)
+    text.lengthen_keys(sprung)
     told = text.let_act() if pieces.yielding else []
     told += text.correct_flange(frames)
     text.correct_masses()
@@ -392,39 +394,23 @@ class _MjcfText(XmlFile):
         ]  # fmt: skip
 
     def place(self, tag: Tag, T: Array) -> None:
-        self.set(tag, _pose(T), ORIENTATIONS[1:])
+        self.set(tag, placed_body(None, T), ORIENTATIONS[1:])
 
     def move(self, body: int, error: Array) -> None:
         """T ← T · error for the body's own attributes, whatever frames stand around it, and in
         MuJoCo's model of the file."""
         tag, own = self.bodies[body], local(self.model, body)
-        if tag.above is not None and tag.above.name == "frame":
-            own = self.stated(tag)
-        self.place(tag, own @ error)
-        for name, value in _pose(local(self.model, body) @ error).items():
+        for name, value in placed_body(None, own @ error).items():
             getattr(self.model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
-
-    def stated(self, tag: Tag) -> Array:
-        """T (4, 4) that a body's own attributes say, as MuJoCo understands them."""
-        kept = {k: v for k, v in tag.stated.items() if k in ("pos", *ORIENTATIONS)}
-        stated = [item for tag in self.anywhere("compiler") for item in tag.stated.items()]
-        how = {k: v for k, v in stated if k in ("angle", "eulerseq")}
-        world = element("worldbody", {}, element("body", kept))
-        alone = element("mujoco", {}, element("compiler", how), world)
-        model = import_mujoco().MjModel.from_xml_string(alone)
-        return transform(model.body_pos[1], model.body_quat[1])
-
-    def correct_joint(self, i: int, j: int) -> None:
-        if nothing(correction := self.pieces.correction(i)):
-            return
-        body = int(self.model.jnt_bodyid[j])
-        if joints_of(self.model, body)[0] != j:
-            name = self.pieces.chain.joints[i].name
-            raise NotInPlace(
-                f"joint '{name}' shares its body with another; give it a body of its own"
-            )
-        X = before(self.model, j)
-        self.move(body, X @ correction @ np.linalg.inv(X))
+        if tag.above is not None and tag.above.name == "frame":
+            # What its attributes say, as MuJoCo understands them.
+            kept = {k: v for k, v in tag.stated.items() if k in ("pos", *ORIENTATIONS)}
+            stated = [item for one in self.anywhere("compiler") for item in one.stated.items()]
+            how = {k: v for k, v in stated if k in ("angle", "eulerseq")}
+            world = element("worldbody", {}, element("body", kept))
+            alone = element("mujoco", {}, element("compiler", how), world)
+            own = local(import_mujoco().MjModel.from_xml_string(alone), 1)
+        self.place(tag, own @ error)
 
     def add_springs(self, i: int, j: int) -> int:
         """Put the springs between link i and joint i before the joint; returns how many."""
@@ -453,16 +439,11 @@ class _MjcfText(XmlFile):
 
     def lengthen_keys(self, sprung: dict[int, int]) -> None:
         """Zeros for the new joints in the positions and velocities of keyframes."""
-        for tag in self.anywhere("key", "keyframe"):
-            for name, address in (
-                ("qpos", self.model.jnt_qposadr),
-                ("qvel", self.model.jnt_dofadr),
-            ):
-                if name not in tag.stated:
-                    continue
+        addresses = {"qpos": self.model.jnt_qposadr, "qvel": self.model.jnt_dofadr}
+        for tag in self.anywhere("key", "keyframe") if any(sprung.values()) else ():
+            for name in addresses.keys() & tag.stated.keys():
                 values = tag.stated[name].split()
-                for j in sorted(sprung, key=lambda j: -address[j]):
-                    at = int(address[j])
+                for at, j in sorted(((int(addresses[name][j]), j) for j in sprung), reverse=True):
                     values[at:at] = ["0"] * sprung[j]
                 self.set(tag, {name: " ".join(values)})
 
@@ -489,17 +470,16 @@ class _MjcfText(XmlFile):
         """Switch on what <flag> of the file switches off, of these."""
         import mujoco
 
-        told = []
-        for name in names:
-            bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}", 0)  # as versions differ
-            if self.model.opt.disableflags & int(bit):
-                flags = self.anywhere("flag", "option")
-                if not flags:
-                    raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')
-                self.set(flags[-1], {name: "enable"})
-                what = f"{name} is switched on in this file"
-                told.append(f"{what}, so that the springs yield to weights")
-        return told
+        bits = {name: f"mjDSBL_{name.upper()}" for name in names}  # as versions differ
+        off = [name for name, bit in bits.items()
+               if self.model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, bit, 0))]  # fmt: skip
+        flags = self.anywhere("flag", "option")
+        for name in off:
+            if not flags:
+                raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')
+            self.set(flags[-1], {name: "enable"})
+        what = "is switched on in this file, so that the springs yield to weights"
+        return [f"{name} {what}" for name in off]
 
     def correct_flange(self, frames: bool) -> list[str]:
         arm, pieces = self.arm, self.pieces
@@ -536,10 +516,8 @@ class _MjcfText(XmlFile):
         model = self.model
         told = [tag.stated.get("inertiafromgeom") for tag in self.anywhere("compiler")]
         from_geoms = "true" in [value for value in told if value][-1:]
-        masses = zip(
-            self.arm.joints, self.arm.anew().chain.masses, self.pieces.masses, strict=False
-        )
-        for j, old, new in masses:
+        own = self.arm.anew().chain.masses
+        for j, old, new in zip(self.arm.joints, own, self.pieces.masses, strict=False):
             mass = new.mass - old.mass
             moment = new.mass * new.com - old.mass * old.com
             if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:
@@ -549,18 +527,9 @@ class _MjcfText(XmlFile):
             if whole <= 0 or from_geoms:
                 name = model.body(body).name
                 raise NotInPlace(f"body '{name}' cannot take the mass that is missing")
-            moment = (
-                model.body_mass[body] * model.body_ipos[body] + moment + mass * model.jnt_pos[j]
-            )
+            moment += model.body_mass[body] * model.body_ipos[body] + mass * model.jnt_pos[j]
             changed = {"mass": repr(whole), "pos": numbers(moment / whole)}
-            stated = {
-                "quat": numbers(model.body_iquat[body]),
-                "diaginertia": numbers(model.body_inertia[body]),
-            }
-            given = self.bodies[body].first("inertial")
-            self.set_in(self.bodies[body], "inertial", changed if given else changed | stated)
-
-
-def _pose(T: Array) -> dict[str, str]:
-    placed = placed_body("", T)
-    return {name: placed[name] for name in ("pos", "quat")}
+            if not self.bodies[body].first("inertial"):
+                changed["quat"] = numbers(model.body_iquat[body])
+                changed["diaginertia"] = numbers(model.body_inertia[body])
+            self.set_in(self.bodies[body], "inertial", changed)

@@ -300,7 +300,7 @@ def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measu
 
 # Industrial arms measured by trackers: radians of a campaign span more than this, degrees too.
 SMALLEST_SPREAD_DEG = 7.0  # 2 pi: a column of radians read as degrees spans less
-LARGEST_TURN = 4 * np.pi
+LARGEST_TURN_DEG = 720.0
 FARTHEST_M, LARGEST_SPREAD_M, LEAST_SPREAD_M = 150.0, 30.0, 0.02
 LARGEST_FORCE_N = 2e5
 LARGEST_SIGMA_M = 5e-3
@@ -308,69 +308,49 @@ LARGEST_SIGMA_M = 5e-3
 
 def plausibility(made: Assembled, table: Measurements, observe: str | None) -> list[str]:
     """Sentences about columns that are likely in another unit, and about pairs that are missing."""
+    turning = table.q[:, np.array([kind == "revolute" for kind in made.kinds])]
+    turned = float(np.degrees(np.abs(turning).max(initial=0.0)))
+    span = float(np.degrees(np.ptp(turning, axis=0).max(initial=0.0)))
+    several = turning.size > 0 and len(np.unique(table.q, axis=0)) >= 5
+    still = [f"joint {j + 1}" for j in range(table.q.shape[1]) if np.ptp(table.q[:, j]) == 0]
+    places = np.zeros((1, 3)) if table.position is None else table.position
+    moved = float(np.ptp(table.q, axis=0).max(initial=0.0))
     with np.errstate(over="ignore"):  # numbers of 1e300 are told as implausible, too
-        warnings = [told for told in (_joints(made, table), _positions(table)) if told]
-        force = np.linalg.norm(table.force, axis=1)
-    if force.max() > LARGEST_FORCE_N:
-        warnings.append(
-            f"forces reach {force.max():.3g} N, more than any arm carries; check [loads]"
-        )
-    if table.sigma is not None and table.sigma.max() > LARGEST_SIGMA_M:
-        warnings.append(
-            f"standard deviations reach {table.sigma.max() * 1e3:.3g} mm; are they in µm?"
-        )
-    if table.position is not None and np.any(table.force[:, 2] > 0):
-        warnings.append(
-            "some forces point up (+z of the tracker's frame); a hanging load is negative"
-        )
+        far = float(np.linalg.norm(places, axis=1).max())
+        spread = float(np.linalg.norm(np.ptp(places, axis=0)))
+        force = float(np.linalg.norm(table.force, axis=1).max())
+    sigma = 0.0 if table.sigma is None else float(table.sigma.max())
     labels, loaded = table.configuration_labels, np.any(table.force != 0, axis=1)
     states = [set(loaded[table.configuration == code]) for code in range(len(labels))]
     lonely = [label for label, found in zip(labels, states, strict=True) if len(found) == 1]
-    if observe == "deflection" and lonely:
-        warnings.append(
-            f"{len(lonely)} of {len(labels)} configurations were not measured both "
-            f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"
-        )
-    return warnings
-
-
-def _joints(made: Assembled, table: Measurements) -> str:
-    q = table.q[:, np.array([kind == "revolute" for kind in made.kinds])]
-    if not q.size:
-        return ""
-    first = next(header for header in made.columns if header.startswith("q1"))
-    if np.abs(q).max() > LARGEST_TURN:
-        return (
-            f"a joint stands at {np.degrees(np.abs(q).max()):.4g}°, more than two turns: degrees "
-            "read as radians? Map q#_deg"
-        )
-    several = len(np.unique(table.q, axis=0)) >= 5
-    span = np.degrees(np.ptp(q, axis=0)).max()
-    if several and first.endswith("_deg") and span < SMALLEST_SPREAD_DEG:
-        return f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"
-    still = [f"joint {j + 1}" for j in range(table.q.shape[1]) if np.ptp(table.q[:, j]) == 0]
-    if several and still:
-        return f"{listed(still)} never moved; is it mapped to the right column?"
-    return ""
-
-
-def _positions(table: Measurements) -> str:
-    if table.position is None:
-        return ""
-    far = float(np.linalg.norm(table.position, axis=1).max())
-    spread = float(np.linalg.norm(np.ptp(table.position, axis=0)))
-    if far > FARTHEST_M or spread > LARGEST_SPREAD_M:
-        return (
-            f"points lie up to {far:.3g} m from the tracker and span {spread:.3g} m: mm read as m? "
-            "Map x_mm, y_mm, z_mm"
-        )
-    moved = float(np.ptp(table.q, axis=0).max()) if len(table) else 0.0
-    if moved > 0.3 and spread < LEAST_SPREAD_M:
-        return (
-            f"all points lie within {spread * 1e3:.3g} mm although the arm moved: m read as mm? "
-            "Map x_m, y_m, z_m"
-        )
-    return ""
+    # Of each row the first that is so.
+    doubts = (
+        (
+            (turned > LARGEST_TURN_DEG, f"a joint stands at {turned:.4g}°, more than two turns: "
+             "degrees read as radians? Map q#_deg"),
+            (several and "q1_deg" in made.columns and span < SMALLEST_SPREAD_DEG,
+             f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"),
+            (several and still, f"{listed(still)} never moved; is it mapped to the right column?"),
+        ),
+        (
+            (far > FARTHEST_M or spread > LARGEST_SPREAD_M,
+             f"points lie up to {far:.3g} m from the tracker and span {spread:.3g} m: mm read as "
+             "m? Map x_mm, y_mm, z_mm"),
+            (table.position is not None and moved > 0.3 and spread < LEAST_SPREAD_M,
+             f"all points lie within {spread * 1e3:.3g} mm although the arm moved: m read as mm? "
+             "Map x_m, y_m, z_m"),
+        ),
+        ((force > LARGEST_FORCE_N,
+          f"forces reach {force:.3g} N, more than any arm carries; check [loads]"),),
+        ((sigma > LARGEST_SIGMA_M,
+          f"standard deviations reach {sigma * 1e3:.3g} mm; are they in µm?"),),
+        ((table.position is not None and bool(np.any(table.force[:, 2] > 0)),
+          "some forces point up (+z of the tracker's frame); a hanging load is negative"),),
+        ((observe == "deflection" and lonely,
+          f"{len(lonely)} of {len(labels)} configurations were not measured both "
+          f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"),),
+    )  # fmt: skip
+    return [told for row in doubts for told in [text for so, text in row if so][:1]]
 
 
 SLACK = 1e-6  # rad or m beyond a limit that rounding explains
@@ -430,16 +410,14 @@ def import_files(
     `name`: what messages call the table.  Nothing is written.
     """
     where, table = mapping.path, mapping.table
-    names: tuple[str, ...] = ()
-    if cell is not None:
-        names = tuple(joint.name for joint in load_chain(cell).joints)
+    names = () if cell is None else tuple(joint.name for joint in load_chain(cell).joints)
     units = table.units or mapping_file.UnitsTable()
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
     spherical = False
     for path, source in _assigned(where, files, mapping.sources):
         found = joining.with_labels(where, read_records(where, path, source, units), source.names)
-        spherical = spherical or joining.is_spherical(found)
+        spherical = spherical or not found.numbers.keys().isdisjoint(joining.SPHERICAL)
         found = joining.with_positions(found, clockwise=source.azimuth == "clockwise")
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip

@@ -21,11 +21,6 @@ HEIGHT = ("zenith", "elevation")
 SPHERICAL = ("range", "azimuth", *HEIGHT)
 
 
-def is_spherical(records: Records) -> bool:
-    """Does the file give any spherical coordinate?"""
-    return any(stem in records.numbers for stem in SPHERICAL)
-
-
 def with_positions(records: Records, clockwise: bool = False) -> Records:
     """The records with x, y, z, where the file has spherical coordinates.
 
@@ -37,10 +32,29 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     α counts counterclockwise seen from above; where `clockwise`, as theodolites count, y has the
     other sign.  Readings in the second face, ζ beyond 180° with α turned by 180°, come out right.
     """
-    if not is_spherical(records):
+    found = [stem for stem in SPHERICAL if stem in records.numbers]
+    both = [stem for stem in "xyz" if stem in records.numbers]
+    heights = [stem for stem in HEIGHT if stem in found]
+    missing = [stem for stem in ("range", "azimuth") if stem not in found]
+    missing += [] if heights else ["zenith or elevation"]
+    if not found:
         return records
-    height = _height(records)
-    numbers = dict(records.numbers)
+    require(
+        not both,
+        f"{records.source}: positions are mapped twice, as {listed(both)} and as "
+        f"{listed(found)}; keep one of the two in [source.columns]",
+    )
+    require(
+        len(heights) < 2,
+        f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
+        "gives (a level line has zenith 90° and elevation 0°)",
+    )
+    require(
+        not missing,
+        f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
+        "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]",
+    )
+    height, numbers = heights[0], dict(records.numbers)
     d = numbers.pop("range")
     alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
     if not (d > 0).all():
@@ -63,30 +77,6 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     numbers |= {"x": level * np.cos(alpha), "y": -y if clockwise else y, "z": d * np.cos(zeta)}
     kept = {stem: unit for stem, unit in records.units.items() if stem not in SPHERICAL}
     return replace(records, numbers=numbers, units=kept | dict.fromkeys("xyz", "mm"))
-
-
-def _height(records: Records) -> str:
-    found = [stem for stem in SPHERICAL if stem in records.numbers]
-    both = [stem for stem in "xyz" if stem in records.numbers]
-    if both:
-        raise InputError(
-            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
-            f"{listed(found)}; keep one of the two in [source.columns]"
-        )
-    heights = [stem for stem in HEIGHT if stem in found]
-    if len(heights) == 2:
-        raise InputError(
-            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
-            "gives (a level line has zenith 90° and elevation 0°)"
-        )
-    missing = [stem for stem in ("range", "azimuth") if stem not in found]
-    missing += [] if heights else ["zenith or elevation"]
-    if missing:
-        raise InputError(
-            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
-            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
-        )
-    return heights[0]
 
 
 GROUPS = ("configuration", "marker", "repeat", "load")
@@ -601,7 +591,11 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         empty = np.setdiff1d(np.arange(len(first)), stop[good])
         unused = tuple(f"standstill {k + 1} (from line {log.line[order[first[k]]]})" for k in empty)
     else:
-        moving = np.flatnonzero(good & _moved(at, stop, clock, q, still, 2 * settings.tolerance_s))
+        # From the row before to the one after each point; rows of other stops say nothing of it.
+        ends = [np.clip(stop + step, 0, len(q) - 1) for step in (-1, 1)]
+        soon = [np.abs(clock[k] - at) <= 2 * settings.tolerance_s for k in ends]
+        before, after = (np.where(near, k, stop) for near, k in zip(soon, ends, strict=True))
+        moving = np.flatnonzero(good & (np.abs(q[after] - q[before]) > still).any(axis=1))
         remarks = [
             f"clocks differ by {apart[good].max():.3g} s at most, {np.median(apart[good]):.3g} s "
             "in the median"
@@ -619,13 +613,3 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
     )
     row = np.where(good, order[first[stop]], -1)
     return Joined(how, row, standing[stop], None, left_out, unused, tuple(remarks))
-
-
-def _moved(
-    at: Array, row: IntArray, clock: Array, q: Array, still: Array, soon: float
-) -> NDArray[np.bool_]:
-    """(n,) whether the arm moved from the row before to the one after each point, of those that are
-    `soon` enough: rows of other stops say nothing of this one."""
-    ends = [np.clip(row + step, 0, len(q) - 1) for step in (-1, 1)]
-    before, after = (np.where(np.abs(clock[k] - at) <= soon, k, row) for k in ends)
-    return np.asarray((np.abs(q[after] - q[before]) > still).any(axis=1))
