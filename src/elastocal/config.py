@@ -190,9 +190,10 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     hints = _hints_of(cls)
     if issubclass(cls, BaseModel):
         return {
-            name: (Key(name, of.description or "", None, None, of.is_required(), hints[name]),)
+            name: (Key(name, of.description or _choice(hints[name]), None, None,
+                       of.is_required(), hints[name]),)
             for name, of in cls.model_fields.items()
-        }
+        }  # fmt: skip
     found = {}
     for name, one in cls.__dataclass_fields__.items():
         how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
@@ -221,10 +222,11 @@ def keys_of(*classes: Any, without: Sequence[str] = ()) -> list[Key]:
 
 def _choice(hint: Any) -> str:
     """The members of a Literal as a sentence lists them, or true or false."""
-    if get_origin(hint) is not Literal:
-        return "true or false"
-    *first, last = (f'"{name}"' for name in get_args(hint))
-    return f"{', '.join(first)} or {last}"
+    for one in (hint, *get_args(hint)):
+        if get_origin(one) is Literal:
+            *first, last = (f'"{name}"' for name in get_args(one))
+            return f"{', '.join(first)} or {last}"
+    return "true or false"
 
 
 def _notes(hint: Any) -> Iterator[Any]:

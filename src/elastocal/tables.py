@@ -545,8 +545,8 @@ def _read(
                 raise problem
             bare = {n: (cell.replace(",", ".").strip() for cell in texts[n]) for n in pieces}
             numbers = {n: np.array([float(t or "nan") for t in own]) for n, own in bare.items()}
-        for name, read in numbers.items():
-            pieces[name].append(read)
+        for name, own in numbers.items():
+            pieces[name].append(own)
         for name, read in labels.items():
             read += texts[name]
     values = {name: np.concatenate(read) for name, read in pieces.items()}

@@ -290,29 +290,21 @@ def export(
 
 
 def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
-    found = []
-    if kept.fitted and len(cost.forces) > 1 and not kept.exported.elastic:
-        found.append(
-            f"the arm sags under its load and this file cannot: it is fitted to all "
-            f"{len(cost.forces)} loads measured; state {option('load')} for the one that it is for"
-        )
-    spec = calibrated.model.cell.model
+    spec, loads = calibrated.model.cell.model, len(cost.forces)
     elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
-    if elastic and not cost.forces.any() and not spec.link_gravity:
-        found.append(
-            f"no load is given, so compliances cost nothing here: state one with {option('load')} "
-            "(N, in the tracker's axes)"
-        )
-    if spec.torque == "measured":
-        found.append(
-            "joint torques are taken from the load here, as a file has no measured torques"
-        )
-    if cost.unsettled:
-        found.append(
-            f"{cost.unsettled} of {cost.poses} random poses have no static equilibrium under the "
-            "load and are left out"
-        )
-    return found
+    doubts = (
+        (kept.fitted and loads > 1 and not kept.exported.elastic,
+         f"the arm sags under its load and this file cannot: it is fitted to all {loads} loads "
+         f"measured; state {option('load')} for the one that it is for"),
+        (elastic and not cost.forces.any() and not spec.link_gravity,
+         f"no load is given, so compliances cost nothing here: state one with {option('load')} "
+         "(N, in the tracker's axes)"),
+        (spec.torque == "measured",
+         "joint torques are taken from the load here, as a file has no measured torques"),
+        (cost.unsettled, f"{cost.unsettled} of {cost.poses} random poses have no static "
+         "equilibrium under the load and are left out"),
+    )  # fmt: skip
+    return [told for so, told in doubts if so]
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:

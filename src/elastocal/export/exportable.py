@@ -3,7 +3,6 @@ the file can do instead."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -159,26 +158,25 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     are those at the deflected pose.  `only` makes the change of one of them alone.
     """
     cell, values = part.model.cell, dict(part.values)
-    changed = defaultdict[str, list[str]](list)
-    spec = cell.model
+    changed, spec = list[tuple[str, str]](), cell.model
     if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):
+        told = []
         for joint, levels in spec.compliance_levels.items():
             names = [f"{joint}.compliance_level{k + 1}" for k in range(len(levels))]
             if names[0] in values:
                 values[f"{joint}.compliance"] = float(np.mean([values[name] for name in names]))
-                told = f"one spring with the mean compliance of {joint}'s {len(names)} levels"
-                changed[LEVELS].append(told)
+                told += [f"one spring with the mean compliance of {joint}'s {len(names)} levels"]
+        changed += [(LEVELS, "; ".join(told))] if told else []
         spec = replace(spec, compliance_levels={})
     if spec.deflection_model == "linear" and only in (None, LINEAR):
         spec = replace(spec, deflection_model="equilibrium")
-        changed[LINEAR] = ["springs settle under the load at the deflected pose, eq. (3) not"]
+        changed += [(LINEAR, "springs settle under the load at the deflected pose, eq. (3) not")]
     model = Model.assembled(part.model.chain, replace(cell, model=spec))
     negative = [p.name for p in model.parameters if p.lower == 0.0 and values[p.name] < 0.0]
     if negative and only in (None, NEGATIVE):
         values |= dict.fromkeys(negative, 0.0)
-        changed[NEGATIVE] = [f"rigid, as no spring yields so: {', '.join(negative)}"]
-    omitted = [(effect, "; ".join(sentences)) for effect, sentences in changed.items()]
-    return Valued(model, np.array([values[name] for name in model.names])), omitted
+        changed += [(NEGATIVE, f"rigid, as no spring yields so: {', '.join(negative)}")]
+    return Valued(model, np.array([values[name] for name in model.names])), changed
 
 
 # The numbers of an exported model: joint placements, markers, springs, masses.
@@ -276,32 +274,28 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     given = {"time": conditions.time, "temperature": conditions.temperature}
     inputs = [np.full(s.shape[0], given.get(name) or 0.0) for name, s in arm.inputs.items()]
     expressions = [
-        *arm.links,
         ca.vertcat(*arm.q),
         arm.T_tracker_base,
-        *arm.markers.values(),
-        *arm.marker_rotation.values(),
         ca.vertcat(ca.SX.zeros(0, 1), *[spring.law(ca.SX(1.0)) for spring in arm.springs]),
+        *arm.links,
+        *(rigid.transform(arm.marker_rotation[name], at) for name, at in arm.markers.items()),
     ]
     function = ca.Function("pieces", [*arm.inputs.values(), symbolic.p], expressions)
-    found = [value.full() for value in function.call([*inputs, part.x])]
+    found = (value.full() for value in function.call([*inputs, part.x]))
+    offsets, T_tracker_base, compliances, *placed = found
     n, values = model.chain.n_joints, part.values
-    links, (offsets, T_tracker_base), rest = found[:n], found[n : n + 2], found[n + 2 :]
-    markers = {name: np.eye(4) for name in arm.markers}
-    for k, T in enumerate(markers.values()):
-        T[:3, 3], T[:3, :3] = rest[k][:, 0], rest[len(markers) + k]
     scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
     return ExportNumbers(
         chain=model.chain,
-        links=tuple(links),
+        links=tuple(placed[:n]),
         offsets=offsets[:, 0],
         T_tracker_base=T_tracker_base,
-        markers=markers,
+        markers=dict(zip(arm.markers, placed[n:], strict=True)),
         load_point=model.cell.tool.load_point + np.array(shift),
         load_scale=1.0 + scale,
         springs=tuple(
             SpringValue(s.name, s.site, s.kind, s.axis, float(k))
-            for s, k in zip(arm.springs, rest[-1][:, 0], strict=True)
+            for s, k in zip(arm.springs, compliances[:, 0], strict=True)
         ),
         masses=_masses(model.chain, values, model.cell.model.link_gravity),
     )

@@ -20,7 +20,7 @@ from elastocal.files import read_bytes
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
-from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, local, transform
+from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, transform
 from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile, comment, element
 from elastocal.text import listed
 from elastocal.units import Array
@@ -399,9 +399,10 @@ class _MjcfText(XmlFile):
     def move(self, body: int, error: Array) -> None:
         """T ← T · error for the body's own attributes, whatever frames stand around it, and in
         MuJoCo's model of the file."""
-        tag, own = self.bodies[body], local(self.model, body)
+        tag, model = self.bodies[body], self.model
+        own = transform(model.body_pos[body], model.body_quat[body])
         for name, value in placed_body(None, own @ error).items():
-            getattr(self.model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
+            getattr(model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
         if tag.above is not None and tag.above.name == "frame":
             # What its attributes say, as MuJoCo understands them.
             kept = {k: v for k, v in tag.stated.items() if k in ("pos", *ORIENTATIONS)}
@@ -409,7 +410,8 @@ class _MjcfText(XmlFile):
             how = {k: v for k, v in stated if k in ("angle", "eulerseq")}
             world = element("worldbody", {}, element("body", kept))
             alone = element("mujoco", {}, element("compiler", how), world)
-            own = local(import_mujoco().MjModel.from_xml_string(alone), 1)
+            model = import_mujoco().MjModel.from_xml_string(alone)
+            own = transform(model.body_pos[1], model.body_quat[1])
         self.place(tag, own @ error)
 
     def add_springs(self, i: int, j: int) -> int:
@@ -470,10 +472,9 @@ class _MjcfText(XmlFile):
         """Switch on what <flag> of the file switches off, of these."""
         import mujoco
 
-        bits = {name: f"mjDSBL_{name.upper()}" for name in names}  # as versions differ
-        off = [name for name, bit in bits.items()
-               if self.model.opt.disableflags & int(getattr(mujoco.mjtDisableBit, bit, 0))]  # fmt: skip
-        flags = self.anywhere("flag", "option")
+        flags, kinds = self.anywhere("flag", "option"), mujoco.mjtDisableBit
+        bits = {name: int(getattr(kinds, f"mjDSBL_{name.upper()}", 0)) for name in names}
+        off = [name for name, bit in bits.items() if self.model.opt.disableflags & bit]
         for name in off:
             if not flags:
                 raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')

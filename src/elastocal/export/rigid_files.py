@@ -247,11 +247,9 @@ def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Ar
     ends = [model.getFrameId(name, pin.FrameType.BODY) for name in (base, flange)]
     numbers = [model.getJointId(name) for name in joints]
     for row in q:
-        position = pin.neutral(model)
-        for number, value in zip(numbers, row, strict=True):
-            at = model.joints[number].idx_q
-            turns = model.joints[number].nq == 2  # without limits: (cos q, sin q)
-            position[at : at + 1 + turns] = [np.cos(value), np.sin(value)] if turns else [value]
+        motion = np.zeros(model.nv)  # a position is (cos q, sin q) where there are no limits
+        motion[[model.joints[number].idx_v for number in numbers]] = row
+        position = pin.integrate(model, pin.neutral(model), motion)
         pin.framesForwardKinematics(model, data, position)
         start, end = (data.oMf[frame].homogeneous for frame in ends)
         found.append(np.linalg.solve(start, end))

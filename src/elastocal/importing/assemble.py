@@ -39,7 +39,7 @@ UNLOADED = ("none", "unloaded", "0")
 def forces_of(
     where: str,
     points: Records,
-    loads: Mapping[str, NDArray[np.float64] | mapping_file.LoadStatesTable] | None,
+    loads: Mapping[str, NDArray[np.float64] | mapping_file.LoadStatesTable],
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
@@ -51,7 +51,7 @@ def forces_of(
     if named is None:
         require(
             not loads or bool(points.forces),
-            f"{where}: [loads] names {listed(loads or ())}, but no file says which load it belongs "
+            f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
             "to; give load in [[source]], or a group (?P<load>…) in a pattern",
         )
         return None
@@ -61,7 +61,7 @@ def forces_of(
         "one",
     )
     known = {name: np.zeros(3) for name in UNLOADED}
-    for name, stated in (loads or {}).items():
+    for name, stated in loads.items():
         if isinstance(stated, mapping_file.LoadStatesTable):
             stated = np.array([0.0, 0.0, -stated.mass_kg * GRAVITY])
         known[name] = stated + 0.0  # no -0.0
@@ -97,7 +97,7 @@ def load_in(text: str) -> tuple[str, float] | None:
 
 
 def with_loads_of_names(
-    by_role: Mapping[str, list[Records]], loads: Mapping[str, Any] | None
+    by_role: Mapping[str, list[Records]], loads: Mapping[str, Any]
 ) -> tuple[dict[str, list[Records]], list[str]]:
     """The records with the loads that their files are named for, where nothing else states any, and
     what to tell.  They hang straight down."""
@@ -177,7 +177,7 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
     within same_pose_deg.  Repeats are numbered in order where the file does not number them.  Times
     are counted from the first reading.
     """
-    settings, n = mapping.join or mapping_file.JoinTable(), len(points)
+    settings, n = mapping.join, len(points)
     numbers, units = dict(points.numbers), dict(points.units)
     stems = joint_stems(numbers)
     if not stems:
@@ -264,15 +264,6 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
                 "shots numbered in order"
             )
     return np.array([int(text) for text in stated], dtype=np.int64)
-
-
-def table_text(made: Assembled) -> str:
-    """The CSV of docs/file-formats.md; numbers with the digits that read back exactly."""
-    columns = [
-        [repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
-        for values in made.columns.values()
-    ]
-    return csv_text(made.columns, zip(*columns, strict=True))
 
 
 def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measurements:
@@ -411,12 +402,13 @@ def import_files(
     """
     where, table = mapping.path, mapping.table
     names = () if cell is None else tuple(joint.name for joint in load_chain(cell).joints)
-    units = table.units or mapping_file.UnitsTable()
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
     spherical = False
     for path, source in _assigned(where, files, mapping.sources):
-        found = joining.with_labels(where, read_records(where, path, source, units), source.names)
+        found = joining.with_labels(
+            where, read_records(where, path, source, table.units), source.names
+        )
         spherical = spherical or not found.numbers.keys().isdisjoint(joining.SPHERICAL)
         found = joining.with_positions(found, clockwise=source.azimuth == "clockwise")
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
@@ -441,7 +433,10 @@ def import_files(
     if log is not None and joined is not None:
         points = with_joint_values(points, log, joined)
     made = assemble(where, points, table)
-    text = table_text(made)
+    # Numbers with the digits that read back exactly.
+    cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
+             for values in made.columns.values()]  # fmt: skip
+    text = csv_text(made.columns, zip(*cells, strict=True))
     measured = validated(text, name, made, cell)
     fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
     remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]

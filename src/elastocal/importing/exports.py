@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import (
@@ -28,7 +28,7 @@ from elastocal.importing.mapping_file import (
     UnitsTable,
 )
 from elastocal.tables import MAX_LINE, NUMBER, column, first_bad_cell
-from elastocal.text import quoted
+from elastocal.text import listed, quoted
 from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
 
 MAX_BYTES = 300_000_000
@@ -175,14 +175,14 @@ def table_rows(
     it has as many cells.  Lines above the table, repeated headers and lines that match `ignore` are
     passed over and listed.
     """
-    guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
+    guess = NumberCells("auto", settings.thousands, settings.missing, ())
     places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
 
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    named = mapping_file.by_name(asked)
-    marks = tuple(settings.comments or ())
+    named = any(isinstance(part, str) for c in asked if c.required for part in c.parts)
+    marks = tuple(settings.comments)
     skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
     with bounded(source, lines if skip else ()):
@@ -196,13 +196,12 @@ def table_rows(
                 content.append((number, line))
     if not content:
         raise InputError(f"{source}: only comments and blank lines; export the points again")
-    chosen: str = settings.delimiter or "auto"
-    tried = _by_numbers(content) if chosen == "auto" else [chosen]
+    tried = _by_numbers(content) if settings.delimiter == "auto" else [settings.delimiter]
     # Some write the names of the columns as a comment.
     mark = re.compile("".join(f"(?:{re.escape(m)})?" for m in sorted(marks, key=len, reverse=True)))
-    bare = [(number, mark.sub("", line, count=1)) for number, line in comments[:SAMPLE]]
+    plain = [(number, mark.sub("", line, count=1)) for number, line in comments[:SAMPLE]]
     delimiter, header_line, header = (
-        _named_header(source, tried, [*content[:SAMPLE], *bare], asked)
+        _named_header(source, tried, [*content[:SAMPLE], *plain], asked)
         if named else _unnamed_header(source, tried[0], content, is_data)
     )  # fmt: skip
     rows: list[Line] = []
@@ -219,8 +218,14 @@ def table_rows(
             rows.append((number, cells))
     if not rows:
         raise InputError(f"{source}: a header but no readings below it; export the points")
-    if named and not header_line:
-        raise mapping_file.no_header(source, asked, rows[:SAMPLE])
+    if named and not header_line:  # which line comes nearest, and what it lacks
+        found = [(*row, mapping_file.lacking(asked, row[1])) for row in rows[:SAMPLE]]
+        number, cells, absent = min(found, key=lambda row: len(row[2]))
+        raise InputError(
+            f"{source}: no line has all the columns that the mapping names; line {number} has "
+            f"{listed(map(quoted, cells), 12)}, but not {listed(absent, 8)}: correct "
+            "the names, the delimiter or the comments in [source], or give columns by number"
+        )
     told = tuple(line for _, line in comments)
     return Rows(header, rows, ignored, header_line, delimiter, told)
 
@@ -303,11 +308,9 @@ class NumberCells:
             bare = [self._bare(cell) for cell in sample]
             # Where a cell has both, the last is the decimal mark and the other is told as wrong.
             both = next((cell for cell in bare if "." in cell and "," in cell), None)
-            points = any("." in cell for cell in bare)
-            commas = any("," in cell for cell in bare)
-            self.decimal = "," if commas and not points else "."
-            if both is not None:
-                self.decimal = max(".,", key=both.rfind)
+            points, commas = (any(mark in cell for cell in bare) for mark in ".,")
+            usual = "," if commas and not points else "."
+            self.decimal = max(".,", key=both.rfind) if both else usual
 
     def _bare(self, cell: str) -> str:
         text = cell.strip()
@@ -375,6 +378,8 @@ def seconds_of(
 KRL_AXES = tuple(f"{letter}{i}" for letter in "AE" for i in range(1, 7))
 RAPID_AXES = (*(f"rax_{i}" for i in range(1, 7)), *(f"eax_{letter}" for letter in "abcdef"))
 NOT_CONNECTED = 9e9  # what RAPID writes for an external axis that does not exist
+NO_JOINTS = dict.fromkeys(("o_robtarget", "o_jointtarget"), "the position before a correction")
+NO_JOINTS["robtarget"] = "no joint values"
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 # Names begin where a word does, and no part gives back what it took: a line that is no statement
 # is looked through once, not from each of its letters.
@@ -415,13 +420,12 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
                 )
         kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
         rows.append((line, [name, *(kept.get(axis, "") for axis in axes)]))
-    if not rows:
-        n = len(ignored)
-        passed_over = f" ({n} Cartesian positions passed over)" if n else ""
-        raise InputError(
-            f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
-            "its format in [source.text]"
-        )
+    passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
+    require(
+        bool(rows),
+        f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
+        "its format in [source.text]",
+    )
     # Axes that no row has (E1 … of a robot without them) are no columns.
     used = [0, *(i for i in range(1, len(axes) + 1) if any(cells[i] for _, cells in rows))]
     rows = [(line, [cells[i] for i in used]) for line, cells in rows]
@@ -450,16 +454,13 @@ def _rapid(whole: str) -> Found:
     start = 0
     for statement in whole.split(";"):
         declared = _RAPID_NAME.search(statement)
-        kind = (declared[1] or "").lower() if declared else ""
-        name = declared[2] if declared else ""
-        if declared and kind in ("robtarget", "o_robtarget", "o_jointtarget"):
-            before = kind.startswith("o_")
-            reason = "the position before a correction" if before else "no joint values"
-            yield start + declared.start(2), name, f"is {kind}: {reason}"
+        kind, name, several = declared.groups() if declared else ("", "", "")
+        if declared and (why := NO_JOINTS.get((kind or "").lower())):
+            yield start + declared.start(2), name, f"is {kind.lower()}: {why}"
         else:
-            several, k = bool(declared and declared[3]), 0
+            k = 0
             for match in _RAPID_PAIR.finditer(statement):
-                cells = [[part.strip() for part in match[k].split(",")] for k in (1, 2)]
+                cells = [[part.strip() for part in match[i].split(",")] for i in (1, 2)]
                 if list(map(len, cells)) == [6, 6]:
                     k += 1
                     values = dict(zip(RAPID_AXES, cells[0] + cells[1], strict=True))
@@ -591,10 +592,10 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     A row with an empty cell where a number belongs is passed over and listed; of a marker without
     a value that one alone.
     """
-    settings, name = source.text or TextSourceKeys(), str(path)
-    asked = mapping_file.wanted(where, source.columns or {}, source.optional or {})
-    lines, encoding = read_lines(path, settings.encoding or "auto")
-    if settings.format in ("krl", "rapid"):
+    settings, name = source.text, str(path)
+    asked = mapping_file.wanted(where, source.columns, source.optional)
+    lines, encoding = read_lines(path, settings.encoding)
+    if settings.format != "table":
         table = program_rows(name, lines, settings.format)
     else:
         table = table_rows(name, lines, settings, asked)
@@ -610,15 +611,20 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     }
     every = [c for own in columns.values() for c in own]
     cells = NumberCells(
-        settings.decimal or "auto",
-        settings.thousands or "none",
-        settings.missing or (),
+        settings.decimal, settings.thousands, settings.missing,
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in every if not c.is_text and c.index[0] < len(row)),
     )  # fmt: skip
     kept, values, ignored = _rows(name, table, columns, cells)
-    numbers, of = _numbers(columns, values, kept, source.coverage_factor or 1.0)
-    texts = _texts([row for _, row, _ in kept], next(iter(columns.values())))
+    numbers, of = _numbers(columns, values, kept, source.coverage_factor)
+    texts = {}
+    for c in (c for c in next(iter(columns.values())) if c.is_text):
+        glue = " " if c.stem == "time_text" else "::"
+        texts[c.stem] = [glue.join(row[i].strip() for i in c.index) for _, row, _ in kept]
+        # A load that is a bare size gets the unit in its header.
+        if c.stem == "load" and (unit := re.search(UNIT_OF_LOAD, c.header)):
+            bare = re.compile(r"[\d.,]+")
+            texts["load"] = [f"{t} {unit[1]}" if bare.fullmatch(t) else t for t in texts["load"]]
     if "" not in columns:
         texts["marker"] = [marker for _, _, marker in kept]
     line = np.array([number for number, _, _ in kept], dtype=np.int64)
@@ -630,17 +636,11 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         numbers["time"], of["time"] = np.array(seconds), "s"
     used = {i for c in every for i in c.index}
     understood = Understood(
-        file=name,
-        preset=source.preset,
-        role=source.role or "both",
-        encoding=encoding,
-        layout=table.layout,
-        decimal=cells.decimal,
+        name, source.preset, source.role or "both", encoding, table.layout, cells.decimal,
         columns=tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
         unused=tuple(n or f"column {i + 1}" for i, n in enumerate(table.header) if i not in used),
-        rows=len(kept),
-        ignored=tuple(sorted({*table.ignored, *ignored})),
-    )
+        rows=len(kept), ignored=tuple(sorted({*table.ignored, *ignored})),
+    )  # fmt: skip
     file = np.zeros(len(line), dtype=np.int64)
     return Records((name,), file, line, numbers, of, texts, understood, source.load)
 
@@ -698,20 +698,6 @@ def _numbers(
             # Seconds and nanoseconds of a time add up.
             numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += found
     return numbers, of
-
-
-def _texts(rows: Sequence[list[str]], columns: Sequence[ColumnKey]) -> dict[str, list[str]]:
-    """The texts by column; a load that is a bare size gets the unit in its header."""
-    loads = (re.search(UNIT_OF_LOAD, c.header) for c in columns if c.stem == "load")
-    unit = next((found[1] for found in loads if found), "")
-    texts = {}
-    for c in (c for c in columns if c.is_text):
-        glue = " " if c.stem == "time_text" else "::"
-        found = [glue.join(row[i].strip() for i in c.index) for row in rows]
-        if c.stem == "load":
-            found = [f"{t} {unit}".strip() if re.fullmatch(r"[\d.,]+", t) else t for t in found]
-        texts[c.stem] = found
-    return texts
 
 
 def likely_presets(path: Path) -> list[str]:

@@ -83,25 +83,16 @@ GROUPS = ("configuration", "marker", "repeat", "load")
 NAMED = "write pattern in [source.names]"
 
 
-def with_labels(where: str, records: Records, names: NamesTable | None) -> Records:
+def with_labels(where: str, records: Records, names: NamesTable) -> Records:
     """The records with the texts of GROUPS, from columns and, where a pattern is given, from names.
 
     A group that a column gives too is taken from the column.  A name that no pattern matches is
     an error, or with unmatched = "ignore" passed over and listed.
     """
-    names = names or NamesTable()
-    named, found = records.texts.get("name"), dict[str, list[str]]()
-    if names.pattern is not None and named is not None:
-        found, bad = _labels_of_names(where, records, names, named)
-        if bad:
-            keep, old = np.setdiff1d(np.arange(len(records)), bad), records.understood
-            told = ((int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad)
-            ignored = tuple(sorted([*old.ignored, *told]))
-            understood = replace(old, rows=len(keep), ignored=ignored)
-            records = replace(records.take(keep), understood=understood)
-            found = {stem: [texts[i] for i in keep] for stem, texts in found.items()}
-    labels = found | {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
-    if names.markers and "marker" in labels:
+    if names.pattern is not None and "name" in records.texts:
+        records = _with_names_read(where, records, names)
+    labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
+    if "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
     if names.in_order and "marker" not in labels:
         n = len(names.in_order)
@@ -122,9 +113,8 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
     return replace(records, texts=records.texts | labels)
 
 
-def _labels_of_names(
-    where: str, records: Records, names: NamesTable, named: list[str]
-) -> tuple[dict[str, list[str]], list[int]]:
+def _with_names_read(where: str, records: Records, names: NamesTable) -> Records:
+    named = records.texts["name"]
     patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
     expressions = [exports.compiled(where, "pattern", text) for text in patterns]
     for expression in expressions:
@@ -155,11 +145,15 @@ def _labels_of_names(
         if empty:
             default = "0" if stem == "repeat" else "none"
             present[stem] = [text or default for text in texts]
-    return present, bad
+    reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
+    good = np.setdiff1d(np.arange(len(records)), bad)
+    kept = replace(records, texts=present | records.texts).take(good)
+    ignored = tuple(sorted([*records.understood.ignored, *reasons]))
+    return replace(kept, understood=replace(records.understood, rows=len(kept), ignored=ignored))
 
 
 def with_joints(
-    where: str, records: Records, joints: JointsTable | None, model_names: Sequence[str] = ()
+    where: str, records: Records, joints: JointsTable, model_names: Sequence[str] = ()
 ) -> Records:
     """The records with q1 … qn as the robot model counts them: order, sign, offset, coupling.
 
@@ -180,14 +174,9 @@ def with_joints(
             f"{records.source}: the mapping fills {listed(stems)}, but not q"
             f"{int(wrong[0][1:]) - 1}; joints are numbered from 1 without gaps"
         )
-    joints = joints or JointsTable()
-    values = [records.numbers[stem] for stem in stems]
-    units = [records.units[stem] for stem in stems]
     taken = _order(where, records, joints, model_names, len(stems))
-    if taken is not None:
-        per_row = np.stack(values)
-        values = [per_row[taken[:, j], np.arange(len(records))] for j in range(taken.shape[1])]
-        units = [units[int(taken[0, j])] for j in range(taken.shape[1])]
+    values = list(records.q[np.arange(len(records))[:, None], taken].T)
+    units = [records.units[stems[j]] for j in taken[0]]
     n = len(values)
     for key in ("sign", "offset_deg", "offset_mm"):
         given = getattr(joints, key)
@@ -202,7 +191,7 @@ def with_joints(
         given = joints.offset_deg if unit == "deg" else joints.offset_mm
         values[j] = values[j] * (joints.sign or [1] * n)[j] + (given or [0.0] * n)[j]
     before = list(values)
-    for k, coupling in enumerate(joints.coupling or ()):
+    for k, coupling in enumerate(joints.coupling):
         for name in ("joint", "of"):
             number = getattr(coupling, name)
             require(
@@ -229,27 +218,26 @@ def with_joints(
 
 def _order(
     where: str, records: Records, joints: JointsTable, model_names: Sequence[str], n: int
-) -> np.ndarray | None:
-    if joints.order is not None:
-        order = joints.order
-        if max(order) > n or len(set(order)) < len(order):
-            raise InputError(
-                f"{where}: [joints] order = {order} takes each of the file's {n} joints at most "
-                "once"
-            )
-        return np.tile(np.array(order) - 1, (len(records), 1))
+) -> IntArray:
+    """(rows, joints): the file's joint, from 0, for each joint of the robot."""
+    order = joints.order or list(range(1, n + 1))
+    require(
+        max(order) <= n and len(set(order)) == len(order),
+        f"{where}: [joints] order = {order} takes each of the file's {n} joints at most once",
+    )
+    as_stated = np.tile(np.array(order) - 1, (len(records), 1))
     columns = [records.texts[f"joint{i}"] for i in range(1, n + 1) if f"joint{i}" in records.texts]
-    if len(columns) != n:
-        if joints.names is not None:
-            raise InputError(
-                f"{where}: [joints] names needs the joint names of the file: add "
-                'joint# = "name_#0" to [source.columns], or use order'
-            )
-        return None
+    if joints.order is not None or len(columns) != n:
+        require(
+            joints.order is not None or joints.names is None,
+            f"{where}: [joints] names needs the joint names of the file: add "
+            'joint# = "name_#0" to [source.columns], or use order',
+        )
+        return as_stated
     found = list(zip(*columns, strict=True))
     wanted = joints.names or (model_names if set(model_names) <= set(found[0]) else None)
     if not wanted:
-        return None
+        return as_stated
     orders: dict[tuple[str, ...], list[int]] = {}
     rows = []
     for i, names in enumerate(found):
@@ -365,9 +353,8 @@ class Joined:
     remarks: tuple[str, ...]
 
 
-def join(where: str, points: Records, log: Records, settings: JoinTable | None) -> Joined:
+def join(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
     """By name where names agree, by time where both have one, else by order, unless stated."""
-    settings = settings or JoinTable()
     named = points.texts.get("configuration")
     both = points.time is not None and log.time is not None
     obvious = "time" if both else "order"

@@ -48,19 +48,15 @@ COLUMNS = (
 class TextSourceKeys(Table):
     """How the text is written; what is left out is found out or taken from the preset."""
 
-    format: Literal["table", "krl", "rapid"] | None = key('"table", "krl" or "rapid"')
-    encoding: Literal["auto", "utf-8", "utf-16", "cp1252", "latin-1"] | None = key(
-        '"auto", "utf-8", "utf-16", "cp1252" or "latin-1"'
-    )
-    delimiter: Literal["auto", ",", ";", "tab", "space"] | None = key(
-        '"auto", ",", ";", "tab" or "space"'
-    )
-    decimal: Literal["auto", ".", ","] | None = key('"auto", "." or ","')
-    thousands: Literal["none", ",", ".", " ", "'"] | None = key('"none", ",", ".", " " or "\'"')
-    comments: list[Text] | None = key('a list of what begins a comment line, as in ["//", "#"]')
+    format: Literal["table", "krl", "rapid"] = "table"
+    encoding: Literal["auto", "utf-8", "utf-16", "cp1252", "latin-1"] = "auto"
+    delimiter: Literal["auto", ",", ";", "tab", "space"] = "auto"
+    decimal: Literal["auto", ".", ","] = "auto"
+    thousands: Literal["none", ",", ".", " ", "'"] = "none"
+    comments: list[Text] = key('a list of what begins a comment line, as in ["//", "#"]', [])
     ignore: Text | None = key("a regular expression for lines to pass over")
     unit_comment: Text | None = key("a regular expression with a group (?P<unit>…)")
-    missing: list[str] | None = key('a list of cells that mean no value, as in ["-", "n/a"]')
+    missing: list[str] = key('a list of cells that mean no value, as in ["-", "n/a"]', [])
 
 
 class NamesTable(Table):
@@ -70,8 +66,8 @@ class NamesTable(Table):
         "a regular expression with groups (?P<configuration>…), (?P<marker>…), (?P<repeat>…), "
         "(?P<load>…), or a list of them to be tried in order"
     )
-    unmatched: Literal["refuse", "ignore"] | None = key('"refuse" or "ignore"')
-    markers: dict[str, Text] | None = key('names by what the file says, as in { "1" = "M1" }')
+    unmatched: Literal["refuse", "ignore"] = "refuse"
+    markers: dict[str, Text] = key('names by what the file says, as in { "1" = "M1" }', {})
     in_order: Texts | None = key('the markers in the order they are measured, as in ["M1", "M2"]')
 
 
@@ -80,17 +76,17 @@ class SourceTable(Table):
 
     preset: Text | None = key(f"the name of a preset: {', '.join(PRESETS)}")
     files: Texts | None = key('patterns of file names, as in ["loaded_*.txt"]')
-    role: Literal["points", "joints", "both"] | None = key('"points", "joints" or "both"')
+    role: Literal["points", "joints", "both"] | None = None
     load: Text | None = key("the name of a load of [loads], for all of these files")
     time_format: Text | Texts | None = key('how time_text is written, as in "%d.%m.%Y %H:%M:%S"')
-    coverage_factor: Positive | None = key("a positive number k: the sigma columns hold k sigma")
-    azimuth: Literal["counterclockwise", "clockwise"] | None = key(
-        '"counterclockwise" or "clockwise", seen from above'
+    coverage_factor: Positive = key("a positive number k: the sigma columns hold k sigma", 1.0)
+    azimuth: Literal["counterclockwise", "clockwise"] = key(
+        '"counterclockwise" or "clockwise", seen from above', "counterclockwise"
     )
-    text: TextSourceKeys | None = key("a table")
-    columns: dict[str, Where] | None = key(COLUMNS)
-    optional: dict[str, Where] | None = key(COLUMNS + "; these may be absent")
-    names: NamesTable | None = key("a table")
+    text: TextSourceKeys = key("a table", TextSourceKeys())
+    columns: dict[str, Where] = key(COLUMNS, {})
+    optional: dict[str, Where] = key(COLUMNS + "; these may be absent", {})
+    names: NamesTable = key("a table", NamesTable())
 
 
 class CouplingTable(Table):
@@ -109,7 +105,7 @@ class JointsTable(Table):
     sign: list[float] | None = key("1 or -1 per joint")
     offset_deg: list[float] | None = key("degrees per joint, added after the sign")
     offset_mm: list[float] | None = key("mm per joint, added after the sign, for prismatic joints")
-    coupling: list[CouplingTable] | None = key("tables { joint = 3, of = 2, factor = 1.0 }")
+    coupling: list[CouplingTable] = key("tables { joint = 3, of = 2, factor = 1.0 }", [])
 
 
 class LoadStatesTable(Table):
@@ -119,9 +115,7 @@ class LoadStatesTable(Table):
 class JoinTable(Table):
     """How a point finds its joint values."""
 
-    by: Literal["order", "name", "time", "standstill"] | None = key(
-        '"order", "name", "time" or "standstill"'
-    )
+    by: Literal["order", "name", "time", "standstill"] | None = None
     points_per_pose: Annotated[int, Field(ge=1)] | None = key(
         "a whole number >= 1: points measured in each pose, for order"
     )
@@ -130,7 +124,7 @@ class JoinTable(Table):
     still_deg: Positive = key("a positive number of degrees: motion that counts as none", 0.01)
     still_mm: Positive = key("a positive number of mm, for prismatic joints", 0.01)
     still_s: NonNegative = key("a number >= 0 in s: the shortest standstill that counts", 1.0)
-    unmatched: Literal["refuse", "leave_out"] | None = key('"refuse" or "leave_out"')
+    unmatched: Literal["refuse", "leave_out"] = "refuse"
     same_pose_deg: Positive = key("a positive number: joints this near are the same pose", 0.05)
     same_pose_mm: Positive = key("a positive number of mm, for prismatic joints", 0.05)
 
@@ -138,19 +132,20 @@ class JoinTable(Table):
 class UnitsTable(Table):
     """Units of presets' columns where the file does not say them."""
 
-    length: Literal["mm", "m", "um", "cm", "in"] | None = key('"mm", "m", "um", "cm" or "in"')
-    angle: Literal["deg", "rad", "mrad", "gon"] | None = key('"deg", "rad", "mrad" or "gon"')
+    length: Literal["mm", "m", "um", "cm", "in"] | None = None
+    angle: Literal["deg", "rad", "mrad", "gon"] | None = None
 
 
 class MappingTable(Table):
     source: Annotated[list[SourceTable], Field(min_length=1)] | None = key("[[source]] tables")
-    units: UnitsTable | None = key("a table")
-    joints: JointsTable | None = key("a table")
-    loads: dict[Text, Vector3 | LoadStatesTable] | None = key(
+    units: UnitsTable = key("a table", UnitsTable())
+    joints: JointsTable = key("a table", JointsTable())
+    loads: dict[Text, Vector3 | LoadStatesTable] = key(
         "forces in N in the tracker's frame by name, as in full = [0, 0, -2600], or "
-        "{ mass_kg = 265 }"
+        "{ mass_kg = 265 }",
+        {},
     )
-    join: JoinTable | None = key("a table")
+    join: JoinTable = key("a table", JoinTable())
 
 
 # Reads a mapping file and the presets: TOML → checked tables, the user's keys on top.
@@ -216,14 +211,10 @@ def with_units(
 ) -> ImportMapping:
     """The mapping with these units, where given, instead of its own."""
     given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
-    if not given:
-        return mapping
-    data = mapping.table.model_dump(exclude_none=True)
-    data["units"] = data.get("units", {}) | given
-    return replace(
-        mapping,
-        table=checked(MappingTable, data, f"{option('length_unit')}, {option('angle_unit')}"),
-    )
+    where = f"{option('length_unit')}, {option('angle_unit')}"
+    checked(MappingTable, {"units": given}, where)
+    units = mapping.table.units.model_copy(update=given)
+    return replace(mapping, table=mapping.table.model_copy(update={"units": units}))
 
 
 def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
@@ -352,40 +343,30 @@ def wanted(
     where: str, required: Mapping[str, Where], optional: Mapping[str, Where]
 ) -> tuple[ColumnKey, ...]:
     """The keys of [source.columns] (required) and [source.optional], checked."""
-    filled: dict[str, str] = {}
-    result: list[ColumnKey] = []
-    for part in (required, optional):
-        for name, at in part.items():
-            target = replace(column_key(where, name), at=at, required=part is required)
-            # Seconds and nanoseconds of one clock stand in two columns, and are added.
-            name = target.key if target.stem == "time" else target.stem
-            if name in filled:
-                raise InputError(
-                    f"{where}: {filled[name]} and {target.key} fill the same column; keep one"
-                )
-            filled[name] = target.key
-            if target.is_template and any(isinstance(p, int) for p in target.parts):
-                raise InputError(
-                    f"{where}: {target.key} takes a name with # or #0 in it, as in "
-                    f'"position_#0"; write {target.numbered(1).key} = {target.at}, … for columns '
-                    "by number"
-                )
-            if isinstance(target.at, list) and not target.is_text:
-                raise InputError(
-                    f"{where}: {target.key} takes one column; only texts such as name are joined "
-                    "from several"
-                )
-            if EACH in str(target.at) and (target.is_text or not target.of_each_marker):
-                raise InputError(
-                    f"{where}: {target.key} = {quoted(str(target.at))}: {EACH} stands for the "
-                    'markers of a row in places of numbers, as in x_mm = "*_x"'
-                )
-            result.append(target)
-    return tuple(result)
-
-
-def by_name(asked: Sequence[ColumnKey]) -> bool:
-    return any(isinstance(part, str) for c in asked if c.required for part in c.parts)
+    filled: dict[str, ColumnKey] = {}
+    for name, at, needed in (*((*own, True) for own in required.items()),
+                            *((*own, False) for own in optional.items())):  # fmt: skip
+        target = replace(column_key(where, name), at=at, required=needed)
+        # Seconds and nanoseconds of one clock stand in two columns, and are added.
+        before = filled.setdefault(name if target.stem == "time" else target.stem, target)
+        require(
+            before is target, f"{where}: {before.key} and {name} fill the same column; keep one"
+        )
+        require(
+            not (target.is_template and any(isinstance(p, int) for p in target.parts)),
+            f'{where}: {name} takes a name with # or #0 in it, as in "position_#0"; write '
+            f"{name.replace('#', '1')} = {at}, … for columns by number",
+        )
+        require(
+            target.is_text or not isinstance(at, list),
+            f"{where}: {name} takes one column; only texts such as name are joined from several",
+        )
+        require(
+            EACH not in str(at) or (target.of_each_marker and not target.is_text),
+            f"{where}: {name} = {quoted(str(at))}: {EACH} stands for the markers of a row in "
+            'places of numbers, as in x_mm = "*_x"',
+        )
+    return tuple(filled.values())
 
 
 def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
@@ -447,18 +428,6 @@ def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(found))
 
 
-def no_header(
-    source: str, asked: Sequence[ColumnKey], rows: Sequence[tuple[int, list[str]]]
-) -> InputError:
-    """What to say where no line is the header: which line comes nearest, and what it lacks."""
-    number, cells = min(rows, key=lambda row: len(lacking(asked, row[1])))
-    return InputError(
-        f"{source}: no line has all the columns that the mapping names; line {number} has "
-        f"{listed(map(quoted, cells), 12)}, but not {listed(lacking(asked, cells), 8)}: correct "
-        "the names, the delimiter or the comments in [source], or give columns by number"
-    )
-
-
 def resolve(
     source: str, asked: Sequence[ColumnKey], header: Sequence[str], width: int,
     units: UnitsTable, hint: str | None,
@@ -477,22 +446,19 @@ def resolve(
             if found is None:
                 break
             columns.append(_with_unit(source, found, units, hint))
-    if unstated := [c for c in columns if c.unit == AUTO]:
-        raise _no_unit(source, unstated)
-    return tuple(columns)
-
-
-def _no_unit(source: str, columns: Sequence[ColumnKey]) -> InputError:
-    keys = {c: column(c.stem, next(iter(FACTORS[c.default]))) for c in columns}
-    needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in columns
+    unstated = {c: column(c.stem, next(iter(FACTORS[c.default]))) for c in columns
+                if c.unit == AUTO}  # fmt: skip
+    if not unstated:
+        return tuple(columns)
+    needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in unstated
                              if (unit := USUAL.get(q := c.default)))]  # fmt: skip
-    if by_key := [key for c, key in keys.items() if c.default not in USUAL]:
+    if by_key := [key for c, key in unstated.items() if c.default not in USUAL]:
         needed.append(f"{listed(by_key)} in [source.columns]")
-    several = len(columns) > 1
-    return InputError(
-        f"{source}: column{'s' * several} {listed((quoted(c.header) for c in columns), 12)} "
+    several = len(unstated) > 1
+    raise InputError(
+        f"{source}: column{'s' * several} {listed((quoted(c.header) for c in unstated), 12)} "
         f"state{'s' * (not several)} no unit; give {' and '.join(needed)}; a mapping file says "
-        f"it by [units] or a key such as {keys[columns[0]]} in [source.columns]"
+        f"it by [units] or a key such as {next(iter(unstated.values()))} in [source.columns]"
     )
 
 

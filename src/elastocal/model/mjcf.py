@@ -70,12 +70,9 @@ class MjcfArm:
 
     @classmethod
     def read(
-        cls,
-        path: str | Path,
-        base: str | None = None,
-        flange: str | None = None,
+        cls, path: str | Path, base: str | None = None, flange: str | None = None,
         text: str | None = None,
-    ) -> MjcfArm:
+    ) -> MjcfArm:  # fmt: skip
         """The arm of an MJCF file, or of a `text` that is to stand in its place.
 
         Without `flange` it is `Tree.last_link`.
@@ -100,8 +97,7 @@ class MjcfArm:
         model, unweighed, told = _compiled(path, spec)
         bodies = tuple(model.body(b).name or f"body {b}" for b in range(model.nbody))
         tree = _tree(path, spec.modelname or path.stem, model, bodies, unweighed)
-        ends = tree.ends(base, flange)
-        arm = cls(model, tree, *ends, bodies, unweighed, tuple(told))
+        arm = cls(model, tree, *tree.ends(base, flange), bodies, unweighed, tuple(told))
         arm.check_open()
         return arm
 
@@ -136,8 +132,8 @@ class MjcfArm:
 
     def weightless(self) -> list[int]:
         """Moved bodies whose weight `gravcomp` of the file carries."""
-        moved = (b for b, name in enumerate(self.bodies) if name in self._carriers)
-        return [b for b in moved if self.model.body_gravcomp[b]]
+        held = np.flatnonzero(self.model.body_gravcomp)
+        return [int(b) for b in held if self.bodies[b] in self._carriers]
 
     @cached_property
     def chain(self) -> Chain:
@@ -150,17 +146,12 @@ class MjcfArm:
 
     def sites(self) -> dict[str, Array]:
         """Name → place (3,) in m in the flange frame of every site that moves with the flange."""
+        frames = self.tree.frames | {self.flange: self.tree.link_of(self.flange)}
         last = len(self.moving) - 1
-
-        def place(link: str, T: Array) -> Array:
-            return np.asarray(self._carriers[link][1] @ T)
-
-        end = place(*self.tree.link_of(self.flange))
-        return {
-            name: np.asarray(np.linalg.solve(end, place(link, T))[:3, 3])
-            for name, (link, T) in self.tree.frames.items()
-            if name != self.flange and self._carriers.get(link, (-1,))[0] == last
-        }
+        at = {name: self._carriers[link][1] @ T for name, (link, T) in frames.items()
+              if self._carriers.get(link, (-1,))[0] == last}  # fmt: skip
+        end = at.pop(self.flange)
+        return {name: np.asarray(np.linalg.solve(end, T)[:3, 3]) for name, T in at.items()}
 
     def upright(self) -> tuple[Array, str]:
         """Rotation (3, 3) of the file's world that turns its gravity down, and who says so."""
@@ -223,13 +214,13 @@ class MjcfArm:
         left = N @ J[:, own] if len(J) else np.zeros((0, len(own)))
         if np.abs(left).max(initial=0.0) < BOUND:
             return
-        names = [joint.name for joint in self.chain.joints]
-        tied = [repr(names[k]) for k in np.flatnonzero(np.abs(left).max(axis=0) >= BOUND)]
-        weight = np.abs(N[np.abs(left).max(axis=1) >= BOUND]).max(axis=0)
+        bound, joints = np.abs(left) >= BOUND, self.chain.joints
+        tied = [repr(joints[k].name) for k in np.flatnonzero(bound.any(axis=0))]
+        weight = np.abs(N[bound.any(axis=1)]).max(axis=0)
         told = listed(_constraint(model, e) for e in dict.fromkeys(which[weight >= BOUND]))
+        they = f"joints {listed(tied)} are" if len(tied) > 1 else f"joint {tied[0]} is"
         raise InputError(
-            f"{self.tree.path}: joint{'s' * (len(tied) > 1)} {listed(tied)} "
-            f"{'are' if len(tied) > 1 else 'is'} bound by {told}; coupled joints and closed loops "
+            f"{self.tree.path}: {they} bound by {told}; coupled joints and closed loops "
             "are not supported between base and flange, remove the constraint or choose another "
             "flange"
         )
@@ -248,7 +239,7 @@ class MjcfArm:
             ends = [int(model.site_bodyid[site]) for site in ends]
         last = [self._carriers.get(self.bodies[b], (-1,))[0] == len(self.joints) - 1 for b in ends]
         still = [model.body_weldid[b] == WORLD for b in ends]
-        held = (last[0] and still[1]) or (last[1] and still[0])
+        held = any(one and other for one, other in zip(last, still[::-1], strict=True))
         dragged = any(model.body_mocapid[b] >= 0 for b in ends)
         return dragged or (held and kind == kinds.mjEQ_WELD)
 
@@ -263,10 +254,10 @@ def _constraint(model: Any, e: int) -> str:
     kind = mujoco.mjtEq(int(model.eq_type[e])).name.removeprefix("mjEQ_").lower()
     sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
     what = kind if kind in ("joint", "tendon") else "site" if sites else "body"
-    names = [getattr(model, what)(int(i)).name for i in (model.eq_obj1id[e], model.eq_obj2id[e])
-             if i >= 0]  # fmt: skip
+    ends = (int(i) for i in (model.eq_obj1id[e], model.eq_obj2id[e]) if i >= 0)
+    names = " and ".join(f"{what} {getattr(model, what)(i).name!r}" for i in ends)
     own = f" '{name}'" if (name := model.equality(e).name) else ""
-    return f"<equality><{kind}>{own} of {' and '.join(f'{what} {name!r}' for name in names)}"
+    return f"<equality><{kind}>{own} of {names}"
 
 
 def _tree(
@@ -275,7 +266,8 @@ def _tree(
     links = {bodies[WORLD]: LinkMass(0.0, np.zeros(3))}
     joints = []
     for b in range(1, model.nbody):
-        parent, T = bodies[int(model.body_parentid[b])], local(model, b)
+        parent = bodies[int(model.body_parentid[b])]
+        T = transform(model.body_pos[b], model.body_quat[b])
         for j in joints_of(model, b):
             child = f"{bodies[b]} after joint {j}"
             links[child] = LinkMass(0.0, np.zeros(3))
@@ -295,22 +287,19 @@ def _tree(
 def _joint(model: Any, j: int, parent: str, child: str, T: Array) -> FileJoint:
     import mujoco
 
-    kinds = mujoco.mjtJoint
-    own = kinds(int(model.jnt_type[j]))
-    kind = {kinds.mjJNT_FREE: "free", kinds.mjJNT_BALL: "a ball joint"}.get(own)
-    if kind is not None:
-        return FileJoint(model.joint(j).name, kind, parent, child, T, np.zeros(3), number=j)
+    kinds, name = mujoco.mjtJoint, model.joint(j).name
+    other = {int(kinds.mjJNT_FREE): "free", int(kinds.mjJNT_BALL): "a ball joint"}
+    if kind := other.get(int(model.jnt_type[j])):
+        return FileJoint(name, kind, parent, child, T, np.zeros(3), number=j)
     lower, upper = map(float, model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf))
     return FileJoint(
-        model.joint(j).name, motion_of(model, j), parent, child, T @ before(model, j),
+        name, motion_of(model, j), parent, child, T @ before(model, j),
         np.array(model.jnt_axis[j]), (lower, upper), rest=_ref(model, j), number=j,
     )  # fmt: skip
 
 
 def motion_of(model: Any, j: int) -> JointKind:
-    import mujoco
-
-    slides = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
+    slides = model.jnt_type[j] == import_mujoco().mjtJoint.mjJNT_SLIDE
     return "prismatic" if slides else "revolute"
 
 
@@ -319,10 +308,6 @@ def joints_of(model: Any, body: int) -> list[int]:
     first = int(model.body_jntadr[body])
     own = range(first, first + int(model.body_jntnum[body]))
     return [j for j in own if not model.joint(j).name.startswith(SPRING)]
-
-
-def local(model: Any, body: int) -> Array:
-    return transform(model.body_pos[body], model.body_quat[body])
 
 
 def before(model: Any, j: int) -> Array:
@@ -443,21 +428,17 @@ def strip(spec: Any, geoms: Iterable[Any]) -> None:
     ties = [one for one in spec.equalities if one.type == eq.mjEQ_TENDON]
     tied = {name for one in ties for name in (one.name1, one.name2)}
     kept = (eq.mjEQ_CONNECT, eq.mjEQ_WELD, eq.mjEQ_JOINT, eq.mjEQ_TENDON)
-    for one in [e for e in spec.equalities if e.type not in kept]:
+    gone = [e for e in spec.equalities if e.type not in kept]
+    gone += [t for t in spec.tendons if t.name not in tied]
+    for one in (*gone, *geoms):
         spec.delete(one)
-    for tendon in [t for t in spec.tendons if t.name not in tied]:
-        spec.delete(tendon)
-    for geom in geoms:
-        spec.delete(geom)
     for one in (*spec.geoms, *spec.sites):
         one.material = ""
     meshes = {geom.meshname for geom in spec.geoms}
     for kind in (
         "keys", "sensors", "actuators", "pairs", "excludes", "tuples",
-        "skins", "flexes", "materials", "textures",
+        "skins", "flexes", "materials", "textures", "meshes",
     ):  # fmt: skip
         for one in list(getattr(spec, kind)):
-            spec.delete(one)
-    for mesh in list(spec.meshes):
-        if mesh.name not in meshes:
-            spec.delete(mesh)
+            if kind != "meshes" or one.name not in meshes:
+                spec.delete(one)

@@ -174,20 +174,21 @@ class Tree:
         leaves the choice open may have meant another frame.
         """
         base = self.root if base is None else self.find("base", base, self.root)
-        if flange is not None:
-            usual = ""
-            if flange not in self.links and flange not in self.frames:
-                with suppress(InputError):  # of several arms, each with an end of its own
-                    usual = self.last_link(base)
-            return base, self.find("flange", flange, usual)
-        found = self.last_link(base)
-        able = [k for k in self._leaves(base) if len(self._moving(base, k)) >= MIN_JOINTS]
-        require(
-            choose or len(able) < 2,
-            f"{self.path}: several links could be the flange: {listed(sorted({*able, found}))}; "
-            f"name the right one as `flange` (init takes '{found}')",
-        )
-        return base, found
+        if flange is None:
+            found = self.last_link(base)
+            able = [k for k in self._leaves(base) if len(self._moving(base, k)) >= MIN_JOINTS]
+            require(
+                choose or len(able) < 2,
+                f"{self.path}: several links could be the flange: "
+                f"{listed(sorted({*able, found}))}; name the right one as `flange` (init takes "
+                f"'{found}')",
+            )
+            return base, found
+        usual = ""
+        if flange not in self.links and flange not in self.frames:
+            with suppress(InputError):  # of several arms, each with an end of its own
+                usual = self.last_link(base)
+        return base, self.find("flange", flange, usual)
 
     def last_link(self, base: str) -> str:
         """The link below `base` from which on fingers, or frames that none moves, branch off.
@@ -206,8 +207,9 @@ class Tree:
             f"{self.path}: several {self.parts} could be the flange, one of each arm: "
             f"{listed(sorted(ends))}; name the right one as `flange`, and its base",
         )
-        leaves = self._leaves(base)
-        return ends[0] if ends else max(leaves, key=lambda leaf: len(self._moving(base, leaf)))
+        if ends:
+            return ends[0]
+        return max(self._leaves(base), key=lambda leaf: len(self._moving(base, leaf)))
 
     def _leaves(self, base: str) -> list[str]:
         """Links on which nothing hangs but tool frames that `export` has added."""
@@ -218,21 +220,17 @@ class Tree:
         ]  # fmt: skip
 
     def _end_of_arm(self, base: str, leaves: Sequence[str]) -> str:
-        most = max(len(self._moving(base, leaf)) for leaf in leaves)
-        ways = [
-            [joint.child for joint in self.joints_between(base, leaf) or ()]
-            for leaf in leaves
-            if len(self._moving(base, leaf)) == most
-        ]
+        sizes = {leaf: len(self._moving(base, leaf)) for leaf in leaves}
+        most = max(sizes.values())
+        ways = [[joint.child for joint in self.joints_between(base, leaf) or ()]
+                for leaf in leaves if sizes[leaf] == most]  # fmt: skip
         common = [link for link in ways[0] if all(link in way for way in ways)]
         if len(self._moving(base, common[-1])) == most and len(ways) > 1:
-            named = [way[-1] for name in FLANGES for way in ways if way[-1] == name]
-            return named[0] if named else common[-1]
+            named = (way[-1] for name in FLANGES for way in ways if way[-1] == name)
+            return next(named, common[-1])
         # Fingers of unequal length, as a thumb has: no link is common to those with most joints.
         for link in common:
-            before, after = (
-                len(self._moving(*pair)) for pair in ((base, link), (link, common[-1]))
-            )
+            before, after = (len(self._moving(*p)) for p in ((base, link), (link, common[-1])))
             if before < MIN_JOINTS or not 0 < after <= MOST_IN_A_FINGER:
                 continue
             own = ([self.parent_joint[k] for k in self._below(child)]
@@ -289,8 +287,8 @@ class Tree:
         it carries up to the next one, with its centre in m in the joint's frame; none where all
         are zero.  Bodies beyond the flange and on side branches count, those on the base do not."""
         moving = self.serial_chain(base, flange)
-        joints: list[Joint] = []
-        T = np.eye(4)
+        joints, T = list[Joint](), np.eye(4)
+        mass, moment = np.zeros(len(moving)), np.zeros((len(moving), 3))
         with np.errstate(over="ignore", invalid="ignore"):  # numbers of 1e308 are judged later
             for source in self.joints_between(base, flange) or ():
                 T = T @ source.origin
@@ -299,19 +297,14 @@ class Tree:
                     limits = source.limit or (-np.inf, np.inf)
                     joints.append(Joint(name, source.motion, T, source.axis, *limits))
                     T = np.eye(4)
-            masses = self._carried(moving)
+            for link, (k, place) in self.carriers(moving).items():
+                body = self.links[link]
+                mass[k] += body.mass
+                moment[k] += body.mass * (place @ [*body.com, 1.0])[:3]
+            both = zip(mass, moment, strict=True)
+            masses = tuple(LinkMass(float(m), s / m if m > 0 else np.zeros(3)) for m, s in both)
         end = T @ self.link_of(flange)[1]
-        return Chain(self.name, tuple(joints), end, masses)
-
-    def _carried(self, moving: Sequence[FileJoint]) -> tuple[LinkMass, ...]:
-        mass, moment = np.zeros(len(moving)), np.zeros((len(moving), 3))
-        for link, (k, T) in self.carriers(moving).items():
-            body = self.links[link]
-            mass[k] += body.mass
-            moment[k] += body.mass * (T @ [*body.com, 1.0])[:3]
-        both = zip(mass, moment, strict=True)
-        whole = tuple(LinkMass(float(m), s / m if m > 0 else np.zeros(3)) for m, s in both)
-        return whole if mass.any() else ()
+        return Chain(self.name, tuple(joints), end, masses if mass.any() else ())
 
 
 def _check_on_path(joint: FileJoint, where: str) -> None:
@@ -379,7 +372,20 @@ def urdf_file(path: Path) -> XmlFile:
 
 def tree_of(file: XmlFile) -> Tree:
     path, root = file.path, file.root
-    _check_root(file)
+    for tag in file.tags:
+        require(tag.prefix != "xacro", xacro_left(path, f"<xacro:{tag.name}>"))
+        # Files of meshes and plug-ins are not read.
+        values = [v for k, v in tag.stated.items() if k not in ("filename", "file")]
+        macro = next((v for v in values if LEFT.search(v)), None)
+        require(macro is None, xacro_left(path, f"'{macro}' in <{tag.name}>"))
+    hint = {
+        "mujoco": '; this is MJCF, give it as mjcf = "…"',
+        "sdf": "; this is SDF, export it as URDF",
+    }.get(root.name, "")
+    require(
+        root.name == "robot",
+        f'{path}: the root element is <{root.name}>, a URDF has <robot name="…">{hint}',
+    )
     links: dict[str, LinkMass] = {}
     for tag in root.all("link"):
         name = _name(path, tag, links)
@@ -404,24 +410,6 @@ def xacro_left(path: Path, what: str) -> str:
     plain = plain if plain.endswith(".urdf") and plain != path.name else "expanded.urdf"
     return (
         f"{path}: xacro macros are left in ({what}); run xacro first: xacro {path.name} > {plain}"
-    )
-
-
-def _check_root(file: XmlFile) -> None:
-    path, root = file.path, file.root.name
-    for tag in file.tags:
-        require(tag.prefix != "xacro", xacro_left(path, f"<xacro:{tag.name}>"))
-        # Files of meshes and plug-ins are not read.
-        values = [v for k, v in tag.stated.items() if k not in ("filename", "file")]
-        macro = next((v for v in values if LEFT.search(v)), None)
-        require(macro is None, xacro_left(path, f"'{macro}' in <{tag.name}>"))
-    hint = {
-        "mujoco": '; this is MJCF, give it as mjcf = "…"',
-        "sdf": "; this is SDF, export it as URDF",
-    }.get(root, "")
-    require(
-        root == "robot",
-        f'{path}: the root element is <{root}>, a URDF has <robot name="…">{hint}',
     )
 
 

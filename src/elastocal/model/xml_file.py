@@ -141,11 +141,10 @@ class XmlFile:
         self._changed.setdefault(tag.start, {}).update(dict.fromkeys(without) | dict(stated))
 
     def set_in(self, tag: Tag, name: str, stated: Mapping[str, str]) -> None:
-        inside = tag.first(name)
-        if inside is None:
-            self.insert_in(tag, element(name, stated))
-        else:
+        if inside := tag.first(name):
             self.set(inside, stated)
+        else:
+            self.insert_in(tag, element(name, stated))
 
     def result(self) -> str:
         parts, last = [], 0
@@ -291,7 +290,17 @@ class _Model:
         return self._weights[real]
 
     def _weight(self, file: XmlFile, tag: Tag) -> float:
-        _check_sizes(file.path, tag)
+        for key, text in tag.stated.items():
+            stated = f"{file.path}: <{printable(tag.name)} {printable(key)}={quoted(text)}>"
+            require(
+                key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
+                f"{stated} is no number; correct it",
+            )
+            largest = LARGEST.get(tag.name, {}).get(key, math.inf)
+            require(
+                max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
+                f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
+            )
         if tag.name == "hfield":
             sides = (math.prod(_numbers(tag.get(key))) for key in ("nrow", "ncol"))
             self._count_cells(file.path, math.prod(sides))
@@ -306,7 +315,15 @@ class _Model:
                       for one in file.tags if one.name == "model"}  # fmt: skip
             name = models.get(tag.get("model"), "")
         if tag.name in ("include", "model", "attach"):
-            yield from map(self.weight_of, self._included(file.path, name) if name else ())
+            # Beside the model or beside the file itself, as versions of MuJoCo differ.
+            for found in {self._folder / name, file.path.parent / name} if name else ():
+                if os.path.lexists(found):
+                    require(
+                        any(found.resolve().is_relative_to(root) for root in self._roots),
+                        f"{file.path}: includes {printable(name)}, which is outside its folder; "
+                        "put a copy there",
+                    )
+                    yield self.weight_of(XmlFile.read(found, "included model", "an MJCF file"))
             return
         for each in [v for k, v in tag.stated.items() if k.startswith("file") and v]:
             for found in self._places(file, each):
@@ -332,18 +349,6 @@ class _Model:
                         sides = struct.unpack(">II", head[16:24])
                         self._count_cells(file.path, math.prod(map(float, sides)))
 
-    def _included(self, path: Path, name: str) -> Iterator[XmlFile]:
-        """The files that an element of the file `path` includes by `name`: beside the model or
-        beside the file itself, as versions of MuJoCo differ."""
-        for found in {self._folder / name, path.parent / name}:
-            if os.path.lexists(found):
-                require(
-                    any(found.resolve().is_relative_to(root) for root in self._roots),
-                    f"{path}: includes {printable(name)}, which is outside its folder; put a copy "
-                    "there",
-                )
-                yield XmlFile.read(found, "included model", "an MJCF file")
-
     def _places(self, file: XmlFile, name: str) -> set[Path]:
         """Where a file may stand; the last part of its name alone counts under `strippath`."""
         stated = [tag.get(f"{kind}dir") for tag in file.tags if tag.name == "compiler"
@@ -358,20 +363,6 @@ class _Model:
         require(
             self._cells <= MOST_CELLS,
             f"{path}: <hfield> has more than {MOST_CELLS} points, which no arm needs; take it out",
-        )
-
-
-def _check_sizes(path: Path, tag: Tag) -> None:
-    for key, text in tag.stated.items():
-        stated = f"{path}: <{printable(tag.name)} {printable(key)}={quoted(text)}>"
-        require(
-            key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
-            f"{stated} is no number; correct it",
-        )
-        largest = LARGEST.get(tag.name, {}).get(key, math.inf)
-        require(
-            max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
-            f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
         )
 
 
