@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from elastocal.identification.smooth_functions import LinearRows, Scales
+from elastocal.identification.smooth_fit import LinearRows, Scales
 from elastocal.identification.weighted_problem import RFactor
 
 ROWS, FREE, SHRUNK = 80, 4, 15

@@ -321,9 +321,9 @@ class Reduced:
         return np.asarray(v.value)
 
 
-def minimise(J: Array, t: Array, system: System, stated: System | None = None) -> Minimum:
-    """Minimise |t − J x|² over the system's x; errors and `stated` as in `Reduced`."""
-    return Reduced.of(J, t, system).minimum(stated)
+def minimise(J: Array, t: Array, system: System) -> Minimum:
+    """Minimise |t − J x|² over the system's x; errors as in `Reduced`."""
+    return Reduced.of(J, t, system).minimum()
 
 
 def _free_minimum(

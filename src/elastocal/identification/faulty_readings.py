@@ -366,9 +366,9 @@ def report_faulty(
     if noise is None:
         B, e = problem.weights.apply(B), problem.weights.apply(e)
     else:
-        own, whiten = own_noise(noise.fit, readings)[0], weights_of(noise, readings).whole
-        if shared and whiten is not None:
-            e = block_diagonal(own) @ (whiten.T @ (whiten @ e))
+        own, weights = own_noise(noise.fit, readings)[0], weights_of(noise, readings)
+        if shared and weights.whiten is not None:
+            e = block_diagonal(own) @ (weights.whiten.T @ weights.beside(weights.apply(e)))
         root = block_diagonal(inverse_factor(own))
         B, e = root @ B, root @ e
     lead = observed.lead

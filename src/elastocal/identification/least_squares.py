@@ -8,7 +8,7 @@ P; every fit is the same descent by Levenberg and Marquardt on R factors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -76,8 +76,7 @@ class Problem:
 class Fit:
     """Values x (parameters,), raw and whitened residual (rows,), R factor of whitened B and it.
 
-    `columns` (fitted,) index the parameters, `sizes` (parameters,) their typical sizes; `wide`,
-    where there is one, is the R factor of the columns that these were chosen among.
+    `columns` (fitted,) index the parameters, `sizes` (parameters,) their typical sizes.
     """
 
     x: Array
@@ -90,7 +89,6 @@ class Fit:
     problem: Problem = field(repr=False)
     columns: NDArray[np.int64]
     sizes: Array
-    wide: RFactor | None = field(default=None, repr=False)
 
     @cached_property
     def B(self) -> Array:
@@ -135,14 +133,13 @@ class PriorRows:
 @dataclass(frozen=True)
 class Objective:
     """|e(u)|² + |target − P u|² under the `limits` on u, where X[columns] = x[columns] + size · u
-    and the other parameters are x (parameters,).  The columns are a choice `among` these."""
+    and the other parameters are x (parameters,)."""
 
     problem: Problem
     columns: IntArray
     x: Array
     size: Array
     known: PriorRows
-    among: IntArray
 
     @cached_property
     def P(self) -> Array:
@@ -157,18 +154,17 @@ class Objective:
         system = self.known.system
         return None if system is None else system.moved(self.x[self.columns], self.size)
 
-    def evaluate(self, u: Array, last: bool = False) -> Evaluation:
-        """e, and the R factor of it and of B per unit of u; the `last` time with that of the
-        columns `among` which these are.  Raises ElastocalError where the model has no prediction.
-        """
-        problem, asked = self.problem, self.among if last else self.columns
-        at = evaluate(problem.model, problem.parts, self.values(u), asked)
+    def evaluate(self, u: Array) -> Evaluation:
+        """e, and the R factor of it and of B per unit of u; ElastocalError where the model has no
+        prediction."""
+        problem = self.problem
+        at = evaluate(problem.model, problem.parts, self.values(u), self.columns)
         if not np.isfinite(at.r_factor.rss):
             raise ElastocalError(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        return at.chosen(self.columns, asked, self.size)
+        return replace(at, r_factor=at.r_factor.scaled(self.size))
 
     def values(self, u: Array) -> Array:
         """X (parameters,), what lies at its bound but for rounding on it."""
@@ -201,17 +197,16 @@ class Objective:
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
-    def descend(
-        self, u: Array, at: Evaluation, tolerance: float, most: int
-    ) -> tuple[Array, Evaluation, str, int]:
-        """Full Gauss–Newton steps while they lower the cost, damped ones where they do not, from
-        the evaluation `at` u: where they end, why, and after how many evaluations.
+    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Evaluation, str, int]:
+        """Full Gauss–Newton steps while they lower the cost, damped ones where they do not: where
+        they end, why, and after how many evaluations.
 
         Ends where the linearised cost promises less than `tolerance` of itself: that last step is
         still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
         converges.  Steps are judged by the cost itself, so no rounding of it can keep it from
         ending.
         """
+        at = self.evaluate(u)
         cost, damping, evaluations = self.cost(u, at), 0.0, 1
         failed = -1.0  # the damping that was too little a step ago
         while evaluations < most:
@@ -221,7 +216,7 @@ class Objective:
                 return u, at, NEGLIGIBLE, evaluations
             evaluations += 1
             try:
-                trial = self.evaluate(u + step, last)
+                trial = self.evaluate(u + step)
                 trial_cost = self.cost(u + step, trial)
             except ElastocalError:
                 trial, trial_cost = at, np.inf
@@ -259,15 +254,12 @@ def moved(x: Array, columns: IntArray, step: Array) -> Array:
 
 def fit(
     problem: Problem, columns: IntArray, x: Array, sizes: Array, *, known: PriorRows | None = None,
-    among: IntArray | None = None, max_steps: int = 60, tolerance: float = TOLERANCE,
-    at: Evaluation | None = None,
+    max_steps: int = 60, tolerance: float = TOLERANCE,
 ) -> Fit:  # fmt: skip
     """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
     other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
 
-    `sizes` (parameters,) scale the variables.  `among` are columns of which those fitted are a
-    choice: the fit leaves their R factor too, which else would take another pass.  `at` is the
-    evaluation of these at x, where it is known.
+    `sizes` (parameters,) scale the variables.
 
     On R factors, with the cost and the gradient of all rows, until a step promises less than
     `tolerance` of the cost.  Every step starts from the residual of the exact model, so that the
@@ -279,15 +271,14 @@ def fit(
     """
     size, u = sizes[columns], np.zeros(len(columns))
     known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
-    objective = Objective(problem, columns, x, size, known, columns if among is None else among)
+    objective = Objective(problem, columns, x, size, known)
     if objective.limits is not None:  # the nearest that is allowed
         u = minimise(np.eye(len(u)), u, objective.limits).x
-    at = objective.evaluate(u) if at is None else at.chosen(columns, objective.among, size)
-    u, at, reason, evaluations = objective.descend(u, at, tolerance, max_steps)
+    u, at, reason, evaluations = objective.descend(u, tolerance, max_steps)
     return Fit(
         objective.values(u), at.residual, problem.weights.apply(at.residual),
         at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason, evaluations, problem, columns,
-        sizes, at.wide,
+        sizes,
     )  # fmt: skip
 
 
@@ -382,7 +373,7 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     equilibrium any more.  Steps that do not settle lead to none.
     """
     fit, limit, size = found.fit, found.objective + rise, found.fit.sizes[found.fit.columns]
-    objective = Objective(fit.problem, fit.columns, fit.x, size, found.known, fit.columns)
+    objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
     assert objective.limits is not None
     far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
     u = np.zeros(len(size))

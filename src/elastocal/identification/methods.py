@@ -542,7 +542,9 @@ def fit_with_knowledge(
         least_squares(problem, columns, fit.x, solution.sizes, known=stated), stated, sigma
     )
     progress("intervals under constraints" if prior is None else "intervals with the prior")
-    dof = np.full(len(columns), own.dof) if own else _dof(solution, before.intervals, columns)
+    told = dict(zip(fit.columns.tolist(), before.intervals.covariance.dof.tolist(), strict=True))
+    spare = own.dof if own else min(told.values())
+    dof = np.array([spare if own else told.get(c, spare) for c in columns.tolist()])
     many = set() if own is None else set(own.prior.names)
     intervals = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
@@ -558,11 +560,11 @@ def fit_with_knowledge(
         problem.model, problem.parts, found.fit.x, columns, found.face
     )
     known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
-    told = _contradiction(solution, before.intervals, found, own)
+    doubts = _contradiction(solution, before.intervals, found, own)
     return replace(
         before, method="constrained", solution=known, intervals=intervals,
         active=found.best.active, prior_share=shares, effective=round(found.effective),
-        leverage=leverage, warnings=(*before.warnings, *told),
+        leverage=leverage, warnings=(*before.warnings, *doubts),
         smooth=tuple(part.refitted(fitted.x, columns, matrix) for part in before.smooth),
     )  # fmt: skip
 
@@ -595,12 +597,6 @@ def _contradiction(
         f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "
         "names, units and signs of what is stated, and whether the model lacks an effect.",
     )
-
-
-def _dof(solution: Solution, before: Intervals, columns: IntArray) -> Array:
-    known = dict(zip(solution.fit.columns.tolist(), before.covariance.dof.tolist(), strict=True))
-    fewest = min(known.values())
-    return np.array([known.get(c, fewest) for c in columns.tolist()])
 
 
 def _as_fit(found: KnownFit) -> Fit:

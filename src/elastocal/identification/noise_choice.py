@@ -35,7 +35,6 @@ from elastocal.identification.noise_structure import (
     Deviation,
     Kind,
     Readings,
-    Structure,
     ranked_within,
     stated_deviations,
     visit_record,
@@ -242,10 +241,6 @@ class Fitted(MixedFit):
     noisy: NoisyReadings
 
     @property
-    def structure(self) -> Structure:
-        return self.noisy.structure
-
-    @property
     def own(self) -> Array:
         return self.theta[: self.noisy.own]
 
@@ -301,7 +296,7 @@ def fitted(
         if TIME in kind.parts:
             raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
         prior = prior_of_groups(noisy)
-        if like is None or like.structure.names != noisy.structure.names:
+        if like is None or like.noisy.structure.names != noisy.structure.names:
             start[: noisy.own] = np.exp(prior.mean)
     found = fit(noisy.model(prior), start, noisy.may_vanish, enough)
     return Fitted(found.model, found.theta, found.converged, noisy)
@@ -362,8 +357,8 @@ def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
 def own_noise(found: Fitted, readings: Readings) -> tuple[Array, Array]:
     """Covariance (N, size, size) of single readings, be they those fitted or others, and degrees of
     freedom (N, size) behind it.  A variance that no reading of the fit has is the mean of all."""
-    names = found.structure.names
-    structure = found.structure.model.structure(readings, names)
+    names = found.noisy.structure.names
+    structure = found.noisy.structure.model.structure(readings, names)
     place = {name: k for k, name in enumerate(names)}
     known = np.array([place.get(name, -1) for name in structure.names])
     W = np.diag(found.covariance)[: found.noisy.own]
@@ -434,7 +429,7 @@ class NoiseFit:
         names: dict[str, list[str]] = {}
         for d, _ in self.fit.found:
             names.setdefault(d.part, []).append(d.name)
-        text = self.fit.structure.model.description
+        text = self.fit.noisy.structure.model.description
         for part, own in names.items():
             named = " / ".join([own[0], *(name.removeprefix(EACH_HAS) for name in own[1:])])
             text += PARTS[part].clause.format(named)
@@ -709,7 +704,8 @@ def weights_sharing(
     waves = [np.sqrt(v) * d.waves for d, v in deviations if d.waves is not None]
     if not waves:
         return own
-    return own.with_common(np.concatenate(waves, axis=2).reshape(Z.shape[0], -1), together)
+    common = np.concatenate(waves, axis=2).reshape(Z.shape[0], -1)
+    return replace(own, common=common, together=together)
 
 
 def with_stated_sharing(own: Weights, model: Model, observed: Observations, x: Array) -> Weights:

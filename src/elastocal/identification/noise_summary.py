@@ -297,8 +297,9 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     def label(numbered: re.Match[str]) -> str:
         return f"{numbered[1]} {labels[numbered[1]][int(numbered[2])]}"
 
-    kind, sizes = fit.structure.model.name, list[NoiseSize]()
-    for name, s in zip(fit.structure.names, sigma[:own], strict=True):
+    structure, sizes = fit.noisy.structure, list[NoiseSize]()
+    kind = structure.model.name
+    for name, s in zip(structure.names, sigma[:own], strict=True):
         one = NoiseSize(NUMBERED.sub(label, name), s, turns=name in TURNED)
         sizes.append(replace(one, sigma=None, factor=s) if kind == "stated" else one)
     for d, s in zip(fit.noisy.deviations, sigma[own:], strict=True):

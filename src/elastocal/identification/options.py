@@ -4,19 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from functools import cached_property
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
 from elastocal.identification.constrained import ActiveConstraint
-from elastocal.identification.covariance import Covariance, Rows, clustered, of_rows, t_quantile
+from elastocal.identification.covariance import (
+    Covariance,
+    Rows,
+    clustered,
+    of_rows,
+    root_of,
+    t_quantile,
+)
 from elastocal.identification.knowledge import Constraints, GaussianPrior
 from elastocal.identification.least_squares import Fit, KnownFit, PriorRows, profile_end
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
-from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import (
     Part,
@@ -24,8 +31,9 @@ from elastocal.identification.weighted_problem import (
     each,
     regressor,
 )
+from elastocal.model.manipulator import SmoothGroup
 from elastocal.text import did_you_mean, quoted
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Configurations per parameter from which the scatter of those of a large table counts.
 ENOUGH = 10
@@ -44,10 +52,6 @@ class Intervals:
 
     covariance: Covariance
     ci95: Array
-
-    @property
-    def kind(self) -> str:
-        return self.covariance.kind
 
 
 def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Intervals:
@@ -116,6 +120,110 @@ def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     ]
     text = "profile of the nonlinear sum of squares (all readings independent)"
     return Intervals(replace(classical, kind="profile", description=text), np.array(ends))
+
+
+# What an identification says of a smooth function: its size, and how sure.
+
+PLACES = 500
+DRAWS = 400
+
+
+@dataclass(frozen=True)
+class SmoothPart:
+    """A smooth function as it was fitted.
+
+    Attributes:
+        group: Its parameters and what it follows.
+        scale: By how much the variance of its coefficients is larger than the prior that the cell
+            states; 0 where it was left out.
+        effective: How many coefficients' worth of it the readings determine.
+        value: Coefficients (components, waves).
+        covariance: Theirs, (components · waves, components · waves).
+        places: What it follows in the readings fitted (n,), in rad or s.
+    """
+
+    group: SmoothGroup
+    scale: float
+    effective: float
+    value: Array
+    covariance: Array
+    places: Array
+
+    @property
+    def coefficients(self) -> int:
+        """How many parameters it has."""
+        return int(self.value.size)
+
+    def refitted(self, x: Array, columns: IntArray, covariance: Array) -> SmoothPart:
+        """The same function at other parameters x (parameters,), the covariance that of the
+        `columns` fitted."""
+        mine = self.group.columns
+        place = {int(c): k for k, c in enumerate(columns)}
+        at = np.array([place.get(int(c), -1) for c in mine.ravel()])
+        there, matrix = np.flatnonzero(at >= 0), np.zeros((mine.size, mine.size))
+        matrix[np.ix_(there, there)] = covariance[np.ix_(at[there], at[there])]
+        return replace(self, value=x[mine], covariance=matrix)
+
+    def _own_waves(self, x: Array) -> Array:
+        """The waves at x (n,) without their mean and their wave of one period per turn (of a time,
+        its slope), for which offsets, lengths and tilts of the arm can stand."""
+        assert self.group.basis is not None
+        alike = [np.ones(len(x)), *((np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],))]
+        Q, _ = np.linalg.qr(np.column_stack(alike))
+        waves = self.group.basis(x)
+        return np.asarray(waves - Q @ (Q.T @ waves))
+
+    def _block(self, c: int, k: int) -> Array:
+        return self.covariance[c * k : (c + 1) * k, c * k : (c + 1) * k]
+
+    @cached_property
+    def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
+        """By unit, over all components and the places of the readings: rms of what is left of the
+        function without what the arm can stand for, the 95 % interval of that, and the rms half
+        width of its 95 % band.
+
+        Of parameters that are no function of one quantity, the root of their sum of squares.
+        """
+        basis = self.group.basis
+        found = {}
+        for unit in dict.fromkeys(self.group.units):
+            own = [c for c, u in enumerate(self.group.units) if u == unit]
+            if basis is None:
+                waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
+            else:
+                places = np.sort(self.places)
+                even = np.linspace(0, len(places) - 1, min(len(places), PLACES)).astype(int)
+                waves = self._own_waves(places[even])
+            mean = self.value[own] @ waves.T
+            rng = np.random.default_rng(0)
+            k = waves.shape[1]
+            total, spread = np.zeros(DRAWS), 0.0
+            for c, m in zip(own, mean, strict=True):
+                drawn = rng.normal(size=(DRAWS, k)) @ root_of(self._block(c, k)).T @ waves.T
+                total += ((m + drawn) ** 2).mean(axis=1)
+                spread += float(((waves @ self._block(c, k)) * waves).sum(axis=1).mean())
+            rms = np.sqrt(total / (1 if basis is None else len(own)))
+            low, high = np.quantile(rms, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+            half = float(t_quantile(LEVEL, np.array(np.inf))) * np.sqrt(spread / len(own))
+            found[unit] = (float(np.median(rms)), (float(low), float(high)), float(half))
+        return found
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """An entry for each unit that the function has, in SI."""
+        g = self.group
+        return [
+            {
+                "effect": g.effect, "where": g.where, "follows": g.follows or None, "unit": unit,
+                "size": g.size, "length": _finite(g.length), "low": _finite(g.low),
+                "high": _finite(g.high), "scale": self.scale, "coefficients": self.coefficients,
+                "effective": self.effective, "rms": rms, "rms_ci95": list(ci95), "band95": half,
+            }
+            for unit, (rms, ci95, half) in self.sizes.items()
+        ]  # fmt: skip
+
+
+def _finite(value: float) -> float | None:
+    return value if np.isfinite(value) else None
 
 
 # What a method ends with.

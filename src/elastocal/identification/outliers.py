@@ -360,8 +360,7 @@ def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) 
             outside = np.zeros(len(own), dtype=bool)
             beyond[part.index] &= fit.p_values(fit.coordinates(B * width), own, outside) < level
 
-    for _ in each(problem.parts, of_part):
-        pass
+    list(each(problem.parts, of_part))
     return beyond
 
 

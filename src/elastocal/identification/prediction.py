@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 
 from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
@@ -31,7 +31,7 @@ from elastocal.identification.covariance import Covariance, root_of, variance_of
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
+from elastocal.identification.solve import Solution, free_r_factor, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
@@ -184,16 +184,10 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     open_ = open_[read]
     if not len(open_):
         return ()
-    known = B[:, kept[~model.shrunk[kept]]]
-    basis = linalg.qr(known, mode="economic")[0]
-    off = B[:, open_] - basis @ (basis.T @ B[:, open_])
-    off -= basis @ (basis.T @ off)
-    _, R, order = linalg.qr(off, mode="economic", pivoting=True)
-    least = STRUCTURAL * max(np.linalg.norm(B, axis=0))
-    pivot = np.zeros(len(open_))
-    pivot[: min(R.shape)] = np.abs(np.diag(R))
-    none = pivot <= np.where(typical[open_[order]] > 0, max(least, NEVER_SHOWN), least)
-    return tuple(model.names[d] for d in open_[order[none]])
+    both = np.concatenate([kept[~model.shrunk[kept]], open_])
+    ranks = np.isin(both, open_).astype(int)
+    told = both[reduce(B[:, both], np.ones(len(both)), (), 1.0, NEVER_SHOWN, ranks).kept]
+    return tuple(model.names[d] for d in open_[~np.isin(open_, told)])
 
 
 def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:

@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import (
+    Part,
     Partition,
-    Span,
     Weights,
-    in_order,
+    each,
     regressor,
     same_size,
 )
@@ -71,8 +71,7 @@ def held_out_by_parts(
     held, leverage = np.empty((2, len(parts.observed.value)))
     together = parts.weights.together
 
-    def leave_out(span: Span) -> None:
-        part = parts.part(span)
+    def leave_out(part: Part) -> None:
         at = regressor(model, part, x, columns)
         residual = at.residual
         if step is not None:
@@ -84,8 +83,7 @@ def held_out_by_parts(
         held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, parts.observed.size))
         leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
 
-    for _ in in_order(parts.spans, leave_out):
-        pass
+    list(each(parts, leave_out))
     return held, leverage
 
 

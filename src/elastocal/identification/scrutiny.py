@@ -17,9 +17,9 @@ from scipy import linalg, special
 
 from elastocal.engine.mixed import Standardised
 from elastocal.identification.noise_summary import Noise
+from elastocal.identification.options import SmoothPart
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
 from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
-from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
 from elastocal.identification.weighted_problem import Weights, least_norm, same_size, weights_for
 from elastocal.measurements import Measurements
@@ -271,9 +271,8 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     held, plain = [], []
     for _, chosen in sets:
         # Whole rows count by the fit's weights, whatever the set.
-        left = y - fit.B[:, chosen] @ least_norm(white[:, chosen], target)
+        left, own = _refitted(fit, y, np.flatnonzero(chosen), weights)
         plain.append(rms_3d(left, size))
-        own = held_out_residual(fit.B[:, chosen], left, weights, observed.configuration, size)
         held.append((own.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
     likelihood = [
         _restricted(white, target, chosen & (stage == 0), chosen & (stage > 0), typical, s2)
@@ -295,6 +294,13 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
             )
         )  # fmt: skip
     return tuple(found)
+
+
+def _refitted(fit: FoundFit, y: Array, columns: IntArray, weights: Weights) -> tuple[Array, Array]:
+    """Residual (rows,) of y by these columns, and of each configuration by a fit to the others."""
+    B, observed = fit.B[:, columns], fit.observations
+    left = y - B @ least_norm(weights.apply(B), weights.apply(y))
+    return left, held_out_residual(B, left, weights, observed.configuration, observed.size)
 
 
 def _restricted(
@@ -426,23 +432,19 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
 def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_]) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
     model linearised at the whole fit."""
-    model, observed, B = result.model, result.observations, result.B
-    weights = weights_for(observed, model.cell.tracker, "auto")
+    model, B = result.model, result.B
+    weights = weights_for(result.observations, model.cell.tracker, "auto")
     y = result.residual + B @ np.where(held, result.x - model.nominal, 0.0)
-    white, error = weights.apply(B[:, columns]), weights.apply(y)
     if result.smooth and len(columns):
         # What has a prior in the whole fit has none here: a minimal complete set.
         own = tuple(model.parameters[c] for c in columns)
         sizes = np.array([p.typical or 1.0 for p in own])
-        sigma = max(float(np.sqrt(np.mean(error**2))), 1e-300)
-        kept = reduce(white, sizes, own, sigma, WORTH_A_COLUMN).kept
-        columns, white = columns[kept], white[:, kept]
+        sigma = max(float(np.sqrt(np.mean(weights.apply(y) ** 2))), 1e-300)
+        kept = reduce(weights.apply(B[:, columns]), sizes, own, sigma, WORTH_A_COLUMN).kept
+        columns = columns[kept]
     if not len(columns):
         return y
-    residual = y - B[:, columns] @ least_norm(white, error)
-    found = held_out_residual(
-        B[:, columns], residual, weights, observed.configuration, observed.size
-    )
+    found = _refitted(result, y, columns, weights)[1]
     return found if np.isfinite(found).all() else None
 
 

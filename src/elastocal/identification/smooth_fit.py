@@ -19,8 +19,9 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse, special
 
+from elastocal.engine.mixed import Products, climb
 from elastocal.identification.covariance import Covariance
-from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.knowledge import GaussianPrior, share_of_prior
 from elastocal.identification.least_squares import Fit, PriorRows, Problem
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
@@ -31,26 +32,19 @@ from elastocal.identification.options import (
     Intervals,
     MethodResult,
     Options,
+    SmoothPart,
     check_for_functions,
 )
 from elastocal.identification.outliers import FALSE_ALARM, NoiseAndOutliers, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
-from elastocal.identification.smooth_functions import (
-    LinearRows,
-    Posterior,
-    Scales,
-    SmoothPart,
-)
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Reduction,
     Solution,
     choose,
-    free_r_factor,
     is_placed,
 )
 from elastocal.identification.weighted_problem import (
-    Evaluation,
     Part,
     RFactor,
     each,
@@ -64,6 +58,193 @@ from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
+
+# Parameters with a prior beside parameters without one: sizes by restricted likelihood, posterior.
+#
+#     e = B_f α + B_s b + ε,   ε ~ N(0, σ²),   b ~ N(0, Λ),   Λ = diag(λ_g s²)
+#
+# with whitened rows; α are the ordinary parameters, b the shrunk ones as deviations from nominal, s
+# their standard deviations as declared and λ_g one scale for each group.  With [B_f B_s e] = QR the
+# rows are needed no more: R_ss, below what the ordinary parameters take, holds all that decides σ²
+# and λ (Patterson and Thompson 1971; Harville 1977).
+
+# Scales λ beyond these are no longer told apart: nothing is left of the group, or of its prior.
+LEAST, MOST = 1e-3, 1e6
+SMALL = 0.05
+# Of log λ above 0: a function may be smaller than stated at no price, but ten times the size costs
+# what a likelihood ratio of 1e8 gains.  Data that hardly show a function know no upper limit.
+PRICE = 0.75
+# Noise as shares of the variance that ordinary parameters leave, from which the search starts.
+SHARES = (1.0, 0.1, 0.01, 0.001)
+CLIMBS, ENOUGH, CURVED = 30, 0.02, 0.3  # of −2ℓ: what the last step may promise; its curvature
+
+
+@dataclass(frozen=True)
+class Scales:
+    """λ (groups,), σ² of a whitened row, and by how much (groups,) the restricted log-likelihood
+    falls where a group is left out."""
+
+    scale: Array
+    variance: float
+    gain: Array
+
+    @property
+    def sigma(self) -> float:
+        return float(np.sqrt(self.variance))
+
+
+@dataclass(frozen=True)
+class LinearRows:
+    """Rows linearised: the R factor of [B_f B_s e], e at nominal functions.
+
+    `std` (shrunk,) are the prior's standard deviations as declared, `group` (shrunk,) the numbers
+    of the groups.
+    """
+
+    factor: RFactor
+    std: Array
+    group: IntArray
+
+    @classmethod
+    def of(cls, factor: RFactor, away: Array, std: Array, group: IntArray) -> LinearRows:
+        """From the R factor with the functions `away` (shrunk,) from nominal."""
+        rows = factor.augmented.copy()
+        rows[:, -1] += rows[:, len(rows) - 1 - len(away) : -1] @ away
+        return cls(RFactor(rows, factor.rows), std, group)
+
+    def only(self, kept: IntArray) -> LinearRows:
+        """With the ordinary columns `kept` alone: what the others took is the functions' again."""
+        chosen = np.append(kept, np.arange(self.ordinary, self.factor.columns))
+        return replace(self, factor=self.factor.of_columns(chosen))
+
+    @property
+    def ordinary(self) -> int:
+        return self.factor.columns - len(self.std)
+
+    @cached_property
+    def products(self) -> Products:
+        """Those of B_s and e with the ordinary columns projected out."""
+        S, e = self.factor.augmented[self.ordinary :, self.ordinary : -1], self.factor.augmented
+        left = e[self.ordinary :, -1]
+        spare = max(self.factor.rows - self.ordinary, 1)
+        return Products(S.T @ S, S.T @ left, float(left @ left), spare)
+
+    def scales(self, start: Scales | None = None) -> Scales:
+        """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
+        at the `start` stays so."""
+        alive = (
+            np.ones(self.group.max(initial=-1) + 1, dtype=bool)
+            if start is None
+            else start.scale > 0
+        )
+        own = np.flatnonzero(alive[self.group])
+        group = np.unique(self.group[own], return_inverse=True)[1].ravel()
+        whole = self.products
+        products = replace(whole, M=whole.M[np.ix_(own, own)], z=whole.z[own])
+        grown = 2.0 * (group[:, None] == np.arange(int(alive.sum())))
+
+        def objective(theta: Array) -> tuple[float, Array, Array]:
+            """In log σ and the ½ log λ of the groups."""
+            variances = np.exp(2 * theta[1:])[group] * self.std[own] ** 2
+            value, slope, information = products.objective(variances, grown, float(theta[0]))
+            over = np.maximum(2 * theta[1:], 0.0) / PRICE
+            slope[1:] += 4 * over / PRICE
+            # What is next to nothing has next to no curvature: no step may be taken for it.
+            information[np.diag_indices_from(information)] += CURVED
+            at = 1 + np.flatnonzero(over > 0)
+            information[at, at] += 8 / PRICE**2
+            return value + float(over @ over), slope, information
+
+        variance, n = max(whole.squares / whole.rows, 1e-300), grown.shape[1]
+        size = 0.5 * np.log([LEAST, MOST])
+        noise = 0.5 * np.log(variance) + np.array([-20.0, 1.0])
+        lower, upper = (np.concatenate([[noise[k]], np.full(n, size[k])]) for k in (0, 1))
+
+        def found(theta: Array) -> Array:
+            return climb(objective, np.clip(theta, lower, upper), lower, upper, ENOUGH, CLIMBS)[0]
+
+        if start is None:
+            levels = 0.5 * np.log(variance * np.array(SHARES))
+            begun = [np.concatenate([[level], np.zeros(n)]) for level in levels]
+            theta = found(min(begun, key=lambda one: objective(one)[0]))
+            small = theta[1:] < 0.5 * np.log(SMALL)
+            if small.any():
+                again = found(np.where(np.concatenate([[False], small]), 0.0, theta))
+                theta = min(theta, again, key=lambda one: objective(one)[0])
+        else:
+            # From nothing the likelihood shows no way back: what is small begins anew.
+            known = np.where(start.scale[alive] < SMALL, 1.0, start.scale[alive])
+            theta = found(0.5 * np.log(np.concatenate([[start.variance], known])))
+        scale, gain = np.zeros(len(alive)), np.zeros(len(alive))
+        scale[alive] = np.exp(2 * theta[1:])
+        at = products.at(scale[self.group[own]] * self.std[own] ** 2, float(theta[0]))
+        gain[alive] = at.left_out([np.flatnonzero(group == g) for g in range(n)])
+        return Scales(scale, float(np.exp(2 * theta[0])), gain)
+
+    def posterior(self, scales: Scales) -> Posterior:
+        k, std = self.ordinary, np.sqrt(scales.scale / scales.variance)[self.group] * self.std
+        own = np.flatnonzero(std > 0)
+        P = np.eye(len(own), k + len(own), k) / std[own, None]
+        rows = self.factor.of_columns(np.append(np.arange(k), k + own))
+        prior = RFactor(np.column_stack([P, np.zeros(len(own))]), 0)
+        return Posterior(rows.merged(prior), own, P)
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
+
+    `r_factor` is that of readings and prior rows P (own, columns) together, in units of σ, the
+    shrunk ones counted from nominal; `own` index those that take part.
+    """
+
+    r_factor: RFactor
+    own: IntArray
+    P: Array
+
+    @property
+    def ordinary(self) -> int:
+        return self.r_factor.columns - len(self.own)
+
+    @property
+    def of_own(self) -> Array:
+        """P of the shrunk ones (own, own), diagonal."""
+        return self.P[:, self.ordinary :]
+
+    @cached_property
+    def half(self) -> Array:
+        return self.r_factor.half
+
+    @property
+    def step(self) -> Array:
+        """α and b (columns,)."""
+        return self.half @ self.r_factor.projected
+
+    @property
+    def marginal(self) -> RFactor:
+        """R of the ordinary columns with the shrunk ones taken for noise,
+        RᵀR/σ² = B_fᵀ(σ² + B_sΛB_sᵀ)⁻¹B_f."""
+        last = np.roll(np.arange(self.r_factor.columns), len(self.own))
+        rows = self.r_factor.of_columns(last)
+        return RFactor(rows.augmented[len(self.own) :, len(self.own) :], rows.rows)
+
+    @cached_property
+    def cofactor(self) -> Array:
+        return self.half @ self.half.T
+
+    @property
+    def prior_share(self) -> Array:
+        """Share of each estimate's information that is the prior's, 0 to 1."""
+        return share_of_prior(self.cofactor, self.P)
+
+    @cached_property
+    def effective(self) -> Array:
+        """How many parameters' worth of each (columns,) the readings determine, 0 to 1: their sum
+        is the trace of the hat matrix."""
+        return np.asarray(1 - (self.P**2).sum(axis=0) * np.diag(self.cofactor))
+
+
+# The course of the fit.
 
 STEPS = 25
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
@@ -173,8 +354,7 @@ class JointFit:
                 e = sparse.linalg.spsolve(part.weights.whiten.tocsc(), e)
             standard[part.rows] = e
 
-        for _ in each(parts, one):
-            pass
+        list(each(parts, one))
         return standard
 
 
@@ -269,20 +449,18 @@ class _Course:
         False.  Raises ElastocalError where the start has poses without equilibrium.
         """
         f, sizes, ordinary = self.functions, self.every.sizes, self.sound.problem.free
-        among, x = np.append(ordinary, f.columns), self._started(x, reduction)
-        problem = replace(problem, free=among)
+        problem = replace(problem, free=np.append(ordinary, f.columns))
+        x = self._started(x, reduction)
         if scales is not None:
             gone = f.columns[(scales.scale == 0)[f.group]]
             x[gone] = self.model.nominal[gone]
-        at = evaluate(self.model, problem.parts, x, among)
+        free = self._rows(problem, x)
         for left in reversed(range(CHOICES if scales is None else 1)):
-            free = f.rows(at.r_factor, x)
             scales = free.only(np.searchsorted(ordinary, reduction.kept)).scales(scales)
             again = self._chosen(free, scales) if choosing else reduction
             if not np.array_equal(again.kept, reduction.kept):
                 reduction, x = again, self._started(x, again)
-                at = evaluate(self.model, problem.parts, x, among)
-                free = f.rows(at.r_factor, x)
+                free = self._rows(problem, x)
                 if left:
                     continue
             reduction = reduction.seen(ordinary, free.factor.R, sizes)
@@ -291,13 +469,18 @@ class _Course:
             known = PriorRows(posterior.P, posterior.of_own @ self.model.nominal[own])
             # While there is another choice, a single step.
             found = least_squares(
-                problem, np.append(reduction.kept, own), x, sizes, known=known, among=among,
-                max_steps=2 if left else STEPS, tolerance=SETTLED / len(at.residual), at=at,
+                problem, np.append(reduction.kept, own), x, sizes, known=known,
+                max_steps=2 if left else STEPS,
+                tolerance=SETTLED / len(problem.observations.value),
             )  # fmt: skip
-            x, at = found.x, Evaluation(found.residual, free_r_factor(problem, found))
+            x, free = found.x, self._rows(problem, found.x)
         assert scales is not None
-        linear = f.rows(at.r_factor, x).only(np.searchsorted(ordinary, reduction.kept))
+        linear = free.only(np.searchsorted(ordinary, reduction.kept))
         return JointFit(found, reduction, scales, linear)
+
+    def _rows(self, problem: Problem, x: Array) -> LinearRows:
+        factor = evaluate(self.model, problem.parts, x, problem.free).r_factor
+        return self.functions.rows(factor, x)
 
     def _chosen(self, free: LinearRows, scales: Scales) -> Reduction:
         problem, marginal = self.sound.problem, free.posterior(scales).marginal
@@ -426,7 +609,7 @@ class _Course:
         mixing = np.vstack([r.mixing, np.zeros((len(posterior.own), len(r.dropped)))])
         solution = replace(
             self.sound, problem=problem, held=cross[0], nominal_rms=self.every.nominal_rms,
-            fit=replace(found, problem=problem, r_factor=posterior.marginal, wide=None),
+            fit=replace(found, problem=problem, r_factor=posterior.marginal),
             reduction=replace(r, kept=columns, mixing=mixing, with_prior=f.columns),
         )  # fmt: skip
         effective = float(posterior.effective.sum())

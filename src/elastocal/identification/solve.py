@@ -175,8 +175,6 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 def free_r_factor(problem: Problem, found: Fit) -> RFactor:
     if np.array_equal(found.columns, problem.free):
         return found.r_factor
-    if found.wide is not None:
-        return found.wide
     return evaluate(problem.model, problem.parts, found.x, problem.free).r_factor
 
 
@@ -208,15 +206,10 @@ def chosen_again(solution: Solution) -> Reduction:
 
 
 def fit_kept(
-    problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60,
-    *, again: bool = False,
-) -> Fit:  # fmt: skip
-    """Fit of the kept parameters, the others held at the start; their share moves over first.
-
-    `again` says that there will be another choice at its end, by `free_r_factor`.
-    """
+    problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60
+) -> Fit:
+    """Fit of the kept parameters, the others held at the start; their share moves over first."""
     kept, dropped = chosen.kept, chosen.dropped
-    among = problem.free if again else None
     start = x.copy()
     start[dropped] = problem.x0[dropped]
     shifted = start.copy()
@@ -224,10 +217,10 @@ def fit_kept(
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
     for trial in (shifted, start):
         try:
-            return fit(problem, kept, trial, sizes, among=among, max_steps=max_steps)
+            return fit(problem, kept, trial, sizes, max_steps=max_steps)
         except ElastocalError:
             continue
-    return fit(problem, kept, problem.x0, sizes, among=among, max_steps=max_steps)
+    return fit(problem, kept, problem.x0, sizes, max_steps=max_steps)
 
 
 def looked_at(problem: Problem, found: Fit) -> tuple[Array, Array]:
@@ -284,7 +277,7 @@ def prefer_wider(
         if not predicts(linear[0]):
             continue
         try:
-            wide = fit_kept(problem, sizes, start, wider, max_steps=30, again=True)
+            wide = fit_kept(problem, sizes, start, wider, max_steps=30)
             after = looked_at(problem, wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
@@ -390,11 +383,11 @@ def settle(
             problem, exact = replace(problem, x0=tied_fit(asked, sizes, PLACING).x), True
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
-        found = fit_kept(problem, sizes, found.x, reduction, again=True)
+        found = fit_kept(problem, sizes, found.x, reduction)
         sigma, r_factor = residual_sigma(found, len(kept)), free_r_factor(problem, found)
     left = reduction.seen(problem.free, r_factor.R, sizes)
     if left is not reduction:
-        reduction, found = left, fit_kept(problem, sizes, found.x, left, again=True)
+        reduction, found = left, fit_kept(problem, sizes, found.x, left)
         r_factor = free_r_factor(problem, found)
     return problem, found, reduction, r_factor, nominal
 

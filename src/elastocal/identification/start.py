@@ -193,33 +193,22 @@ def _descended(
 def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tuple[Array, Array]:
     """Translation (s, 3) and markers (s, M, 3) for every rotation R (s, 3, 3) and weight (s, n).
 
-    With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations, of
-    orthogonal blocks.  Its normal equations cost half the digits, which a start can spare.
+    With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations.  Its normal
+    equations cost half the digits, which a start can spare.
     """
-    turn, code = problem.flange[:, :3, :3], problem.marker
-    free = np.flatnonzero(problem.free_markers)
+    n, free = len(problem.points), np.flatnonzero(problem.free_markers)
     fixed = problem.start_markers * ~problem.free_markers[:, None]
     known = np.zeros(3) if problem.free_base else problem.base_translation
     y = (problem.points - known) @ R - _body_points(problem, fixed)
-    size = 3 + 3 * len(free)
-    normal, right = np.zeros((len(R), size, size)), np.empty((len(R), size))
-    own = np.arange(3)
-    normal[:, own, own] = weight.sum(axis=1)[:, None]
-    right[:, :3] = (weight[..., None] * y).sum(axis=1)
-    for k, c in enumerate(free):
-        here, at = code == c, slice(3 + 3 * k, 6 + 3 * k)
-        w = weight[:, here]
-        cross = (w @ turn[here].reshape(-1, 9)).reshape(-1, 3, 3)
-        normal[:, :3, at], normal[:, at, :3] = cross, cross.transpose(0, 2, 1)
-        normal[:, 3 + 3 * k + own, 3 + 3 * k + own] = w.sum(axis=1)[:, None]
-        weighted = (w[..., None] * y[:, here]).reshape(len(R), -1)
-        right[:, at] = weighted @ turn[here].reshape(-1, 3)
-    sought = slice(0 if problem.free_base else 3, size)
-    values, vectors = np.linalg.eigh(normal[:, sought, sought])
+    turned = (problem.marker[:, None] == free)[:, None, :, None] * problem.flange[:, :3, None, :3]
+    base = np.broadcast_to(np.eye(3) * problem.free_base, (n, 3, 3))
+    rows = np.concatenate([base, turned.reshape(n, 3, -1)], axis=2).reshape(3 * n, -1)
+    weighted = (rows * np.repeat(weight, 3, axis=1)[..., None]).transpose(0, 2, 1)
+    values, vectors = np.linalg.eigh(weighted @ rows)
     shown = values > RCOND**2 * values[:, -1:]
-    along = (right[:, None, sought] @ vectors)[:, 0] / np.where(shown, values, np.inf)
-    x = np.zeros((len(R), size))
-    x[:, sought] = (vectors @ along[..., None])[..., 0]
+    right = (weighted @ y.reshape(len(R), -1, 1)).transpose(0, 2, 1)
+    along = (right @ vectors)[:, 0] / np.where(shown, values, np.inf)
+    x = (vectors @ along[..., None])[..., 0]
     markers = np.broadcast_to(fixed, (len(R), *fixed.shape)).copy()
     markers[:, free] = x[:, 3:].reshape(len(R), -1, 3)
     return known + (R @ x[:, :3, None])[..., 0], markers
@@ -227,12 +216,8 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
 
 def _body_points(problem: RegistrationProblem, markers: Array) -> Array:
     """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
-    out = np.empty((*markers.shape[:-2], len(problem.flange), 3))
-    for k in range(markers.shape[-2]):
-        here = problem.marker == k
-        turned = markers[..., k, :] @ problem.flange[here, :3, :3].reshape(-1, 3).T
-        out[..., here, :] = turned.reshape(*turned.shape[:-1], -1, 3) + problem.flange[here, :3, 3]
-    return out
+    turned = problem.flange[:, :3, :3] @ markers[..., problem.marker, :, None]
+    return np.asarray(turned[..., 0] + problem.flange[:, :3, 3])
 
 
 def _rotation_between(body: Array, points: Array, weight: Array) -> Array:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -42,24 +42,32 @@ class Weights:
     or holds only up to a common factor, which the residual must tell.
 
     Where all readings have some noise in common, as a drift in time, Σ = Σ₀ + FFᵀ with few columns
-    F, `common` (rows, k), and W = (I − low lowᵀ) W₀; `whiten` is then W₀, and a reading is judged
-    by those outside its block of time, `together` (observations,).
+    F, `common` (rows, k), and W = (I − low lowᵀ) W₀; `whiten` is then W₀.  What readings far from
+    each other share so, a reading is judged by those outside its block of time, `together`
+    (observations,).
     """
 
     kind: str
     whiten: sparse.csr_array | None
     absolute: bool
     description: str
-    low: Array | None = None
     common: Array | None = None
     together: IntArray | None = None
 
     def apply(self, rows: Array) -> Array:
         """Whiten a vector (rows,) or matrix (rows, k)."""
-        return self._beside(self.alone(rows))
+        return self.beside(self.alone(rows))
 
-    def _beside(self, own: Array) -> Array:
-        return own if self.low is None else own - self.low @ (self.low.T @ own)
+    def beside(self, own: Array) -> Array:
+        """(I − low lowᵀ) of rows that are whitened by W₀."""
+        return own if self.common is None else own - self._low @ (self._low.T @ own)
+
+    @cached_property
+    def _low(self) -> Array:
+        """(I + F₀F₀ᵀ)^(−1/2) = I − U (1 − (1 + s²)^(−1/2)) Uᵀ of the whitened F₀ = W₀F."""
+        assert self.common is not None
+        U, size, _ = linalg.svd(self.alone(self.common), full_matrices=False)
+        return np.asarray((U * np.sqrt(1 - 1 / np.sqrt(1 + size**2)))[:, size > 0])
 
     def alone(self, rows: Array) -> Array:
         """The same by what is not common to all readings, W₀."""
@@ -73,20 +81,6 @@ class Weights:
         p, k = B.shape[1], self.common.shape[1]
         rows = np.vstack([self.alone(np.hstack([B, self.common])), np.eye(k, p + k, p)])
         return rows, np.concatenate([self.alone(e), np.zeros(k)])
-
-    def with_common(self, F: Array, together: IntArray) -> Weights:
-        """With noise FFᵀ more, F (rows, k), that readings far from each other share."""
-        U, size, _ = linalg.svd(self.apply(F), full_matrices=False)
-        # (I + FFᵀ)^(−1/2) = I − U (1 − (1 + s²)^(−1/2)) Uᵀ
-        low = U * np.sqrt(1 - 1 / np.sqrt(1 + size**2))
-        return replace(self, low=low[:, size > 0], common=F, together=together)
-
-    @property
-    def whole(self) -> sparse.csr_array | None:
-        """W (rows, rows), all of it."""
-        if self.low is None or self.whiten is None:
-            return self.whiten
-        return sparse.csr_array(self._beside(self.whiten.toarray()))
 
 
 def weights_for(
@@ -187,10 +181,10 @@ def _given(observed: Observations, covariance: Array | None) -> Weights:
 def block_diagonal(blocks: Array) -> sparse.csr_array:
     """Blocks (n, d, d) along the diagonal; their zeros are not stored."""
     n, d, _ = blocks.shape
-    block, i, j = np.nonzero(blocks)
-    counts = np.bincount(block * d + i, minlength=n * d)
-    indptr = np.concatenate([[0], np.cumsum(counts)])
-    return sparse.csr_array((blocks[block, i, j], block * d + j, indptr), shape=(n * d, n * d))
+    places = np.arange(n), np.arange(n + 1)
+    out = sparse.bsr_array((np.ascontiguousarray(blocks), *places), shape=(n * d, n * d)).tocsr()
+    out.eliminate_zeros()
+    return sparse.csr_array(out)
 
 
 def inverse_factor(blocks: Array) -> Array:
@@ -296,9 +290,9 @@ def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
         every = sparse.eye_array(len(index), format="csr")
         own = Observations(observed.kind, value, every, np.arange(len(index)), table)
     inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
-    mine = replace(weights, whiten=inside, low=None, common=None, together=None)
+    mine = replace(weights, whiten=inside)
     if weights.common is not None and weights.together is not None:
-        mine = mine.with_common(weights.common[rows], weights.together[index])
+        mine = replace(mine, common=weights.common[rows], together=weights.together[index])
     return Part(index, rows, own, mine)
 
 
@@ -427,7 +421,7 @@ class RFactor:
         return (inverse @ inverse.T) * np.outer(scale, scale)
 
 
-def least_norm(A: Array, b: Array, cond: float | None = None, check_finite: bool = True) -> Array:
+def least_norm(A: Array, b: Array, cond: float | None = None) -> Array:
     """x (k, …) of least norm among those that minimise |A x − b|, by singular values; those below
     `cond` of the largest count as zero, by default what the rounding of so many rows makes.
 
@@ -438,7 +432,7 @@ def least_norm(A: Array, b: Array, cond: float | None = None, check_finite: bool
     if cond is None:
         cond = np.finfo(np.float64).eps * max(A.shape)
     try:
-        return np.asarray(linalg.lstsq(A, b, cond=cond, check_finite=check_finite)[0])
+        return np.asarray(linalg.lstsq(A, b, cond=cond)[0])
     except linalg.LinAlgError:
         return np.asarray(linalg.lstsq(A, b, cond=cond, lapack_driver="gelss")[0])
 
@@ -462,7 +456,6 @@ def _factor(rows: Array) -> Array:
 
 # Passes over a table in parts: B is formed, used and dropped, one part at a time.
 
-Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 # Two parts at a time: one is evaluated while the other is factorised (measured: a third one only
@@ -472,22 +465,10 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Residual (rows,), observed minus predicted and raw, and the R factor of whitened B and it.
-
-    `wide` is the R factor of more columns, where they were evaluated with it.
-    """
+    """Residual (rows,), observed minus predicted and raw, and the R factor of whitened B and it."""
 
     residual: Array
     r_factor: RFactor
-    wide: RFactor | None = None
-
-    def chosen(self, columns: IntArray, among: IntArray, size: Array) -> Evaluation:
-        """Of the `columns` among those evaluated, each per `size` of it."""
-        if columns is among:
-            return Evaluation(self.residual, self.r_factor.scaled(size))
-        order = np.argsort(among)
-        own = self.r_factor.of_columns(order[np.searchsorted(among, columns, sorter=order)])
-        return Evaluation(self.residual, own.scaled(size), self.r_factor)
 
 
 def evaluate(model: Model, parts: Partition, x: Array, columns: NDArray[np.integer]) -> Evaluation:
@@ -512,8 +493,7 @@ def residual_at(model: Model, parts: Partition, x: Array) -> Array:
     def predicted(part: Part) -> None:
         residual[part.rows] = residual_of(model, part, x)
 
-    for _ in each(parts, predicted):
-        pass
+    list(each(parts, predicted))
     return residual
 
 
@@ -529,20 +509,17 @@ def regressor(model: Model, part: Part, x: Array, columns: NDArray[np.integer]) 
 
 
 def each(parts: Partition, work: Callable[[Part], Result]) -> Iterator[Result]:
-    return in_order(parts.spans, lambda span: work(parts.part(span)))
+    """`work` on every part, AT_ONCE at a time; results in the order of the parts.
 
-
-def in_order(items: Sequence[Item], work: Callable[[Item], Result]) -> Iterator[Result]:
-    """`work` on every item, AT_ONCE at a time; results in the order of the items.
-
-    What the results add up to so does not depend on which item is done first.  The first item is
+    What the results add up to so does not depend on which part is done first.  The first one is
     done alone: it builds what the others share (the model's compiled functions).
     """
-    yield work(items[0])
-    if len(items) == 1:
+    first, *others = parts.spans
+    yield work(parts.part(first))
+    if not others:
         return
     pool = ThreadPoolExecutor(AT_ONCE)
     try:
-        yield from pool.map(work, items[1:])
+        yield from pool.map(lambda span: work(parts.part(span)), others)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
