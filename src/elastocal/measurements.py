@@ -455,6 +455,17 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
     return {family.name: family for family in known}
 
 
+def in_file_units(values: Array, kinds: Sequence[str]) -> Array:
+    """Joints (…, n) in rad or m as files have them: degrees, and mm of a prismatic joint."""
+    return values * np.where([kind == "revolute" for kind in kinds], 180 / np.pi, 1e3)
+
+
+def joint_columns(kinds: Sequence[str], before: str = "") -> list[str]:
+    """q1_deg …, q3_mm for a prismatic joint, each after `before`."""
+    units = ["deg" if kind == "revolute" else "mm" for kind in kinds]
+    return [column(f"{before}q{i}", unit) for i, unit in enumerate(units, start=1)]
+
+
 def columns_of(
     source: str,
     header: Sequence[str],

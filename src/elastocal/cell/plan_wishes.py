@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -52,12 +53,8 @@ SPEED_KEYS = (
 )
 
 
-def _force() -> Any:
-    return keyed("three numbers in N, a force in the data's frame", "load_N", default=None)
-
-
-def _point() -> Any:
-    return keyed("three numbers in m, a point in the flange frame", "point_m", default=None)
+FORCE = partial(keyed, "three numbers in N, a force in the data's frame", "load_N", default=None)
+POINT = partial(keyed, "three numbers in m, a point in the flange frame", "point_m", default=None)
 
 
 @record
@@ -71,9 +68,9 @@ class TargetPose:
     """
 
     q: Numbers = keyed("one number per joint, in {}", "q_deg", "q_si")
-    force: Vector3 | None = _force()
+    force: Vector3 | None = FORCE()
     weight: Positive = keyed("a positive number", default=1.0)
-    point: Vector3 | None = _point()
+    point: Vector3 | None = POINT()
     degrees: bool = False
 
     @classmethod
@@ -92,8 +89,8 @@ class TargetPath:
     """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
 
     file: File = keyed('the path of a table of poses, e.g. "path.csv"', required=True)
-    force: Vector3 | None = _force()
-    point: Vector3 | None = _point()
+    force: Vector3 | None = FORCE()
+    point: Vector3 | None = POINT()
 
 
 @record
@@ -113,13 +110,13 @@ class TargetBox:
     rotation: Rotation | None = keyed(
         "three numbers in degrees: roll, pitch, yaw of the flange", "rpy_deg", default=None
     )
-    force: Vector3 | None = _force()
-    point: Vector3 | None = _point()
+    force: Vector3 | None = FORCE()
+    point: Vector3 | None = POINT()
 
     def __post_init__(self) -> None:
         k = int(np.argmin(self.lower < self.upper))
         require(
-            bool((self.lower < self.upper).all()),
+            bool(self.lower[k] < self.upper[k]),
             f"{header(('design', 'test_box'))} takes lower_m < upper_m in x, y and z; found "
             f"{self.lower[k]:g} and {self.upper[k]:g} in {'xyz'[k]}; swap or correct them",
         )

@@ -361,14 +361,6 @@ class Acceptance:
 ENTRY = partial(keyed, "a text", form=Text, default=None)
 
 
-def _is_a_day(text: str) -> bool:
-    try:
-        date.fromisoformat(text)
-    except ValueError:
-        return False
-    return True
-
-
 @record
 class CertificateEntries:
     """What a calibration certificate states besides the results (ISO/IEC 17025, 7.8.2).
@@ -402,22 +394,21 @@ class CertificateEntries:
             f"key certificate.country is {quoted(self.country)}, which takes the two letters of "
             'ISO 3166, as in "DE"',
         )
-        day = self.measured_on or "2000-01-01"
+        try:
+            day = date.fromisoformat(self.measured_on or "2000-01-01").isoformat()
+        except ValueError:
+            day = ""
         require(
-            bool(re.fullmatch(r"\d{4}-\d\d-\d\d", day)) and _is_a_day(day),
-            f"key certificate.measured_on is {quoted(day)}, which takes the date of measurement, "
-            'as in "2026-03-17"',
+            self.measured_on in (None, "", day),
+            f"key certificate.measured_on is {quoted(self.measured_on)}, which takes the date of "
+            'measurement, as in "2026-03-17"',
         )
 
     @property
     def missing(self) -> list[str]:
         """The keys without which a document is no certificate."""
-        needed = (name for name in vars(self) if name != "limit")
-        keys = {
-            "temperature": "temperature_c",
-            "instrument_uncertainty": "instrument_uncertainty_um",
-        }
-        return [keys.get(name, name) for name in needed if getattr(self, name) is None]
+        keys = fields_of(type(self)).items()
+        return [k[0].name for n, k in keys if n != "limit" and getattr(self, n) is None]
 
 
 @record

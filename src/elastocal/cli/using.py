@@ -502,7 +502,7 @@ GRID_REMEDIES = {
 def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
     import numpy as np
 
-    from elastocal.compensation.compensate import in_file_units
+    from elastocal.measurements import in_file_units
     from elastocal.model.calibrated import numbers
     from elastocal.model.chain import joint_limits
 
@@ -543,13 +543,9 @@ def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[d
     reached and `partial` does not allow for that."""
     import numpy as np
 
-    from elastocal.compensation.compensate import (
-        check_status,
-        in_file_units,
-        joint_columns,
-        spread,
-    )
+    from elastocal.compensation.compensate import check_status, spread
     from elastocal.compensation.correction_table import EXACT, FIRST_ORDER
+    from elastocal.measurements import in_file_units, joint_columns
     from elastocal.tables import csv_text
 
     kinds = arm.model.chain.kinds

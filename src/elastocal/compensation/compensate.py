@@ -16,7 +16,13 @@ from elastocal.above import Result
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
-from elastocal.measurements import Measurements, families, read_measurements
+from elastocal.measurements import (
+    Measurements,
+    families,
+    in_file_units,
+    joint_columns,
+    read_measurements,
+)
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -669,16 +675,6 @@ def check_status(
     )
 
 
-def in_file_units(values: Array, kinds: Sequence[str]) -> Array:
-    return values * np.where([kind == "revolute" for kind in kinds], 180 / np.pi, 1e3)
-
-
-def joint_columns(kinds: Sequence[str], before: str = "") -> list[str]:
-    """q1_deg …, q3_mm for a prismatic joint, each after `before`."""
-    units = ["deg" if kind == "revolute" else "mm" for kind in kinds]
-    return [column(f"{before}q{i}", unit) for i, unit in enumerate(units, start=1)]
-
-
 def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     """The commands, one row per target in the order of the targets.
 
@@ -691,17 +687,10 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
     table = result.targets.table
     if result.force.any():
         blocks.append((["force_x_N", "force_y_N", "force_z_N"], result.force, ".9g"))
-    for name, values, unit in (
-        ("time", table.time, "s"),
-        ("approach", table.approach, ""),
-        ("temperature", table.temperature, "C"),
-        ("torque", table.torque, "Nm"),
-    ):
-        if values is not None:
-            stems = families(kinds)[name].units
-            heads = [
-                column(stem, unit if unit in units else units[0]) for stem, units in stems.items()
-            ]
+    for name in ("time", "approach", "temperature", "torque"):
+        if (values := getattr(table, name)) is not None:
+            units = families(kinds)[name].units
+            heads = [column(stem, of[0]) for stem, of in units.items()]
             blocks.append((heads, values.reshape(len(table), -1), ".12g"))
     change = held * in_file_units(result.q - result.nominal, kinds)
     blocks.append((joint_columns(kinds, "correction_"), change, f".{DIGITS}f"))

@@ -16,11 +16,10 @@ from elastocal.compensation.compensate import (
     Goals,
     Targets,
     compensate,
-    in_file_units,
-    joint_columns,
     targets_at,
 )
 from elastocal.errors import InputError, option
+from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,

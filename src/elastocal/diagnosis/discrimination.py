@@ -12,10 +12,9 @@ from scipy import linalg, special
 from scipy.sparse.csgraph import connected_components
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
+from elastocal.diagnosis.diagnosis import RivalPair
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import evidence_of
-from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import PLAUSIBLE, packed_columns, spans_of
 from elastocal.diagnosis.noise_floor import NoiseValues, covariance
 from elastocal.diagnosis.rivals import (
@@ -173,27 +172,11 @@ def joined(first: Measurements, second: Measurements) -> Measurements:
     return with_moves(table) if known else table
 
 
-@dataclass(frozen=True)
-class Campaign:
-    """Data so far and pool in one, the first `measured` configurations being the data; `noise` is
-    what the diagnosis found."""
-
-    dataset: DiagnosisData
-    measured: int
-    noise: NoiseValues
-
-    @property
-    def so_far(self) -> DiagnosisData:
-        data, blocks = self.dataset.data, self.dataset.blocks
-        later = np.isin(np.arange(blocks.n), blocks.member[self.measured :])
-        return replace(self.dataset, data=data.without(later | data.faulty))
-
-
-def campaign_of(
-    base: Baseline, pool: VisitPool, hypotheses: list[Hypothesis], diagnosis: Diagnosis
-) -> Campaign:
-    """Columns of the data so far and of the pool at the fit; faulty readings and those of markers
-    that are not seen left out.
+def with_pool(
+    base: Baseline, pool: VisitPool, suspects: Suspects
+) -> tuple[DiagnosisData, DiagnosisData, NoiseValues]:
+    """Columns of the data so far and of the pool at the fit, of the data alone, and the noise that
+    the diagnosis found; faulty readings and those of markers that are not seen left out.
 
     Candidates are read as precisely as the same marker was on average.
     """
@@ -210,10 +193,12 @@ def campaign_of(
         base, observed=observed, stated=np.concatenate([stated, usual[later]]),
         residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
     )  # fmt: skip
-    measured = len(np.unique(table.configuration[base.observed.lead]))
-    dataset, noise = as_diagnosed(diagnosis_data_of(both, hypotheses), diagnosis)
+    dataset, noise = as_diagnosed(diagnosis_data_of(both, suspects.hypotheses), suspects.diagnosis)
     hidden = np.concatenate([np.zeros(len(table), dtype=bool), pool.hidden])[observed.lead]
-    return Campaign(dataset.without(dataset.data.faulty | hidden), measured, noise)
+    dataset = dataset.without(dataset.data.faulty | hidden)
+    blocks, measured = dataset.blocks, len(np.unique(table.configuration[base.observed.lead]))
+    planned = np.isin(np.arange(blocks.n), blocks.member[measured:])
+    return dataset, dataset.without(planned | dataset.data.faulty), noise
 
 
 def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
@@ -266,10 +251,14 @@ class Discrimination:
     classes: IntArray
 
     @classmethod
-    def of(cls, campaign: Campaign, rivals: RivalSet, rng: np.random.Generator) -> Discrimination:
-        """Columns of the rivals whitened by V, the covariance of each configuration."""
-        dataset, data = campaign.dataset, campaign.dataset.data
-        searched = alternatives(campaign.so_far, campaign.noise, rivals)
+    def of(
+        cls, dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, candidates: int,
+        rivals: RivalSet, rng: np.random.Generator,
+    ) -> Discrimination:  # fmt: skip
+        """Columns of the rivals whitened by V, the covariance of each configuration; of those of
+        the dataset the last are `candidates`."""
+        data, measured = dataset.data, len(dataset.data.X) - candidates
+        searched = alternatives(so_far, noise, rivals)
         # What is beside counts by the widest size of its prior.
         beside = [
             packed_columns(dataset, item) * float(item.scales.max()) for item in rivals.beside
@@ -283,10 +272,10 @@ class Discrimination:
         fitted, n = data.X.shape[2], len(rivals.rivals)
         nuisance = fitted + sum(C.shape[2] for C in beside)
         W = np.concatenate([data.X, *beside, *own, data.r[:, :, None]], axis=2)
-        L = np.linalg.cholesky(covariance(data, campaign.noise))
+        L = np.linalg.cholesky(covariance(data, noise))
         white = np.linalg.solve(L, data.masked(W))
-        so_far = white[: campaign.measured].reshape(-1, W.shape[2])
-        gram = so_far.T @ so_far
+        known = white[:measured].reshape(-1, W.shape[2])
+        gram = known.T @ known
         gram[np.diag_indices(nuisance)] += np.append(data.precision, np.ones(nuisance - fitted))
         widths = [C.shape[2] for C in own]
         spans = spans_of(widths, sum(widths))
@@ -295,7 +284,7 @@ class Discrimination:
         S = eliminated(gram, nuisance)[0]
         draws = _posterior_draws(rivals, groups, S, rng)
         start = cls(
-            rivals, gram[:-1, :-1], white[campaign.measured :, :, :-1], nuisance, groups, by,
+            rivals, gram[:-1, :-1], white[measured:, :, :-1], nuisance, groups, by,
             draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n),
         )  # fmt: skip
         return replace(start, before=start._squared(S[None, :-1, :-1])[0])
@@ -419,11 +408,12 @@ HOPE = 0.9
 def discriminations_of(
     base: Baseline, pool: VisitPool, suspects: Suspects, seed: int
 ) -> list[Discrimination]:
-    campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
-    sets = list(suspects.sets)
-    if suspects.unknown:
-        sets.append(suspects.unknown_set(campaign.so_far, campaign.noise))
-    return [Discrimination.of(campaign, s, np.random.default_rng(seed)) for s in sets]
+    dataset, so_far, noise = with_pool(base, pool, suspects)
+    sets = [*suspects.sets, *([suspects.unknown_set(so_far, noise)] if suspects.unknown else [])]
+    return [
+        Discrimination.of(dataset, so_far, noise, len(pool), s, np.random.default_rng(seed))
+        for s in sets
+    ]
 
 
 def judged(

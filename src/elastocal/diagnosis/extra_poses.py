@@ -27,8 +27,10 @@ from elastocal.errors import InsufficientDataError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
+from elastocal.planning.execution import nearest_first
+from elastocal.planning.moves import travel_times
 from elastocal.text import counted
-from elastocal.units import Array, Progress
+from elastocal.units import Progress
 
 # The fewest candidates that tell the rivals apart: greedy addition, then exchange.
 #
@@ -94,11 +96,8 @@ def _exchange(tasks: Sequence[Discrimination], chosen: list[int]) -> None:
     for _ in range(ROUNDS if len(chosen) > 1 else 0):
         changed = False
         for k, own in enumerate(list(chosen)):
-            others = chosen[:k] + chosen[k + 1 :]
-            best, error = _best(tasks, others)
-            if best == own:
-                continue
-            if error < (1 - WORTH) * _error(tasks, chosen):
+            best, error = _best(tasks, chosen[:k] + chosen[k + 1 :])
+            if best != own and error < (1 - WORTH) * _error(tasks, chosen):
                 chosen[k], changed = best, True
         if not changed:
             break
@@ -114,7 +113,12 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
     A pose is measured in all load states before the arm moves on, so that what drifts does not
     pass for an effect of the load.
     """
-    order = _tour(pool, list(chosen), table.q[-1])
+    left, order, at = np.array(chosen), list[int](), table.q[-1]
+    for moment in [None] if pool.time is None else np.unique(pool.time[left]):
+        due = left if pool.time is None else left[pool.time[left] == moment]
+        travel = travel_times(np.vstack([at, pool.q[due]]), None)
+        order += due[np.array(nearest_first(travel)) - 1].tolist()
+        at = pool.q[order[-1]]
     L, markers = len(pool.forces), len(table.marker_names)
     first_rows = [(k * L + load) * markers for k in order for load in range(L)]
     taken = set(table.configuration_labels)
@@ -132,18 +136,6 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
         position=None, rotation=None, distance=None, torque=None, sigma=None, temperature=None,
         time=time,
     )  # fmt: skip
-
-
-def _tour(pool: VisitPool, chosen: list[int], start: Array) -> list[int]:
-    out: list[int] = []
-    at, left, time = start, list(chosen), pool.time
-    while left:
-        due = left if time is None else [k for k in left if time[k] == time[left].min()]
-        nearest = min(due, key=lambda k: float(np.abs(pool.q[k] - at).max()))
-        out.append(nearest)
-        left.remove(nearest)
-        at = pool.q[nearest]
-    return out
 
 
 # What to do besides measuring the extra poses, in words.
@@ -210,10 +202,10 @@ def plan_extra(
     progress("extra poses: what else the rivals may be")
     suspects.sets = with_neighbours(base, suspects)
     progress("extra poses: drawing candidates")
+    C, M = base.blocks.member.shape
+    room = max(NUMBERS // (M * base.observed.size) ** 2 - C, 0)
     try:
-        pool = draw_pool(
-            model, base.x, table, **suspects.matters, most=_room(base), seed=seed
-        )  # fmt: skip
+        pool = draw_pool(model, base.x, table, **suspects.matters, most=room, seed=seed)
     except InsufficientDataError as error:
         return _nothing(suspects.sets, suspects, (str(error),))
     return _chosen(base, pool, suspects, most, seed, notes, progress)
@@ -273,11 +265,6 @@ def _chosen(
         inseparable=groups,
         advice=(*recording_advice(sets), *notes),
     )
-
-
-def _room(base: Baseline) -> int:
-    C, M = base.blocks.member.shape
-    return max(NUMBERS // (M * base.observed.size) ** 2 - C, 0)
 
 
 def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: tuple[str, ...]) -> ExtraPlan:

@@ -13,13 +13,19 @@ from scipy import linalg, special
 from elastocal.above import Result
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.files import atomic_write_text
-from elastocal.measurements import DEFAULT_MARKER, Measurements, families
+from elastocal.measurements import (
+    DEFAULT_MARKER,
+    Measurements,
+    families,
+    in_file_units,
+    joint_columns,
+)
 from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable, readings_at
-from elastocal.tables import column, csv_text
+from elastocal.tables import csv_text
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.
@@ -98,7 +104,6 @@ def reasons(
 SCHEMA = "elastocal/plan/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m, and a level of -25.24° reads so.
 DIGITS = 9
-UNITS = {"revolute": "deg", "prismatic": "mm"}
 
 
 def plan_table(
@@ -135,10 +140,9 @@ def plan_table(
     times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
     time = np.array([sum(each) / len(each) for each in times if each])
     # As the digits of the file say it.
-    q = [
-        to_si(np.round(in_unit(values, kind), DIGITS), UNITS[kind])
-        for values, kind in zip(np.array([stop.q for stop in first]).T, kinds, strict=True)
-    ]
+    shown = np.round(in_file_units(np.array([stop.q for stop in first]), kinds), DIGITS).T
+    units = ["deg" if kind == "revolute" else "mm" for kind in kinds]
+    q = [to_si(values, unit) for values, unit in zip(shown, units, strict=True)]
     force = np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]]
     own = (DEFAULT_MARKER,) if seen is None else tuple(seen)
     table = replace(
@@ -179,29 +183,24 @@ def write_plan(
 ) -> None:
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm; with the forces of the
     rows or not, and `more` columns."""
-    known = families(table.joint_kinds)
     names = [table.configuration_labels[k] for k in table.configuration]
     columns: dict[str, Sequence[str]] = {"configuration": names}
     if table.marker_names != (DEFAULT_MARKER,):
         columns["marker"] = [table.marker_names[k] for k in table.marker]
-    kinds = zip(known["q"].units, table.joint_kinds, table.q.T, strict=True)
-    for stem, kind, values in kinds:
-        columns[column(stem, UNITS[kind])] = [
-            repr(round(float(v), DIGITS) + 0.0) for v in in_unit(values, kind)
-        ]
-    for stem, values in zip(known["force"].units, table.force.T, strict=True) if forces else ():
-        columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
+    kinds = table.joint_kinds
+    blocks = [(joint_columns(kinds), np.round(in_file_units(table.q, kinds), DIGITS) + 0.0)]
+    if forces:
+        blocks.append((["force_x_N", "force_y_N", "force_z_N"], table.force + 0.0))
     if table.approach is not None:
-        for stem, values in zip(known["approach"].units, table.approach.T, strict=True):
-            columns[stem] = [str(int(v)) for v in values]
+        blocks.append((list(families(kinds)["approach"].units), table.approach.astype(int)))
     if table.time is not None:
-        columns["time_s"] = [repr(round(float(t), 3)) for t in table.time]
+        blocks.append((["time_s"], np.round(table.time[:, None], 3)))
+    for heads, values in blocks:
+        columns |= {
+            h: [repr(v) for v in own] for h, own in zip(heads, values.T.tolist(), strict=True)
+        }
     columns |= more
     atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
-
-
-def in_unit(values: Array, kind: str) -> Array:
-    return np.degrees(values) if kind == "revolute" else values * 1e3
 
 
 # The frozen result of a design: poses in order, what they promise, how far from the best.
@@ -557,7 +556,8 @@ class Plan(Result):
             return ("poses",)
         kind = self.model.chain.kinds[joint_index(joint)]
         unit = "°" if kind == "revolute" else " mm"
-        return tuple(f"{joint} at {in_unit(np.array(v), kind):.6g}{unit}" for v in self.levels)
+        levels = in_file_units(np.array(self.levels)[:, None], [kind])
+        return tuple(f"{joint} at {v:.6g}{unit}" for v in levels[:, 0])
 
     @property
     def stated_forces(self) -> Array | None:

@@ -484,7 +484,7 @@ def _plan_frame(plan: Plan | None) -> pd.DataFrame:
     """One row per pose: joints in ° or mm, place in the order, and the load where it states one."""
     import pandas as pd
 
-    from elastocal.compensation.compensate import in_file_units, joint_columns
+    from elastocal.measurements import in_file_units, joint_columns
 
     if plan is None:
         return pd.DataFrame()

@@ -148,7 +148,8 @@ def _moves(c: Comparison) -> say.Figure:
 
 
 def compensation_report(c: Compensation) -> say.Report:
-    from elastocal.compensation.compensate import in_file_units, joint_columns, summary
+    from elastocal.compensation.compensate import summary
+    from elastocal.measurements import in_file_units, joint_columns
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     table, kinds = c.targets.table, c.chain.kinds
@@ -228,7 +229,7 @@ def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
 
 
 def readings_report(table: Measurements) -> say.Report:
-    from elastocal.compensation.compensate import in_file_units, joint_columns
+    from elastocal.measurements import in_file_units, joint_columns
     from elastocal.report.figures import rows_of_dots
 
     rows = [
