@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from scipy import sparse, special
+from scipy import linalg, sparse, special
 
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification import published
@@ -380,10 +380,8 @@ def _published(
         "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
         "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
     )  # fmt: skip
-    x = solution.fit.x[fit.columns]
-    return MethodResult(
-        method, solution, Intervals(covariance, covariance.interval(x, LEVEL)), None, good
-    )
+    intervals = Intervals.by_t(covariance, solution.fit.x[fit.columns])
+    return MethodResult(method, solution, intervals, None, good)
 
 
 # The fit of a method again, under constraints and with a prior.
@@ -502,14 +500,10 @@ def joined(stated: GaussianPrior | None, own: GaussianPrior | None) -> GaussianP
     if stated is None or own is None:
         return own if stated is None else stated
     rest = [k for k, name in enumerate(own.names) if name not in set(stated.names)]
-    n, m = len(stated.names), len(rest)
-    covariance = np.zeros((n + m, n + m))
-    covariance[:n, :n] = stated.covariance
-    covariance[n:, n:] = own.covariance[np.ix_(rest, rest)]
     return GaussianPrior(
         (*stated.names, *(own.names[k] for k in rest)),
         np.concatenate([stated.mean, own.mean[rest]]),
-        covariance,
+        linalg.block_diag(stated.covariance, own.covariance[np.ix_(rest, rest)]),
     )
 
 

@@ -71,26 +71,20 @@ class Sets:
         self.n = int(self.of.max(initial=-1)) + 1
         self.first = firsts(self.of, self.n)
         repeats = np.bincount(self.of, minlength=self.n)
-        self.root = np.sqrt(repeats)
+        self.root, self.order = np.sqrt(repeats), np.argsort(self.of, kind="stable")
+        self.starts = np.cumsum(repeats) - repeats
         self.B = self.mean(B) * self.root[:, None, None]
         self.e = self.mean(readings.e) * self.root[:, None]
-        order = np.argsort(self.of, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(repeats)])[:-1]
-        e, set_of = readings.e[order], self.of[order]
+        e, set_of = readings.e[self.order], self.of[self.order]
         before = np.cumsum(e, axis=0) - e
-        before -= before[starts][set_of]
-        j = (np.arange(len(e)) - starts[set_of])[:, None]
+        before -= before[self.starts][set_of]
+        j = (np.arange(len(e)) - self.starts[set_of])[:, None]
         self.contrasts = ((before - j * e) / np.sqrt(np.maximum(j * (j + 1), 1)))[j[:, 0] > 0]
         self.sets = set_of[j[:, 0] > 0]
 
     def mean(self, values: Array) -> Array:
-        if self.n == len(self.of):
-            out = np.empty_like(values)
-            out[self.of] = values
-            return out
-        total = np.zeros((self.n, *values.shape[1:]))
-        np.add.at(total, self.of, values)
-        return total / (self.root**2).reshape(-1, *[1] * (values.ndim - 1))
+        total = np.add.reduceat(values[self.order], self.starts)
+        return np.asarray(total / (self.root**2).reshape(-1, *[1] * (values.ndim - 1)))
 
 
 class NoisyReadings:

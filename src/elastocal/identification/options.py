@@ -53,6 +53,11 @@ class Intervals:
     covariance: Covariance
     ci95: Array
 
+    @classmethod
+    def by_t(cls, covariance: Covariance, x: Array) -> Intervals:
+        """x ± t of the covariance's degrees of freedom."""
+        return cls(covariance, covariance.interval(x, LEVEL))
+
 
 def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Intervals:
     """Intervals of the solution's fitted parameters.
@@ -66,23 +71,21 @@ def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None)
     """
     fit, observed = solution.fit, solution.problem.observations
     x = fit.x[fit.columns]
-
-    def by_t(covariance: Covariance) -> Intervals:
-        return Intervals(covariance, covariance.interval(x, LEVEL))
-
     if kind == "auto" and noise is not None:
-        return by_t(noise.covariance)
+        return Intervals.by_t(noise.covariance, x)
     problem = solution.problem
     if kind == "auto" and problem.large:
         configurations = observed.n_configurations
         several = len(observed.lead) > configurations >= ENOUGH * len(x)
         kind = "cr1" if several else kind
     if kind in ("auto", "classical"):
-        return by_t(_classical(solution))
+        return Intervals.by_t(_classical(solution), x)
     if kind == "profile":
         return _profiled(solution, _classical(solution))
     found = _clustered(fit, kind)
-    return by_t(of_rows(found, len(fit.whitened), kind.upper()) if kind[0] == "h" else found)
+    if kind[0] == "h":
+        found = of_rows(found, len(fit.whitened), kind.upper())
+    return Intervals.by_t(found, x)
 
 
 def _clustered(fit: Fit, kind: str) -> Covariance:

@@ -25,7 +25,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import LEVEL, Intervals, MethodResult
+from elastocal.identification.options import Intervals, MethodResult
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import (
@@ -755,5 +755,4 @@ def robust_result(
     solution = replace(sound, problem=problem, fit=fit, held=heldout)
     cluster = None if intervals == "auto" else observed.configuration
     covariance = covariance_of(found, B, cluster)
-    ends = covariance.interval(x[kept], LEVEL)
-    return MethodResult(method, solution, Intervals(covariance, ends), None, good)
+    return MethodResult(method, solution, Intervals.by_t(covariance, x[kept]), None, good)

@@ -47,15 +47,11 @@ def ols(B: Array, dp: Array, sigma: Array | None = None) -> PublishedFit:
     Covariance by eq. (7), s² (BᵀB)⁻¹ with s² = rss/(rows − parameters), or, where `sigma`
     (rows,) is given, by the sandwich of eq. (8), (BᵀB)⁻¹ BᵀΣ²B (BᵀB)⁻¹.
     """
-    B, dp = _given(B, dp)
-    one = np.ones(len(dp))
-    x, cofactor = _solve(B, dp, one)
-    residual = dp - B @ x
-    if sigma is None:
-        covariance = float(residual @ residual) / (len(dp) - len(x)) * cofactor
-    else:
-        covariance = _sandwich(B, one, _positive("sigma", sigma, len(dp)), cofactor)
-    return PublishedFit("ols", x, covariance, one, residual)
+    found = replace(wls(B, dp, np.ones(np.shape(dp)), sigma), method="ols")
+    if sigma is not None:
+        return found
+    s2 = float(found.residual @ found.residual) / (len(dp) - len(found.x))
+    return replace(found, covariance=s2 * found.covariance)
 
 
 def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> PublishedFit:

@@ -27,7 +27,6 @@ from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
-    LEVEL,
     FunctionPrior,
     Intervals,
     MethodResult,
@@ -623,7 +622,7 @@ class _Course:
         )
         matrix = fit.scales.variance * posterior.cofactor
         covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
-        intervals = Intervals(covariance, covariance.interval(x[columns], LEVEL))
+        intervals = Intervals.by_t(covariance, x[columns])
         shares = zip(columns.tolist(), posterior.prior_share.tolist(), strict=True)
         method = self.options.resolved
         if not self.estimating:

@@ -27,7 +27,6 @@ from elastocal.units import Array, BoolArray, IntArray
 # too short.
 
 UNSKEWED = 1.25  # largest over smallest singular value of an A that may be a rotation and a scale
-TOGETHER = 2**18  # rows at a time
 DIGITS = 1e-12
 # A tag, a target or a scale bar is wrong by a few per cent at most; another robot by any factor.
 OF_A_TARGET = 0.05
@@ -55,31 +54,24 @@ class LinearFits:
 def linear_fits(flange: Array, points: Array, marker: IntArray) -> LinearFits:
     """Fits of readings `points` (n, 3) of `marker` (n,) or (K, n) to flanges (K, n, 4, 4)."""
     marker = np.broadcast_to(marker, flange.shape[:2])
-    markers = int(marker.max()) + 1
-    step = max(TOGETHER // max(flange.shape[1], 1), 1)
+    own = marker[..., None, None, None] == np.arange(int(marker.max()) + 1)[:, None]
+    turned = (flange[..., :3, None, :3] * own).reshape(*marker.shape, 3, -1)
+    G = np.concatenate([turned, flange[..., :3, 3:]], axis=3)
     # Rows are components of a reading, one after the other; A and s are the same for all tables
     # and are fitted along by an orthonormal basis.
     Q, R = np.linalg.qr(np.hstack([points - points.mean(axis=0), np.ones((len(points), 1))]))
-    back = np.linalg.pinv(R)[:3]
-    parts = []
-    for k in range(0, len(flange), step):
-        T, own = flange[k : k + step], marker[k : k + step, :, None] == np.arange(markers)
-        G = (T[..., :3, None, :3] * own[:, :, None, :, None]).reshape(*T.shape[:2], 3, -1)
-        parts.append(_linear_fits(np.concatenate([G, T[..., :3, 3:]], axis=3), Q, back))
-    return LinearFits(*(np.concatenate(some) for some in zip(*parts, strict=True)))
-
-
-def _linear_fits(G: Array, Q: Array, back: Array) -> tuple[Array, Array]:
     along = np.einsum("na,knrm->karm", Q, G)
     off = (G - np.einsum("na,karm->knrm", Q, along)).reshape(len(G), -1, G.shape[3])
     X, y = off[..., :-1], off[..., -1:]
     Xt = X.transpose(0, 2, 1)
     m = -np.linalg.pinv(Xt @ X, rcond=DIGITS, hermitian=True) @ (Xt @ y)
     left = np.sqrt(((X @ m + y) ** 2).mean(axis=(1, 2)))
-    A = back @ (along[..., -1] + np.einsum("karm,km->kar", along[..., :-1], m[..., 0]))
+    A = np.linalg.pinv(R)[:3] @ (
+        along[..., -1] + np.einsum("karm,km->kar", along[..., :-1], m[..., 0])
+    )
     size = np.linalg.svd(A, compute_uv=False)
     left[~(size[:, 0] <= UNSKEWED * size[:, -1])] = np.inf
-    return A, left
+    return LinearFits(A, left)
 
 
 # A start from nothing: where base and markers are, from the nominal arm and the readings.
