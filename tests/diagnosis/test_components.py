@@ -101,17 +101,3 @@ def test_a_compliance_below_zero_is_no_cause() -> None:
     assert positive.score - either.score == pytest.approx(np.log(2), abs=1e-6)
     assert positive.earned[0] - either.earned[0] == pytest.approx(np.log(2), abs=1e-6)
     assert negative.components and not none.components
-
-
-def test_nothing_is_found_in_noise() -> None:
-    count = 0
-    for seed in range(6):
-        data = random_data(seed, p=2)
-        rng = np.random.default_rng((seed, 3))
-        V = data.covariance
-        K = np.linalg.cholesky(V + 1e-30 * np.eye(V.shape[1]))
-        data = replace(data, r=(K @ rng.normal(size=(*data.r.shape, 1)))[:, :, 0])
-        components = [component(data, k, 2) for k in range(1, 9)]
-        quiet = NoiseValues.usual(3).of_instrument()
-        count += len(fit_sum(data, components, quiet, refit_noise=False).components)
-    assert count <= 2

@@ -20,7 +20,6 @@ from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import read_cell
 from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.errors import InputError
-from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 
 ROOT = Path(__file__).parents[2]
@@ -105,21 +104,6 @@ def test_reading_it_back_gives_the_same_cell_and_the_additions(layout, found, fo
         assert source.read_text(encoding="utf-8") == text
 
 
-def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):
-    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
-    source = tmp_path / "cell.toml"
-    source.write_text('[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n')
-    (tmp_path / "out").mkdir()
-    keys = {"play_side": "load_and_approach"}
-    cell = write_extended_cell(source, tmp_path / "out" / "cell.toml", (ECCENTRICITY, JUMP), keys)
-    assert cell.model.play_side == "load_and_approach"
-    names = set(Model(cell).names)
-    before = set(Model(read_cell(source)).names)
-    assert names - before == {p.name for f in (ECCENTRICITY, JUMP) for p in f.parameters}
-    assert before < names
-    assert all(choice.name in CATALOGUE for choice in cell.model.effects)
-
-
 @pytest.mark.parametrize("text", ["[robot", "[robot]\n", '[robot]\nurdf = "missing.urdf"\n'])
 def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
     (tmp_path / "cell.toml").write_text(text)
@@ -128,7 +112,7 @@ def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
     assert [p.name for p in tmp_path.iterdir()] == ["cell.toml"]
 
 
-def test_sizes_of_parameters_travel_with_the_effects(tmp_path):
+def test_the_model_gains_the_parameters_of_the_effects_with_their_sizes_and_no_others(tmp_path):
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
     source, sizes = tmp_path / "cell.toml", {"move_lag": 2.5e-3, "move_lag_sign": 1e-3}
     source.write_text(
@@ -136,10 +120,15 @@ def test_sizes_of_parameters_travel_with_the_effects(tmp_path):
         "[model.nominal]\nsizes.joint2 = { encoder_scale = 0.01 }\n"
     )
     lag = replace(ECCENTRICITY, effect="move_lag", parameters=(), sizes=sizes)
-    cell = write_extended_cell(source, tmp_path / "new.toml", (lag,))
+    keys, new = {"play_side": "load_and_approach"}, tmp_path / "new.toml"
+    cell = write_extended_cell(source, new, (ECCENTRICITY, JUMP, lag), keys)
+    assert cell.model.play_side == "load_and_approach"
     assert cell.model.nominal.sizes == {"joint2": {"encoder_scale": 0.01, **sizes}}
-    typical = {p.name: p.typical for p in Model(tmp_path / "new.toml").parameters}
+    typical = {p.name: p.typical for p in Model(new).parameters}
     assert typical["joint2.move_lag"] == 2.5e-3 and typical["joint2.move_lag_sign"] == 1e-3
+    added = {p.name for f in (ECCENTRICITY, JUMP) for p in f.parameters}
+    lags = {name for name in typical if ".move_lag" in name}
+    assert typical.keys() - set(Model(source).names) == added | lags
 
 
 def test_the_cell_says_where_its_smooth_functions_end(tmp_path):

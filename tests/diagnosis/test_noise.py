@@ -42,9 +42,8 @@ def test_the_marginal_likelihood_is_that_of_the_dense_gaussian(seed: int) -> Non
 
 
 @pytest.mark.parametrize("stated", [True, False])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_slope_is_that_of_finite_differences(seed: int, stated: bool) -> None:
-    data, at, h = random_data(seed, stated=stated), NOISE.logs(), 1e-5
+def test_the_slope_is_that_of_finite_differences(stated: bool) -> None:
+    data, at, h = random_data(0, stated=stated), NOISE.logs(), 1e-5
     slope = data.model.objective(NOISE.logs())[1]
     for k, step in enumerate(h * np.eye(len(at))):
         up, down = (data.model.objective(at + s * step)[0] for s in (1, -1))

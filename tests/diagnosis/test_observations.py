@@ -25,7 +25,7 @@ def key(d: Diagnosis) -> tuple[str, str]:
 
 
 @pytest.mark.parametrize("observe", ["pose", pytest.param("distance", marks=pytest.mark.long)])
-def test_a_gears_error_shows_in_poses_and_distances(observe: str) -> None:
+def test_a_gears_error_shows_in(observe: str) -> None:
     d = ec.diagnose(*campaign(ECCENTRIC, observe=observe, n=20))
     assert d.verdict == "explained" and key(d) == ("gear_eccentricity", "joint4")
 
@@ -35,14 +35,6 @@ def test_deflections_show_what_gives_way() -> None:
     assert d.verdict == "ambiguous"
     shown = {(e.effect, e.where) for e in d.indistinguishable[0]}
     assert shown == {("off_axis_compliance", "joint3"), ("link_bending", "link2")}
-
-
-@pytest.mark.long
-def test_deflections_do_not_show_a_gears_error() -> None:
-    """It is the same before and after the load, and the report says that it cannot be seen."""
-    d = ec.diagnose(*campaign(ECCENTRIC, observe="deflection", n=30))
-    assert d.verdict == "nothing_significant"
-    assert ("gear_eccentricity", "joint4") in {(u.effect, u.where) for u in d.untested}
 
 
 def test_positions_without_load_time_approach_and_further_markers() -> None:
@@ -63,8 +55,7 @@ def test_positions_without_load_time_approach_and_further_markers() -> None:
     assert d.verdict != "nothing_significant"
 
 
-@pytest.mark.parametrize("n_joints", [4, pytest.param(9, marks=pytest.mark.long)])
-def test_arms_of_other_numbers_of_joints(n_joints: int) -> None:
+def test_arms_of_other_numbers_of_joints(n_joints: int = 4) -> None:
     chain = zigzag(n_joints)
     plain = cell(nominal=Nominal(joint_compliance=(1e-6,) * n_joints), link_gravity=False)
     fault = Fault(
@@ -82,14 +73,6 @@ def test_too_few_configurations_are_refused_with_what_to_measure() -> None:
         ec.diagnose(model, table.take(np.arange(20)))
 
 
-def test_twenty_readings_get_an_answer_and_no_false_alarm() -> None:
-    model, table = campaign()
-    rows = np.flatnonzero((table.marker == 0) & (table.configuration < 10))
-    d = ec.diagnose(model, table.take(rows))
-    assert d.n_readings == 20 and d.verdict == "nothing_significant"
-    assert len(d.untested) > 5
-
-
 def test_missing_readings_and_unequal_repeats() -> None:
     model, table = campaign("encoder_scale:joint3")
     rng = np.random.default_rng(0)
@@ -97,12 +80,9 @@ def test_missing_readings_and_unequal_repeats() -> None:
     extra = table.take(again)
     noise = 1e-5 * rng.normal(size=extra.position.shape)
     both = table.take(np.concatenate([np.arange(len(table)), again]))
-    both = replace(
-        both,
-        row=np.arange(len(both)) + 2,
-        repeat=np.concatenate([table.repeat, extra.repeat + 1]),
-        position=np.concatenate([table.position, extra.position + noise]),
-    )
+    repeat = np.concatenate([table.repeat, extra.repeat + 1])
+    position = np.concatenate([table.position, extra.position + noise])
+    both = replace(both, row=np.arange(len(both)) + 2, repeat=repeat, position=position)
     d = ec.diagnose(model, both.take(rng.random(len(both)) > 0.2))
     assert d.verdict == "explained" and key(d) == ("encoder_scale", "joint3")
     # Repeats copy the first reading and add 10 µm: their scatter is 10/√2.

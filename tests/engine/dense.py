@@ -32,15 +32,8 @@ class Table:
 def readings(table: Table, seed: int, noise: float = 1e-5, shared: float = 0.0) -> Readings:
     """Readings in random order, a third of the repeats missing if unbalanced; noise in m."""
     rng = np.random.default_rng(seed)
-    labels = np.array(
-        [
-            (c, load, m)
-            for c in range(table.configurations)
-            for load in range(table.loads)
-            for m in range(table.markers)
-            for _ in range(table.repeats)
-        ]
-    )
+    every = table.configurations, table.loads, table.markers, table.repeats
+    labels = np.array(list(np.ndindex(every)))[:, :3]
     keep = rng.permutation(len(labels))
     if table.unbalanced:
         keep = keep[: 2 * len(keep) // 3]

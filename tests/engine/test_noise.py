@@ -44,11 +44,11 @@ def drawn(kind, rng, r):
              "polar+configuration"],
 )  # fmt: skip
 def test_each_noise_is_told_apart(kind):
-    """In at least 5 of 7 tables the very kind: Schwarz's criterion picks a structure with two
+    """In at least 4 of 5 tables the very kind: Schwarz's criterion picks a structure with two
     variances too many in 0.2 % of tables of 432 rows, Akaike's shared effects in 1 of 6 at most."""
     rng, r = np.random.default_rng(3), readings(BASE, 9)
-    chosen = Counter(estimate_noise(r.moved(drawn(kind, rng, r))).kind for _ in range(7))
-    assert chosen[kind] >= 5, chosen
+    chosen = Counter(estimate_noise(r.moved(drawn(kind, rng, r))).kind for _ in range(5))
+    assert chosen[kind] >= 4, chosen
 
 
 def test_what_cannot_be_asked_for_is_refused():
@@ -96,9 +96,9 @@ def test_perfect_data_have_next_to_no_noise(kind):
 # Which readings are judged to be faulty.
 
 
-def predicted(r, V, known, i, covariance=None):
+def predicted(r, V, known, i):
     """Error of the best linear prediction of reading i from the readings `known`, over its own
-    deviation, at fixed V; `covariance` stands for that of the estimate, default (BᵀV⁻¹B)⁻¹."""
+    deviation, at fixed V."""
     size = r.size
     a = (known[:, None] * size + np.arange(size)).ravel()
     b = i * size + np.arange(size)
@@ -107,19 +107,18 @@ def predicted(r, V, known, i, covariance=None):
     Phi = np.linalg.inv(B[a].T @ W @ B[a])
     x = Phi @ B[a].T @ W @ e[a]
     k = V[np.ix_(b, a)] @ W
-    d = e[b] - B[b] @ x - k @ (e[a] - B[a] @ x)
     F = B[b] - k @ B[a]
-    spread = V[np.ix_(b, b)] - k @ V[np.ix_(a, b)]
-    spread = spread + F @ (Phi if covariance is None else covariance) @ F.T
-    return d / np.sqrt(np.diag(spread))
+    spread = V[np.ix_(b, b)] - k @ V[np.ix_(a, b)] + F @ Phi @ F.T
+    return (e[b] - B[b] @ x - k @ (e[a] - B[a] @ x)) / np.sqrt(np.diag(spread))
 
 
 def table(seed=0, **changes):
     return readings(Table(**{"configurations": 8, "markers": 3, **changes}), seed, shared=2e-5)
 
 
-@pytest.mark.parametrize("own", ["independent", "marker", "polar", "stated"])
-@pytest.mark.parametrize("shared", ["", "+configuration"])
+@pytest.mark.parametrize(
+    ("own", "shared"), [("marker", ""), ("polar", "+configuration"), ("stated", "+configuration")]
+)
 def test_readings_are_judged_as_if_each_were_deleted(own, shared):
     """Those of the fit, and those outside it: some with mates in their configuration or set, some
     whose configuration is not fitted."""
@@ -143,7 +142,7 @@ def test_false_alarms_on_clean_tables_are_as_rare_as_stated(kind):
     """1 % per table, Bonferroni; more than the 99.99 % point of the binomial is too many."""
     rng, alarms = np.random.default_rng(12), 0
     r = table(1, configurations=10, repeats=3, unbalanced=False)
-    tables = 120 if kind == "independent" else 25
+    tables = 120 if kind == "independent" else 15
     for _ in range(tables):
         alarms += not settle(r.moved(1e-5 * rng.normal(size=r.e.shape)), kind).good.all()
     assert alarms <= stats.binom.ppf(0.9999, tables, FALSE_ALARM)

@@ -49,8 +49,9 @@ def _as_before() -> Iterator[None]:
         yield
 
 
-@pytest.mark.parametrize("shared", ["", "+configuration"])
-@pytest.mark.parametrize(("model", "built_in"), [(Twin, "axis"), (Markers, "marker")])
+@pytest.mark.parametrize(
+    ("model", "built_in", "shared"), [(Twin, "axis", ""), (Markers, "marker", "+configuration")]
+)
 def test_it_has_the_likelihood_of_a_built_in_model_that_says_the_same(
     model: type[NoiseModel], built_in: str, shared: str
 ) -> None:

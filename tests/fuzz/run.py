@@ -35,6 +35,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="number of the first case")
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
+    parser.add_argument("--harmed", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
     parser.add_argument("--interrupts", type=int, default=0, help="Ctrl-C in each so many times")
     parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
@@ -80,7 +81,7 @@ def everything(asked: argparse.Namespace, base: Path, folder: Path) -> tuple[str
                 print(case.told(), flush=True)
         times = dict(zip(kills.HARMS, (asked.kills, asked.full, asked.interrupts), strict=True))
         harm = partial(kills.do_harm, base, folder, asked.seed, times, until)
-        verbs = asked.verb or kills.KILLED
+        verbs = asked.harmed or asked.verb or kills.KILLED
         for found, tried in pool.map(harm, verbs if any(times.values()) else ()):
             print("\n".join(found), end="", flush=True)
             count, broken = count + tried, broken + len(found)

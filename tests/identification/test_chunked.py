@@ -6,13 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.calibration import GEOMETRY, measured
-from support.parts import (
-    CASES,
-    SIGMA,
-    arm,
-    faulty_of,
-    solved,
-)
+from support.parts import CASES, SIGMA, arm, faulty_of, solved
 
 from elastocal.identification import outliers, solve
 from elastocal.identification import weighted_problem as chunked

@@ -3,13 +3,7 @@
 import numpy as np
 import pytest
 from scipy import sparse
-from support.calibration import (
-    cell_of,
-    measured,
-    planar_chain,
-    table_at,
-    true_values,
-)
+from support.calibration import cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import Nominal

@@ -5,14 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import linalg, stats
-from support.calibration import (
-    PLACED,
-    cell_of,
-    measured,
-    planar_chain,
-    table_at,
-    true_values,
-)
+from support.calibration import PLACED, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker

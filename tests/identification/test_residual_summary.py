@@ -9,10 +9,7 @@ import pytest
 from scipy import sparse, stats
 from support.calibration import binomial_band, table_at
 
-from elastocal.identification.residuals import (
-    normal_scores,
-    summarise_residuals,
-)
+from elastocal.identification.residuals import normal_scores, summarise_residuals
 from elastocal.model.observations import Observations
 
 LOADS = ((0, 0, 0), (0, 0, -2600.0))
@@ -27,20 +24,6 @@ def readings(poses: int, markers: int = 2, forces: Any = LOADS) -> Observations:
 
 def noise(observed: Observations, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=len(observed.value))
-
-
-def test_every_value_is_counted_once_in_every_grouping() -> None:
-    observed = readings(10)
-    found = summarise_residuals(observed, noise(observed, 0))
-    assert [g.by for g in found.groupings] == ["component", "marker", "configuration", "load state"]
-    for g in found.groupings:
-        assert sum(group.n for group in g.groups) == len(observed.value)
-        for group in g.groups:
-            assert group.counts.sum() + group.beyond == group.n
-            assert group.expected.sum() == pytest.approx(group.n, rel=0.05)
-    names = {g.by: [group.name for group in g.groups] for g in found.groupings}
-    assert names["component"] == ["x", "y", "z"]
-    assert names["load state"] == ["unloaded", "(0, 0, -2600) N"]
 
 
 def test_statistics_are_those_of_scipy() -> None:

@@ -21,29 +21,23 @@ from draw import Recipe
 from support.study_scripts import study_of
 
 study = study_of(FOLDER)
-ECCENTRIC, MASS, SCALE = (
-    ("gear_eccentricity", "joint2"),
-    ("link_mass_error", "link2"),
-    ("encoder_scale", "joint3"),
-)
+ECCENTRIC, MASS = ("gear_eccentricity", "joint2"), ("link_mass_error", "link2")
+SCALE, BACKLASH = ("encoder_scale", "joint3"), ("backlash", "joint2")
+TRUTH = {
+    "effects": [{"effect": "gear_eccentricity", "where": "joint2", "values": {"size": 1.0}}],
+    "arm_values": {"joint_offset_rad": [0.0] * 6},
+}
 
 
-def truth(*places, location=None, joints=6):
-    effects = [{"effect": e, "where": w, "values": {"size": 1.0}} for e, w in places]
-    if location:
-        effects[0]["location"] = location
-    return {"effects": effects, "arm_values": {"joint_offset_rad": [0.0] * joints}}
-
-
-def answer(verdict, *found, sets=(), where=None, probability=0.95):
+def answer(verdict, *found, sets=()):
     def placed(pair):
         return {"effect": pair[0], "where": pair[1]}
 
     return {
         "verdict": verdict,
-        "effects": [placed(p) | {"probability": probability} for p in found],
+        "effects": [placed(p) | {"probability": 0.95} for p in found],
         "indistinguishable": [[placed(p) for p in members] for members in sets],
-        "location": where and {"stage": "transmission", "where": where},
+        "location": None,
     }
 
 
@@ -62,11 +56,7 @@ NOTHING = answer("nothing_significant")
         (answer("explained", ECCENTRIC, SCALE), "wrong", False),
         (answer("ambiguous", MASS, sets=[[MASS, ECCENTRIC]]), "right", False),
         (answer("ambiguous", MASS, sets=[[MASS, SCALE, ECCENTRIC]]), "right", False),
-        (
-            answer("ambiguous", MASS, sets=[[MASS, SCALE, ("backlash", "joint2"), ECCENTRIC]]),
-            "vague",
-            False,
-        ),
+        (answer("ambiguous", MASS, sets=[[MASS, SCALE, BACKLASH, ECCENTRIC]]), "vague", False),
         (answer("ambiguous", MASS, sets=[[MASS, SCALE]]), "wrong", False),
         (answer("ambiguous", ECCENTRIC, MASS, sets=[[MASS, SCALE]]), "wrong", False),
         (answer("unknown_effect", ECCENTRIC), "unknown", False),
@@ -75,8 +65,8 @@ NOTHING = answer("nothing_significant")
     ],
 )
 def test_one_effect(given, outcome, outright):
-    assert score.one_effect(truth(ECCENTRIC), given) == outcome
-    assert score.outright(truth(ECCENTRIC), given) is outright
+    assert score.one_effect(TRUTH, given) == outcome
+    assert score.outright(TRUTH, given) is outright
 
 
 # --- nothing leaks, nothing is lost -----------------------------------------------------------
@@ -87,42 +77,31 @@ class Blindfold(worker.Worker):
 
     def __init__(self):
         super().__init__()
-        self.observed, self.tables = [], []
+        self.observed = []
 
     def diagnose(self, folder, *arguments):
         self.observed.append((folder, arguments, sorted(p.name for p in folder.iterdir())))
-        self.tables.append((folder / "data.csv").read_text().splitlines())
         given = dict.fromkeys(score.KEPT) | NOTHING | {"candidates": [{}] * 99}
         (folder / one_world.ANSWER).write_text(json.dumps(given))
         return worker.Run(0, 1.0, "")
 
 
-def task():
-    recipe = Recipe("encoder_scale-8-000", (5, 1), ("encoder_scale",), poses=8)
-    return suites.Task("left_out", recipe)
-
-
 def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch):
-    folders = []
-    make = one_world.tempfile.mkdtemp
-    monkeypatch.setattr(
-        one_world.tempfile,
-        "mkdtemp",
-        lambda **k: folders.append(Path(make(**k))) or str(folders[-1]),
-    )
+    folders, make = [], one_world.tempfile.mkdtemp
+
+    def made(**given):
+        folders.append(Path(make(**given)))
+        return str(folders[-1])
+
+    monkeypatch.setattr(one_world.tempfile, "mkdtemp", made)
+    recipe = Recipe("encoder_scale-8-000", (5, 1), ("encoder_scale",), poses=8)
     blind = Blindfold()
-    record = one_world.diagnose_world(task(), blind, {"seed": 5})
+    record = one_world.diagnose_world(suites.Task("left_out", recipe), blind, {"seed": 5})
     ((visible, arguments, files),) = blind.observed
     sealed = next(f for f in folders if f != visible)
     assert files == ["arm.urdf", "cell.toml", "data.csv"]
-    assert arguments == (
-        "-o",
-        one_world.ANSWER,
-        "--cell-out",
-        one_world.CELL,
-        "--without",
-        "encoder_scale",
-    )
+    written = ("-o", one_world.ANSWER, "--cell-out", one_world.CELL)
+    assert arguments == (*written, "--without", "encoder_scale")
     assert not visible.is_relative_to(sealed) and not sealed.is_relative_to(visible)
     assert "encoder" not in str(visible) and visible.name[:6] != sealed.name[:6]
     assert record["truth"]["effects"][0]["effect"] == "encoder_scale"

@@ -172,7 +172,9 @@ def test_the_tool_sees_nothing_of_the_truth(tmp_path):
         assert world.name not in text
 
 
-@pytest.mark.parametrize("world", ["pair-60-018", "pair-60-028"])
+@pytest.mark.parametrize(
+    "world", [pytest.param("pair-60-018", marks=pytest.mark.long), "pair-60-028"]
+)
 def test_a_small_effect_is_found_before_a_large_one_that_hides_it(world, tmp_path):
     """Beside 2 mm of a spring that is missing yet a jump of the frame does not lower the error of
     poses left out, nor bending that of a hysteresis; both together do."""
