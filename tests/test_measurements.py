@@ -104,12 +104,6 @@ def test_every_column_arrives_in_si_units(read):
     assert got.repeat.tolist() == [3]
 
 
-def test_several_markers_need_a_marker_column(refusal):
-    message = refusal(table(ROW), marker_names=("A", "B"))
-    assert "A, B" in message
-    assert "add a column marker" in message
-
-
 @pytest.mark.parametrize(
     ("quaternion", "vector"),
     [
@@ -187,12 +181,6 @@ def test_wrong_header_is_told_before_any_row_is_looked_at(refusal, header, told)
 def test_what_is_observed_decides_the_columns_needed(refusal, observe, needed):
     header = HEADER if observe != "deflection" else "q1_deg,q2_deg"
     assert needed in refusal(header + "\n", observe=observe)
-
-
-def test_distances_need_no_positions(read):
-    got = read("q1_rad,q2_rad,distance_m\n0,0,0.5\n", observe="distance")
-    assert got.distance.tolist() == [0.5]
-    assert got.position is None
 
 
 # --- the rows ---

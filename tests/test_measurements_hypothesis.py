@@ -14,7 +14,6 @@ from hypothesis.extra.numpy import arrays
 from elastocal.errors import InputError
 from elastocal.measurements import (
     Measurements,
-    families,
     read_measurements,
     with_moves,
     write_measurements,
@@ -31,7 +30,6 @@ POSITIVE = st.floats(min_value=1e-300, max_value=1e300)
 LABEL = st.text(max_size=8).filter(is_label)
 # Of a load: none, or what an arm may carry; less than a micronewton is read as none.
 FORCE = st.just(0.0) | st.floats(1e-3, 1e7) | st.floats(-1e7, -1e-3)
-COLUMNS = [c for f in families(KINDS).values() for stem in f.units for c in f.columns(stem)]
 
 
 def read_or_refuse(path: Path, data: bytes) -> Measurements | None:
@@ -41,34 +39,6 @@ def read_or_refuse(path: Path, data: bytes) -> Measurements | None:
     except InputError as error:
         assert path.name in str(error)
         return None
-
-
-def check_valid(table: Measurements) -> None:
-    assert table.q.shape == (len(table), 2)
-    for values in (table.q, table.position, table.force):
-        assert np.isfinite(values).all()
-    assert len(table.row) and (np.diff(table.row) > 0).all()
-    assert table.configuration.max() < len(table.configuration_labels)
-    assert table.marker.max() < len(table.marker_names)
-
-
-CELL = st.one_of(
-    FINITE.map(repr),
-    st.integers(-(10**25), 10**25).map(str),
-    st.sampled_from(["", " ", "nan", "inf", "1e999", "True", "1,5", '"1', '"2"', "1_0", "-"]),
-    st.text(max_size=3),
-)
-
-
-@SETTINGS
-@given(st.lists(st.sampled_from(COLUMNS) | st.text(max_size=4), max_size=12), st.data())
-def test_headers_give_a_valid_table_or_an_input_error(tmp_path, extra, data):
-    names = data.draw(st.permutations(HEADER.strip().split(",") + extra))
-    row = data.draw(st.lists(CELL, min_size=len(names), max_size=len(names)))
-    text = ",".join(names) + "\n" + ",".join(row) + "\n"
-    table = read_or_refuse(tmp_path / "data.csv", text.encode("utf-8", "replace"))
-    if table is not None:
-        check_valid(table)
 
 
 DIGITS = st.text("0123456789", min_size=1, max_size=30)

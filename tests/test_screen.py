@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal.cli.app import reporting_errors
-from elastocal.screen import SHARE, complain, progress_line, safe_console, say
+from elastocal.screen import SHARE, complain, progress_line, safe_console
 from elastocal.text import printable
 
 TITLE, MARK = "\x1b]0;owned\x07", "\u202egpj.exe"
@@ -159,13 +159,6 @@ main()
     )
     told = (130, "elastocal: interrupted\n") if "by nobody" not in how else (0, "")
     assert (done.returncode, done.stderr) == told
-
-
-def test_a_closed_pipe_is_no_error(tmp_path):
-    command = f"{sys.executable} -m elastocal --help | head -1; exit ${{PIPESTATUS[0]}}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    say("")
 
 
 def test_the_progress_line_shows_time_and_where_it_is_known_the_share(monkeypatch):

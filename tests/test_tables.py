@@ -32,13 +32,6 @@ def read(text, **options):
     return read_table("t.csv", choose, what="list", text=text, **options)
 
 
-def test_comments_and_lines_of_empty_cells_are_passed_over():
-    table = read("\ufeff# by hand\n\nname,x_mm,y_mm\n#,a\na,1,2\n,,\nb,3,4\n", comments=True)
-    assert table.row.tolist() == [5, 7]
-    assert table.si("place").tolist() == [[0.001, 0.002], [0.003, 0.004]]
-    assert [table.text(i, "name") for i in range(2)] == ["a", "b"]
-
-
 def test_cells_may_be_empty_where_the_column_may_be_absent_and_only_there():
     table = read("name;x_m;y_m;high_N\n;1,5;2;\nb;3;4;5\n")
     assert table.text(0, "name") == ""

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.tables import NUMBER
-from elastocal.text import cell_meaning, cell_text, gathered, is_label, json_text, printable
+from elastocal.text import cell_meaning, cell_text, is_label, json_text, printable
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
@@ -42,9 +42,3 @@ def test_no_cell_of_text_is_a_formula_and_each_is_read_back(text):
     assert NUMBER.fullmatch(written) or not written.startswith(("=", "+", "-", "@"))
     assert cell_meaning(written) == printable(text)
     assert not is_label(text) or printable(text) == text
-
-
-def test_parameters_alike_are_told_together():
-    names = ["joint1.compliance", "joint2.compliance", "joint5.compliance", "link3.dx", "base.x"]
-    told = "compliance of joints 1, 2 and 5, dx of link 3, x of base"
-    assert gathered(names) == told

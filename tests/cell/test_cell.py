@@ -479,12 +479,6 @@ def test_other_encodings_and_absurd_texts_are_refused(refusal, text):
     refusal(text)
 
 
-@pytest.mark.parametrize("name", ["absent.toml", "", "a\0b", "x" * 5000])
-def test_absent_files_and_directories_are_refused(tmp_path, name):
-    with pytest.raises(InputError):
-        read_cell(tmp_path / name)
-
-
 IN_PYTHON = {
     "unknown": (lambda: Tool(load_pont=[0, 0, 0]), "Tool has no load_pont.*'load_point'"),
     "too many": (lambda: EffectChoice("a", "b", "c"), "EffectChoice takes at most 2 values"),

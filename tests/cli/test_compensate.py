@@ -75,15 +75,6 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
 
 
-def test_why_targets_are_not_reached_is_said_once(folder):
-    far = folder / "far.csv"
-    far.write_text("x_m,y_m,z_m\n1.8,0,0.9\n9,0,0.9\n")
-    outcome = run(folder, far, "-o", folder / "commands.csv", "--point", "M1")
-    assert outcome.exit_code == 1
-    assert "1 of 2 targets are not reached: line 3: out of reach" in outcome.stderr
-    assert "(not reached)" not in outcome.stderr
-
-
 def test_targets_in_another_unit_are_told_so(folder):
     """1.8 mm from the base's origin no tool works; 1.8 m from it one does."""
     metres = TARGETS.replace("1800,300,1500", "1.8,0.3,1.5").replace("1810,300", "1.81,0.3")

@@ -67,31 +67,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-def test_compensate_undoes_them(folder: Path) -> None:
-    """The commands put the true marker, curves and all, where it should be."""
-    cell, out = folder / "cell.toml", folder / "commands.csv"
-    model = Model(cell)
-    truth = json.loads((folder / "truth.json").read_text())
-    x = np.array([truth[name] for name in model.names])
-    poses(folder / "q.csv", 12, 3)
-    plan = model.read_plan(folder / "q.csv")
-    wanted = model.target_poses(model.table(plan.q), x)[1]
-    targets = ["x_mm,y_mm,z_mm", *(",".join(map(str, p.tolist())) for p in wanted * 1e3)]
-    (folder / "targets.csv").write_text("\n".join(targets))
-    done = run(
-        "compensate", cell, folder / "result.json", folder / "targets.csv", "-o", out,
-        "--frame", "tracker",
-    )  # fmt: skip
-    assert "12 of 12 targets reached" in done.output
-    rows = list(csv.DictReader(out.open()))
-    q = np.radians([[float(row[f"q{k + 1}_deg"]) for k in range(6)] for row in rows])
-    std = np.array([float(row["std_um"]) for row in rows]) * 1e-6
-    inside = (abs(q[:, 0]) < 1.5) & (q[:, 1] > -1.8) & (q[:, 1] < -0.4)
-    error = np.linalg.norm(model.target_poses(model.table(q), x)[1] - wanted, axis=1)
-    assert inside.sum() >= 3
-    assert (error[inside] < 4 * std[inside]).all() and np.median(error[inside]) < 1e-4
-
-
 def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
     (folder / "far.csv").write_text(
         "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n"

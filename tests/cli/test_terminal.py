@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -66,26 +64,6 @@ def test_no_color_is_obeyed_on_a_terminal(colours: bool, tmp_path: Path) -> None
     assert process.returncode == 0 and b"wrote" in told
     # Colours are 30 to 37, 90 to 97, 38;… ; bold (1) is no colour.
     assert bool(re.search(rb"\x1b\[(?:\d+;)*(?:3[0-8]|9[0-7])", told)) == colours
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-def test_ctrl_c_ends_an_export_cleanly(tmp_path: Path) -> None:
-    written = write_result(tmp_path, f'urdf = "{KR270}"')
-    before = sorted(path.name for path in tmp_path.iterdir())
-    command = [sys.executable, "-c", PROGRAM, "export", *map(str, written)]
-    command += ["-o", str(tmp_path / "a.urdf"), "--poses", "1000000", "--load", "0", "0", "-100"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
-        assert process.stderr is not None
-        told = b""
-        while b"cannot hold" not in told:  # the long part has begun
-            told += os.read(process.stderr.fileno(), 4096)
-            assert process.poll() is None, told
-        time.sleep(0.2)
-        process.send_signal(signal.SIGINT)
-        told += process.communicate()[1]
-    assert process.returncode == 130
-    assert told.endswith(b"elastocal: interrupted\n") and b"Traceback" not in told
-    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("module", ["typer", "elastocal.model"])

@@ -20,7 +20,6 @@ from elastocal.model.dh import DH_FAMILIES
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")
-EXAMPLE = ROOT / "experiment_design" / "blind_diagnosis" / "example"
 # Their keys are names of parameters, places, drivers or settings of the arm at hand.
 NAMED_BY_THE_ARM = (
     "terms", "held", "prior_share", "drivers", "stages", "places", "settings", "removed_by",

@@ -31,14 +31,6 @@ def test_every_effect_has_text_places_and_columns(effects, name):
     assert "| parameter | unit |" in part or "No parameters." in part
 
 
-def test_parameters_stand_with_unit_and_size(effects):
-    assert "| `joint1.offset` | rad | 0 | 1 mrad | – |" in effects
-    assert "| `joint1.compliance` | rad/(N·m) | 2e-06 | 2 µrad/(N·m) | ≥ 0 |" in effects
-    assert "`time_constant_s` (default 1800, 60 to 1000000)" in effects
-    distortion = effects.split("### `tracker_distortion`")[1]
-    assert "- **Not with** `observe` = `distance`" in distortion
-
-
 @pytest.mark.parametrize("name", CRITERIA)
 def test_every_criterion_says_what_it_is_and_whether_it_has_a_bound(name):
     page = criteria_page.page()

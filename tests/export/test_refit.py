@@ -12,6 +12,7 @@ import pytest
 from support.exports import write_result
 from support.mjcf_text import LOADABLE, write_arm
 from support.robots import KR270
+from support.urdf_text import arm as urdf_arm
 from typer.testing import CliRunner
 
 import elastocal as ec
@@ -199,3 +200,30 @@ def test_a_file_of_the_user_takes_what_was_fitted(tmp_path, robot):
             assert done.refit.correction < 1e-6 < 0.1 * done.refit.after
         else:
             assert done.refit.taken and done.refit.after < 0.8 * done.refit.before
+
+
+# What a file written elsewhere or in another format says
+
+FIXED = '<joint name="fj" type="fixed"><parent link="l5"/><child link="f"/></joint>'
+
+
+def test_the_meshes_of_a_urdf_are_found_from_another_folder(tmp_path: Path) -> None:
+    (tmp_path / "hull.stl").write_bytes(b"")
+    shapes = [f'<visual><geometry><mesh filename="{name}"/></geometry></visual>'
+              for name in ("hull.stl", "package://p/hull.stl")]  # fmt: skip
+    text = urdf_arm(5, f'<link name="f">{"".join(shapes)}</link>' + FIXED)
+    (tmp_path / "arm.urdf").write_text(text)
+    written = write_result(tmp_path, 'urdf = "arm.urdf"\nflange = "l5"', HELD[:-1])
+    (tmp_path / "out").mkdir()
+    out = run("export", *written, "-o", tmp_path / "out" / "new.urdf", "-q", "--poses", "5")
+    assert "named relative to the file" in out
+    found = (tmp_path / "out" / "new.urdf").read_text()
+    assert 'filename="../hull.stl"' in found and 'filename="package://p/hull.stl"' in found
+
+
+def test_a_urdf_of_a_mujoco_arm_has_its_masses_and_says_what_it_lacks(tmp_path: Path) -> None:
+    write_arm(tmp_path, LOADABLE)
+    written = write_result(tmp_path, 'mjcf = "arm.xml"\nbase = "foot"', HELD[:-1])
+    out = run("export", *written, "-o", tmp_path / "new.urdf", "-q", "--poses", "5")
+    assert "inertia tensors are zero in this file" in out
+    assert '<mass value="6.0"/>' in (tmp_path / "new.urdf").read_text()

@@ -3,21 +3,20 @@ was, to the byte."""
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 import pytest
-from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, write_result
+from support.exports import GEOMETRY, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
 from elastocal.errors import InputError
 from elastocal.export.rigid_files import urdf_flanges
 from elastocal.model.calibrated import CalibratedArm
-from elastocal.model.urdf import check_urdf, read_urdf
+from elastocal.model.urdf import check_urdf
 from elastocal.model.xml_file import XmlFile
 
 NANOMETRE = 1e-9
@@ -67,17 +66,6 @@ def test_a_flange_that_the_last_joint_moves_gets_a_mount(tmp_path: Path) -> None
     (tmp_path / "once.urdf").write_text(text)
     again = write_result(tmp_path, 'urdf = "once.urdf"\nflange = "l5"', GEOMETRY, seed=2)
     assert check(*again, "l0", "l5").count('<link name="elastocal_flange_mount"/>') == 1
-
-
-def test_an_arm_of_a_dh_table_gets_a_urdf(tmp_path: Path) -> None:
-    (tmp_path / "dh.csv").write_text(DH)
-    robot = 'dh = "dh.csv"\ndh_convention = "modified"'
-    cell, result = write_result(tmp_path, robot, GEOMETRY)
-    text = check(cell, result, "base_link", "flange", base_frame=True)
-    assert text.count('type="continuous"') == 1  # a4 has no limits
-    (tmp_path / "new.urdf").write_text(text)
-    limits = [(j.lower, j.upper) for j in read_urdf(tmp_path / "new.urdf", "base_link").joints]
-    assert limits[0] == (-2.9, 2.9)
 
 
 def test_frames_stand_where_they_were_identified_and_an_export_of_an_export_moves_them(
@@ -139,18 +127,6 @@ def test_an_origin_is_changed_where_it_stands(tmp_path: Path) -> None:
     # As XML has it; in the file written a carriage return alone would be a control character.
     old = text_of(tmp_path, ODD.replace("\r\n", "\n").replace("\n", "\r")).result()
     assert old == ODD.replace("\r\n", "\n")
-
-
-def test_only_origins_on_the_chain_change(tmp_path: Path) -> None:
-    path, flange = packaged_urdf("UR5")
-    written = write_result(tmp_path, f'urdf = "{path}"\nflange = "{flange}"', GEOMETRY)
-    _, done = exported(*written, "urdf", frames=False)
-    changed = list(difflib.ndiff(path.read_text().splitlines(), done.text.splitlines()))
-    removed = [line for line in changed if line.startswith("-")]
-    assert removed and all("<origin" in line for line in removed)
-    assert len(removed) == 7  # six joints and the flange
-    added = [line for line in changed if line.startswith("+") and "<origin" not in line]
-    assert len(added) == 1 and "calibrated by elastocal" in added[0]
 
 
 def test_a_foreign_link_of_that_name_is_not_overwritten(tmp_path: Path) -> None:

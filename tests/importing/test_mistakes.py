@@ -141,11 +141,6 @@ def test_what_would_make_the_readings_fit_is_named(tmp_path, readings, change, w
     assert words in warning
 
 
-def test_joints_beyond_the_limits_are_refused_with_their_line(tmp_path, readings):
-    found = with_cell(tmp_path, readings, "[joints]\noffset_deg = [0, 300, 0, 0, 0, 0]\n")
-    assert found.refused.startswith(str(tmp_path / "p.txt") + ", line 3: joint2")
-
-
 def test_markers_and_joints_must_be_the_cells(tmp_path, readings):
     cell, degrees, points = readings
     text = spatialanalyzer(points).replace("M2", "M5")

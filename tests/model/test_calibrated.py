@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from elastocal.demo.example import Demo, run_demo
@@ -25,18 +24,6 @@ def written(demo: Demo, tmp_path: Path) -> tuple[Path, dict[str, Any]]:
     result = demo.result.to_json()
     path.write_text(json.dumps(result))
     return path, result
-
-
-def test_predictions_are_those_of_the_identification(
-    demo: Demo, written: tuple[Path, dict[str, Any]]
-) -> None:
-    arm = read_calibrated(demo.cell, written[0])
-    table = demo.result.observations.table
-    assert np.array_equal(
-        arm.model.predict(table, arm.x), demo.result.model.predict(table, demo.result.x)
-    )
-    assert arm.determined == demo.result.determined
-    assert np.array_equal(arm.covariance, demo.result.covariance)
 
 
 def test_markers_that_only_the_table_named_are_found_in_the_result(

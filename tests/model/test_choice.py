@@ -16,7 +16,7 @@ from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.model.arm import Arm
-from elastocal.model.effects.base import DrivenEffect, Effect, JointMotion, Symbols
+from elastocal.model.effects.base import DrivenEffect, JointMotion
 from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins
@@ -175,27 +175,6 @@ def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> Non
     assert {n for n, e in CATALOGUE.items() if e.acts_unasked(light)} == {"payload"}
 
 
-def test_a_name_is_taken_once_but_by_the_same_class() -> None:
-    class Other(JointMotion):
-        name = "stranger"
-
-    with forgotten():
-        register(Stranger())
-        again = Stranger()
-        register(again)
-        assert CATALOGUE["stranger"] is again
-        with pytest.raises(InputError, match="there is an effect 'stranger' already"):
-            register(Other())
-
-
-class Unplaced(Effect):
-    name = "unplaced"
-    stage = "tool"
-
-    def read(self, arm: object, place: str, p: Symbols) -> None:  # type: ignore[override]
-        pass
-
-
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
@@ -211,11 +190,6 @@ class Unplaced(Effect):
 def test_what_is_stated_wrongly_is_named(changes: dict[str, object], told: str) -> None:
     with pytest.raises(InputError, match=told):
         register(type("Wrong", (Stranger,), changes)())
-
-
-def test_an_effect_without_places_is_refused() -> None:
-    with pytest.raises(InputError, match=r"Unplaced lacks places; it states where it can act"):
-        register(Unplaced())
 
 
 def test_the_example_of_the_page_is_one_more_effect(tmp_path: Path) -> None:

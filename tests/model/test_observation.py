@@ -49,34 +49,9 @@ def test_a_missing_partner_is_named(unloaded: tuple) -> None:
 # --- predictions and B ---------------------------------------------------------------------
 
 
-def models() -> tuple[Model, Model]:
-    effects = ("base_frame", "joint_offset", "joint_compliance")
-    return tuple(
-        Model.assembled(kr270_chain(), kr270_cell(effects, kind, link_gravity=True))
-        for kind in ("position", "deflection")
-    )
-
-
 def shuffled(n: int = 4, seed: int = 2) -> Measurements:
     table = random_table(kr270_chain(), n, seed)
     return table.take(np.random.default_rng(seed).permutation(len(table)))
-
-
-def test_predicted_deflections_are_differences_of_predicted_positions() -> None:
-    at_position, at_deflection = models()
-    table = shuffled()
-    lead, combine = pair_loaded_with_unloaded(table)
-    pairs = {int(i): np.flatnonzero(row) for i, row in zip(lead, combine.toarray(), strict=True)}
-    positions = at_position.regressor(table)
-    h = positions.prediction.reshape(len(table), 3)
-    B = positions.B.reshape(len(table), 3, -1)
-    found = at_deflection.regressor(table)
-    np.testing.assert_array_equal(found.prediction, at_deflection.predict(table))
-    for k, (loaded, row) in enumerate(sorted(pairs.items())):
-        (partner,) = set(row) - {loaded}
-        block = slice(3 * k, 3 * k + 3)
-        np.testing.assert_allclose(found.prediction[block], h[loaded] - h[partner], atol=1e-15)
-        np.testing.assert_allclose(found.B[block], B[loaded] - B[partner], rtol=1e-9, atol=1e-15)
 
 
 # --- subset --------------------------------------------------------------------------------

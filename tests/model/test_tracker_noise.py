@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from support.calibration import table_at
 
-from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
-from elastocal.model.observations import available_noise, polar_axes, position_covariance
+from elastocal.cell.arm_description import PolarNoise, Tracker
+from elastocal.model.observations import polar_axes, position_covariance
 
-AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 3e-5])))
 NOISE = PolarNoise(range=1e-4, range_per_m=5e-5, transverse=3e-4, transverse_per_m=1e-4)
 STATION = np.array([1.0, -0.5, 0.8])
 
@@ -53,11 +52,3 @@ def test_polar_covariance_against_draws_in_polar_coordinates(sight, rows):
     axes = polar_axes(sight[None])[0]
     difference = axes @ (covariance[0] - sample) @ axes.T
     assert (np.abs(difference) < 5 * np.sqrt(2 / n) * np.outer(sigma, sigma)).all()
-
-
-def test_the_tables_sigmas_come_first():
-    bare = table([[1.0, 2.0, 3.0]])
-    rows = replace(bare, sigma=np.full((1, 3), 1e-5))
-    polar = Tracker(noise=NOISE)
-    assert [available_noise(rows, t) for t in (AXIS, polar, Tracker())] == ["rows"] * 3
-    assert [available_noise(bare, t) for t in (AXIS, polar, Tracker())] == ["axis", "polar", "none"]

@@ -5,16 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 from support.robot_files import frame, slide, told_by_init, urdf
-from support.robots import KR270
 from support.urdf_text import LIMIT, arm, joint, link
 
 import elastocal as ec
 from elastocal.errors import InputError
-from elastocal.model.rigid import nominal_flange
 from elastocal.model.urdf import read_urdf
 
 
@@ -22,24 +19,6 @@ def read(tmp_path: Path, text: str, base: str | None = None, flange: str | None 
     path = tmp_path / "arm.urdf"
     path.write_text(text, encoding="utf-8")
     return read_urdf(path, base, flange)
-
-
-def flange_at(chain, q) -> np.ndarray:
-    symbol = ca.SX.sym("q", chain.n_joints)
-    return ca.Function("T", [symbol], [nominal_flange(chain, symbol)])(q).full()
-
-
-def test_kr270_upright_pose_and_limits() -> None:
-    """A2 = −90°, A3 = +90°: link arm up, forearm level; A1 = +90° turns it towards −y."""
-    chain = read_urdf(KR270)
-    p = flange_at(chain, np.radians([90, -90, 90, 0, 0, 0]))[:3, 3]
-    np.testing.assert_allclose(p, [0, -(0.35 + 1.1 + 0.23), 0.75 + 1.25 - 0.055], atol=1e-15)
-    limits = np.degrees([(j.lower, j.upper) for j in chain.joints])
-    expected = [[-185, 185], [-146, 0], [-119, 155], [-350, 350], [-125, 125], [-350, 350]]
-    np.testing.assert_allclose(limits, expected, atol=1e-12)
-    axes = [[0, 0, -1], [0, 1, 0], [0, 1, 0], [-1, 0, 0], [0, 1, 0], [-1, 0, 0]]
-    np.testing.assert_array_equal([j.axis for j in chain.joints], axes)
-    assert sum(body.mass for body in chain.masses) == pytest.approx(1100 - 270)
 
 
 def test_kinds_limits_and_default_axis(tmp_path: Path) -> None:

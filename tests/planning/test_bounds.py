@@ -6,22 +6,18 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning.criteria import CRITERIA, CriterionInputs, SpectralCriterion
+from elastocal.errors import InsufficientDataError
+from elastocal.planning.criteria import CRITERIA, CriterionInputs
 from elastocal.planning.relaxation import (
     DesignProblem,
     balanced,
     check_enough,
     efficiency,
     exact_plan,
-    exchange,
     first_allowed,
     in_terms,
-    prospects,
-    random_plan,
     relax,
     sized_plans,
-    values_without,
 )
 
 FIVE = ("test_pose", "D", "E", "G", "O5")
@@ -100,47 +96,6 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
         assert 0 < efficiency(value, relaxed.bound) <= 1
 
 
-class Ratio(SpectralCriterion):
-    """λ_max/λ_min, of which nothing is concave."""
-
-    name = "ratio"
-
-    def phi(self, lam):
-        return lam[..., -1] / lam[..., 0]
-
-    def phi_slope(self, lam):
-        ends = np.zeros_like(lam)
-        ends[0], ends[-1] = -lam[-1] / lam[0] ** 2, 1 / lam[0]
-        return ends
-
-    def figure(self, value):
-        return value
-
-
-def test_a_criterion_without_a_bound_is_exchanged_all_the_same(monkeypatch):
-    monkeypatch.setitem(CRITERIA, "ratio", Ratio)
-    problem = problem_of("ratio", 2)
-    with pytest.raises(InputError, match="has no relaxation, since it states no curvature"):
-        relax(problem)
-    turned, _ = balanced(problem)
-    plan, value = exact_plan(turned, prospects(turned), starts=3)
-    assert value <= np.quantile(all_values(problem), 0.02)
-    assert problem.value(plan) == pytest.approx(value, rel=1e-6)
-
-
-def test_an_exchange_ends_where_no_single_pose_has_a_better_one():
-    problem, _ = balanced(problem_of("test_pose", 4, N=40, n=6))
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        plan, value = exchange(problem, random_plan(problem, rng))
-        for k, out in enumerate(plan):
-            for into in np.flatnonzero(problem.group == problem.group[out]):
-                if into not in plan:
-                    other = plan.copy()
-                    other[k] = into
-                    assert problem.value(other) >= value * (1 - 1e-8)
-
-
 def test_the_same_plan_in_parameters_of_any_scale():
     problem = problem_of("test_pose", 5, N=40, n=6)
     other = in_terms(problem, np.diag(np.logspace(-6, 6, 5)))
@@ -149,13 +104,6 @@ def test_the_same_plan_in_parameters_of_any_scale():
         turned, _ = balanced(one)
         plans.append(exact_plan(turned, relax(turned))[0].tolist())
     assert plans[0] == plans[1]
-
-
-def test_what_a_plan_loses_without_a_pose():
-    problem = problem_of("D", 0, n=4)
-    plan = np.array([0, 1, 2, 3])
-    expected = [problem.value(np.delete(plan, k)) for k in range(4)]
-    assert values_without(problem, plan) == pytest.approx(np.array(expected), rel=1e-10)
 
 
 def test_too_few_poses_and_pools_that_leave_something_open_are_refused():

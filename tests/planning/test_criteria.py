@@ -9,7 +9,6 @@ from elastocal.errors import InputError
 from elastocal.planning.criteria import (
     CRITERIA,
     CriterionInputs,
-    ScenarioCriterion,
     SpectralCriterion,
     TraceCriterion,
     criterion_named,
@@ -182,29 +181,3 @@ def test_what_is_no_whole_criterion_is_refused(forgotten, parents, content, mess
     with pytest.raises(InputError, match=message):
         register(type("Own", parents, content))
     assert "own" not in CRITERIA
-
-
-def test_a_criterion_of_value_and_slope_alone_is_one_in_any_parameters(forgotten):
-    @register
-    class Largest(ScenarioCriterion):
-        name, unit = "largest_variance", "typical sizes"
-
-        @classmethod
-        def of(cls, inputs):
-            return cls()
-
-        def value(self, V):
-            return np.diagonal(V, axis1=-2, axis2=-1).max(axis=-1)
-
-        def slope(self, V):
-            k = int(np.argmax(np.diag(V)))
-            return float(V[k, k]), np.diag(np.arange(len(V)) == k) * 1.0
-
-        def figure(self, value):
-            return float(np.sqrt(value))
-
-    phi, M = criterion("largest_variance"), information(np.random.default_rng(5))
-    T = np.random.default_rng(6).normal(size=(P, P))
-    assert not phi.certifiable
-    turned = phi.turned(T).of_information(T.T @ M @ T)
-    assert turned == pytest.approx(phi.of_information(M), rel=1e-8)

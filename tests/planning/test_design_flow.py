@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planning.order.test_schedule import driven
 from support.calibration import placement
-from support.cells import DOWN
-from support.design_cells import any_cell, plan_cell, scara, sliding_chain
-from support.robots import packaged_urdf
+from support.cells import DOWN, kr270_chain
+from support.design_cells import any_cell, plan_cell, scara
 
-from elastocal.cell.arm_description import Robot
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.model.chain import Chain, joint_limits
-from elastocal.model.urdf import read_urdf
 from elastocal.planning import design as design_module
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
@@ -30,12 +27,6 @@ BOTH = np.array([[0.0, 0, 0], DOWN])
 LIGHT = np.array([[0.0, 0, 0], [0.0, 0, -60.0]])
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
 FEW = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
-
-
-def packaged(name: str, effects: Any, **design_: Any) -> Cell:
-    path, flange = packaged_urdf(name)
-    chain = read_urdf(path, flange=flange)
-    return replace(any_cell(chain, effects, **design_), robot=Robot(path, flange=flange))
 
 
 def at(x: float, y: float, z: float) -> NDArray:
@@ -59,29 +50,18 @@ def work_cell(**design_: Any) -> Cell:
 
 
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
-LEVELS = {"joint2": (-0.5, -1.2, -2.0)}
-CELLS: dict[str, Callable[[], Cell]] = {
-    "7 axes, D": lambda: packaged(
-        "iiwa14", ("base_frame", "joint_compliance", "marker_position"),
-        loads=LIGHT, poses=8, candidates=150, criterion="D",
+ARMS: dict[str, tuple[Chain, Cell]] = {
+    "work cell": (
+        kr270_chain(),
+        work_cell(
+            loads=DOWN[None], candidates=60, levels={"joint2": (-0.5, -1.2, -2.0)},
+            per_level=(1, 2, 1),
+            motion=Motion(home=HOME, speed=np.radians([60.0] * 6), both_directions=True,
+                          overshoot=0.05),
+        ),
     ),
-    "work cell": lambda: work_cell(
-        loads=DOWN[None], poses=7, candidates=150, levels=LEVELS,
-        motion=Motion(home=HOME, speed=np.radians([60.0] * 6)),
-    ),
-    "both directions": lambda: work_cell(
-        loads=DOWN[None], poses=5, candidates=100,
-        motion=Motion(home=HOME, both_directions=True, overshoot=0.05),
-    ),
-}  # fmt: skip
-CHAINS: dict[str, tuple[Callable[[], Chain], Callable[[Chain], Cell]]] = {
     "scara, E": (
-        scara, lambda c: any_cell(c, FEW, loads=LIGHT, poses=9, candidates=150, criterion="E")
-    ),
-    "sliding level": (
-        sliding_chain,
-        lambda c: any_cell(c, ("joint_compliance",), loads=LIGHT, poses=5, candidates=60,
-                           levels={"joint2": (-0.2, 0.1, 0.3)}, per_level=(1, 3, 1)),
+        scara(), any_cell(scara(), FEW, loads=LIGHT, poses=9, candidates=100, criterion="E")
     ),
 }  # fmt: skip
 
@@ -94,15 +74,10 @@ def planned(name: str) -> tuple[Plan, Setup, Feasibility]:
         observed.append(set_up(*args))
         return observed[-1]
 
+    chain, cell = ARMS[name]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(design_module, "set_up", watched)
-        if name in CELLS:
-            cell = CELLS[name]()
-        else:
-            make, cell_for = CHAINS[name]
-            chain = make()
-            cell = cell_for(chain)
-            patch.setattr("elastocal.model.manipulator.load_chain", lambda cell: chain)
+        patch.setattr("elastocal.model.manipulator.load_chain", lambda cell: chain)
         plan = design(cell, DesignOptions("quick"))
     setup, e = observed[0], plan.everywhere
     if e is not None and e.share:
@@ -111,6 +86,7 @@ def planned(name: str) -> tuple[Plan, Setup, Feasibility]:
 
 
 def every_pose_is_allowed_in_every_state(plan: Plan, _: Setup, rules: Feasibility) -> None:
+    assert list(np.bincount(plan.group)) == list(plan.model.cell.design.per_level or [9])
     lower, upper = joint_limits(plan.model.cell, plan.model.chain)
     assert ((lower - 1e-12 <= plan.q) & (plan.q <= upper + 1e-12)).all()
     for k in range(len(plan.q)):
@@ -123,21 +99,7 @@ def every_reading_has_a_stop_and_every_move_is_free(
     plan: Plan, _: Setup, rules: Feasibility
 ) -> None:
     execution, motion = plan.execution, plan.model.cell.design.motion
-    here, loaded, moves = motion.home, False, []
-    for stop in execution.stops:
-        for done, goal in enumerate([*stop.via, stop.q]):
-            if stop.change_after == done:
-                loaded = bool(plan.forces[stop.load].any())
-            if here is not None:
-                moves.append((here, goal, loaded))
-            here = goal
-        if stop.change_after == len(stop.via) + 1:
-            loaded = bool(plan.forces[stop.load].any())
-        assert loaded == bool(plan.forces[stop.load].any())
-    if motion.home is not None:
-        for goal in [*execution.home_via, motion.home]:
-            moves.append((here, goal, False))
-            here = goal
+    moves = driven(execution, plan.q, plan.forces)
     start, end, hanging = (np.array(v) for v in zip(*moves, strict=True))
     assert rules.paths_free(start, end, hanging).all()
     visits = {(s.pose, s.load) for s in execution.stops}
@@ -186,17 +148,10 @@ def what_is_predicted_is_the_inverse_of_the_information(
         assert all(f >= 1.005 for _, f in reason.serves)
 
 
-@pytest.mark.parametrize("name", [*CELLS, *CHAINS])
+@pytest.mark.parametrize("name", ARMS)
 def test_a_plan_is_allowed_free_and_worth_what_it_says(name: str) -> None:
     found = planned(name)
     every_pose_is_allowed_in_every_state(*found)
     every_reading_has_a_stop_and_every_move_is_free(*found)
     the_value_is_that_of_the_poses_and_no_less_than_its_bound(*found)
     what_is_predicted_is_the_inverse_of_the_information(*found)
-
-
-def test_normal_effort_polishes_off_the_pool_and_is_no_worse() -> None:
-    cell = plan_cell(loads=DOWN[None], poses=4, candidates=40)
-    quick, normal = (design(cell, DesignOptions(effort)) for effort in ("quick", "normal"))
-    assert normal.value <= quick.value
-    assert normal.polished > 0

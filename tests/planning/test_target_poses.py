@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,10 @@ from scipy.spatial.transform import Rotation
 from support.calibration import placement
 from support.cells import DOWN, kr270_cell, kr270_chain, nominal_flanges, random_poses
 from support.design_cells import plan_cell, scara, setup_of
-from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
-from elastocal.cell.work_cell import Cell, Solid, Workspace, read_cell
+from elastocal.cell.work_cell import Cell, Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.candidates import joint_space
@@ -127,23 +125,12 @@ def test_a_box_is_filled_with_reached_places() -> None:
     assert ((at > (LOWER + UPPER) / 2).sum(axis=0) == 16).all()
 
 
-def test_a_box_out_of_reach_is_told_with_a_place_and_a_remedy() -> None:
-    box = TargetBox(LOWER, np.array([1.7, 0.3, 30.0]), 8, np.eye(3))
-    told = r"\[1\..* out of reach, .* mm .*leave out rpy_deg, move it, or check base_position_m"
-    with pytest.raises(InputError, match=told):
-        poses_of(cell_of(nominal=Nominal(base_position=np.zeros(3)), test_box=box))
-
-
 @dataclass(frozen=True)
 class Elbow:
     """Allows joint 3 on one side of `least` only, and the named force at most."""
 
     least: float
     forces: tuple[float, ...] = (0.0, -2600.0)
-
-    def feasible(self, q: NDArray, forces: NDArray) -> Any:
-        under = (np.broadcast_to(force, (len(q), 3)) for force in forces)
-        return np.all([self.check(q, force).ok for force in under], axis=0)
 
     def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
         assert force.shape == (len(q), 3)
@@ -264,18 +251,3 @@ def test_degrees_do_not_fit_a_prismatic_joint() -> None:
         with pytest.raises(InputError, match=told):
             check_cell(cell(**bad), chain)
             target_poses.test_poses(cell(**bad), chain)
-
-
-def test_the_cell_shown_in_the_documentation_fits_its_robot(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "file-formats.md").read_text(encoding="utf-8")
-    blocks = re.findall(r"```toml(?: workspace| design)?\n(.*?)```", page, re.S)
-    assert len(blocks) == 3
-    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
-    (tmp_path / "fixture.stl").write_text("read by the collision check", encoding="utf-8")
-    joints = ",".join(f"q{i}_deg" for i in range(1, 7))
-    (tmp_path / "path.csv").write_text(f"{joints}\n0,-90,90,0,30,0\n", encoding="utf-8")
-    (tmp_path / "cell.toml").write_text("\n".join(blocks), encoding="utf-8")
-    shown = read_cell(tmp_path / "cell.toml")
-    check_cell(shown, kr270_chain())
-    targets = target_poses.test_poses(shown, kr270_chain())
-    assert len(targets.q) == 1 + 1 + 20

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.cells import table_of as rows_with_markers
-from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
+from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.plan_wishes import TargetPose
@@ -99,7 +99,7 @@ CASES: dict[str, tuple[Chain, Cell]] = {
 def test_the_rows_are_how_position_changes_with_the_parameters(case: str) -> None:
     """Points that are stated, and the markers where they are fitted and none is stated."""
     chain, cell = CASES[case]
-    q = TABLE_2[[0, 4, 8, 13]] if chain is CHAIN else spread(chain, 4, 1)
+    q = TABLE_2[[0, 4, 8, 13]] if chain is CHAIN else random_poses(chain, 4, 1)
     poses = [TargetPose(q[k], point=POINT if k % 2 else None, weight=1.0 + k) for k in range(4)]
     cell = replace(cell, design=replace(cell.design, test_poses=tuple(poses)))
     model = Model.assembled(chain, cell)

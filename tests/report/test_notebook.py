@@ -6,14 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.cells import MARKERS, kr270_chain, random_table
 from support.diagnoses import VERDICTS
 from support.pages import Page
 
 import elastocal as ec
 from elastocal.above import Result
 from elastocal.errors import InputError
-from elastocal.measurements import read_measurements
 
 
 def test_names_of_the_user_are_no_markup(hostile):
@@ -76,18 +74,6 @@ def test_interactive_plan_shows_every_pose(plan):
     names = [trace.name for trace in plan.plot(interactive=True).data]
     told = [n for n in names if n and n.startswith("pose")]
     assert told == ["pose 1", "pose 2", "pose 3", "pose 4"]
-
-
-def test_measurements_as_a_frame_are_what_is_written(tmp_path):
-    chain = kr270_chain()
-    table = random_table(chain, 3, 1, markers=tuple(MARKERS))
-    frame = table.to_dataframe()
-    table.save(tmp_path / "t.csv")
-    header = (tmp_path / "t.csv").read_text().split("\n")[0].split(",")
-    assert list(frame.columns) == header
-    back = read_measurements(tmp_path / "t.csv", joint_kinds=chain.kinds)
-    np.testing.assert_array_equal(frame.filter(regex=r"^q\d").to_numpy(), back.q)
-    assert re.search("<table", table._repr_html_())
 
 
 def test_the_figures_that_are_documented_are_those_there_are():

@@ -34,7 +34,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.plan import PlanSize
 from elastocal.report import figures
-from elastocal.report.blocks import TONES, resource
 from elastocal.report.renderers import page_of, write_page
 from elastocal.simulation import simulate
 
@@ -224,11 +223,6 @@ def test_design_writes_its_report_and_checks_the_place_first(tmp_path: Path) -> 
     assert f"wrote {tmp_path / 'plan.html'}" in result.stdout.replace("\n", "")
     found = Page((tmp_path / "plan.html").read_text(encoding="utf-8"))
     assert str(cell) in found.named_rows()
-
-
-def test_the_style_sheet_knows_each_tone_that_a_verdict_can_have() -> None:
-    css = resource("style.css")
-    assert all(f".judgement.{tone}" in css for tone in TONES.values())
 
 
 def test_writing_is_whole_or_not_at_all_and_names_what_was_read(

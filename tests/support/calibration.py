@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from support.cells import choices
+from support.cells import choices, table_at  # noqa: F401
 
 from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.cell.work_cell import Cell
@@ -79,31 +79,6 @@ def cell_of(
         ModelSpec(observe=observe, effects=choices(effects), **model),  # type: ignore[arg-type]
         noise=noise or Unsteadiness(),
     )  # fmt: skip
-
-
-def table_at(
-    q: Array, forces: Any = ((0, 0, 0),), markers: Sequence[str] = ("M1",)
-) -> Measurements:
-    """Every pose under every force with every marker; a configuration per pose, positions zero.
-
-    `forces` (states, 3) for all poses, or (poses, states, 3).
-    """
-    forces = np.asarray(forces, dtype=float)
-    per_pose = np.broadcast_to(forces, (len(q), *forces.shape[-2:]))
-    n, states, m = len(q), per_pose.shape[1], len(markers)
-    pose = np.repeat(np.arange(n), states * m)
-    return Measurements(
-        source="table.csv",
-        row=np.arange(len(pose)) + 2,
-        q=np.asarray(q, dtype=float)[pose],
-        configuration=pose,
-        configuration_labels=tuple(str(i + 1) for i in range(n)),
-        repeat=np.zeros(len(pose), dtype=np.int64),
-        marker=np.tile(np.arange(m), n * states),
-        marker_names=tuple(markers),
-        force=np.repeat(per_pose.reshape(-1, 3), m, axis=0),
-        position=np.zeros((len(pose), 3)),
-    )
 
 
 def true_values(

@@ -97,28 +97,37 @@ def random_poses(chain: Chain, n: int, seed: int) -> Array:
     return np.random.default_rng(seed).uniform(low, high, (n, chain.n_joints))
 
 
+def table_at(
+    q: Array, forces: Any = ((0, 0, 0),), markers: Sequence[str] = ("M1",)
+) -> Measurements:
+    """Every pose under every force with every marker; a configuration per pose, positions zero.
+
+    `forces` (states, 3) for all poses, or (poses, states, 3).
+    """
+    forces = np.asarray(forces, dtype=float)
+    per_pose = np.broadcast_to(forces, (len(q), *forces.shape[-2:]))
+    n, states, m = len(q), per_pose.shape[1], len(markers)
+    pose = np.repeat(np.arange(n), states * m)
+    return Measurements(
+        source="table.csv",
+        row=np.arange(len(pose)) + 2,
+        q=np.asarray(q, dtype=float)[pose],
+        configuration=pose,
+        configuration_labels=tuple(str(i + 1) for i in range(n)),
+        repeat=np.zeros(len(pose), dtype=np.int64),
+        marker=np.tile(np.arange(m), n * states),
+        marker_names=tuple(markers),
+        force=np.repeat(per_pose.reshape(-1, 3), m, axis=0),
+        position=np.zeros((len(pose), 3)),
+    )
+
+
 def table_of(
     poses: Array, force: Array, markers: Sequence[str] = tuple(MARKERS), both: bool = False
 ) -> Measurements:
-    """Every pose once per marker under `force` (3,); with `both`, also without load, before.
-
-    Positions are zero: such a table is for predicting.
-    """
-    loads = np.array([np.zeros(3), force] if both else [force])
-    cases = [(i, f, m) for i in range(len(poses)) for f in range(len(loads)) for m in markers]
-    pose, load = (np.array([case[k] for case in cases]) for k in (0, 1))
-    n = len(cases)
-    return Measurements(
-        source="table",
-        row=np.arange(n) + 2,
-        q=np.asarray(poses, dtype=float)[pose],
-        configuration=pose,
-        configuration_labels=tuple(str(i + 1) for i in range(len(poses))),
-        repeat=np.zeros(n, dtype=np.int64),
-        marker=np.array([markers.index(m) for _, _, m in cases]),
-        marker_names=tuple(markers),
-        force=loads[load],
-        position=np.zeros((n, 3)),
+    """Every pose once per marker under `force` (3,); with `both`, also without load, before."""
+    return replace(
+        table_at(poses, [0 * force, force] if both else [force], markers), source="table"
     )
 
 

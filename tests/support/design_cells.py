@@ -22,7 +22,6 @@ from elastocal.planning import test_poses as target_poses
 from elastocal.planning.information import Known
 from elastocal.planning.setup import Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
-from elastocal.units import Array
 
 AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))
 FULL = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
@@ -107,10 +106,3 @@ def as_table(q: NDArray) -> Measurements:
         repeat=np.zeros(n, dtype=np.int64), marker=np.zeros(n, dtype=np.int64),
         marker_names=("M1",), force=np.zeros((n, 3)),
     )  # fmt: skip
-
-
-def spread(chain: Chain, n: int, seed: int) -> Array:
-    """(n, joints) inside the limits, as random_poses but right for joints that slide."""
-    lower = np.array([max(j.lower, -np.pi) for j in chain.joints])
-    upper = np.array([min(j.upper, np.pi) for j in chain.joints])
-    return np.asarray(np.random.default_rng(seed).uniform(lower, upper, (n, chain.n_joints)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,13 +74,6 @@ def broken(feasibility: Feasibility, q: np.ndarray, force: np.ndarray) -> list[s
     """The rules that each pose breaks."""
     verdict = feasibility.check(q, force)
     return [{r for r, hit in zip(verdict.rules, row, strict=True) if hit} for row in verdict.broken]
-
-
-def study_module(name: str):
-    """A module of experiment_design/feasibility_check, whose scripts import one another."""
-    if str(CHECK) not in sys.path:
-        sys.path.append(str(CHECK))
-    return importlib.import_module(name)
 
 
 def random_chain(seed: int, folder: Path) -> Chain:

@@ -1,8 +1,10 @@
 """The same solids in MuJoCo, with its own kinematics, collision and rays."""
 
+import importlib
+
 import numpy as np
 import pytest
-from planning.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
+from planning.feasibility.small_cells import CHECK, DOWN, NOTHING
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.model.chain import joint_limits
@@ -11,7 +13,6 @@ from elastocal.planning.collision import END, Collisions
 from elastocal.planning.feasibility import Feasibility
 
 pytest.importorskip("mujoco")
-BOTH = [pytest.param(DOWN, id="loaded"), pytest.param(NOTHING, id="not", marks=pytest.mark.long)]
 TOLERANCE = 1e-5  # m between two implementations of GJK
 
 
@@ -27,30 +28,21 @@ def poses(rules, n, seed=0):
 
 
 def judge(rules, slack):
-    module = study_module("mujoco_cell")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(CHECK)
+        module = importlib.import_module("mujoco_cell")
     return module.MujocoCell(rules.cell, rules.chain, rules.bodies, rules.pairs, slack)
 
 
-@pytest.mark.parametrize("force", BOTH)
+@pytest.mark.parametrize("force", [DOWN, NOTHING], ids=["loaded", "not"])
 def test_poses_in_contact_are_in_contact_and_free_ones_free(rules, force):
     loaded = bool(force.any())
-    q = poses(rules, 1500)
+    q = poses(rules, 800)
     hit = Collisions(rules.kinematics, rules.pairs).hits(rules.kinematics.poses(q, force))
     strict, lenient = judge(rules, -TOLERANCE), judge(rules, 1e-3)
     assert not any(strict.touches(pose, loaded) for pose in q[~hit])
     assert all(lenient.touches(pose, loaded) for pose in q[hit])
-    assert 300 < hit.sum() < 1400
-
-
-@pytest.mark.parametrize("force", BOTH)
-def test_feasible_poses_are_seen_by_rays(rules, force):
-    loaded = bool(force.any())
-    q = poses(rules, 60_000, seed=1)
-    q = q[rules.feasible(q, force)][:200]
-    assert len(q) >= 50
-    eye, end = judge(rules, 0.0), END * rules.cell.workspace.visibility.beam_radius
-    assert not any(eye.hidden(pose, end, loaded) for pose in q)
-    assert not any(eye.touches(pose, loaded) for pose in q)
+    assert 150 < hit.sum() < 750
 
 
 def test_what_rays_cannot_reach_is_hidden(rules):
@@ -63,24 +55,3 @@ def test_what_rays_cannot_reach_is_hidden(rules):
     assert (blocked | ~by_ray).all()
     # The beam's 8 mm decide few cases.
     assert (blocked & ~by_ray).sum() < 0.1 * len(q) and by_ray.sum() > 50
-
-
-@pytest.mark.parametrize("force", BOTH)
-def test_moves_hold_at_every_tenth_of_a_degree(rules, force):
-    check, loaded = study_module("check"), bool(force.any())
-    q = poses(rules, 150_000 if loaded else 20_000, seed=3)
-    q = q[rules.feasible(q, force)][:120]
-    q = q[check.tour(q)]
-    free = rules.paths_free(q[:-1], q[1:], loaded)
-    strict, lenient = judge(rules, -TOLERANCE), judge(rules, 1e-3)
-    load = rules.cell.workspace.load
-    for a, b, said in zip(q[:-1], q[1:], free, strict=True):
-        if said:
-            assert not any(strict.touches(pose, loaded) for pose in check.dense((a, b))[::3])
-        else:
-            assert any(
-                lenient.touches(pose, loaded)
-                or (loaded and lenient.slanted(load.rope_axis, np.cos(load.max_angle)))
-                for pose in check.dense((a, b))
-            )
-    assert 0 < free.sum() < len(free)

@@ -68,7 +68,7 @@ def test_small_plans_take_the_time_of_the_best_order(seed, home):
     assert sorted(stop.pose for stop in execution.stops) == list(range(6))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(
     st.integers(0, 10_000),
     st.booleans(),

@@ -50,22 +50,6 @@ def planned(execution):
     return np.array(moves if home is None else [*moves, *execution.home_via, home])
 
 
-def test_the_load_is_hung_before_the_first_loaded_reading_and_taken_off_after_the_last(chain):
-    lines = KRL(execution_of(chain, home=HOME), chain, NAMES, FORCES).splitlines()
-    events = [
-        "load" if "load of" in line else "free"
-        for line in lines
-        if line.startswith("; measure")
-    ]  # fmt: skip
-    assert events == ["free"] * 5 + ["load"] * 5
-    hang, off = (k for k, line in enumerate(lines) if line == "HALT")
-    first = next(k for k, line in enumerate(lines) if "; measure" in line and "load of" in line)
-    last = max(k for k, line in enumerate(lines) if "; measure" in line)
-    assert lines[hang - 1].startswith("; hang the load of (0, 0, -2600) N")
-    assert lines[off - 1].startswith("; take the load off")
-    assert max(k for k in range(first) if "; measure" in lines[k]) < hang < first < last < off
-
-
 @pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_the_text_is_the_same_every_time_and_names_cannot_break_it(chain, write):
     execution = execution_of(chain)
