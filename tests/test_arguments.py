@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.files import write_campaign
+from fuzz import campaign
 
 import elastocal as ec
 from elastocal.above import LARGEST_SEED
@@ -19,10 +19,8 @@ SEEDS = (10**12, LARGEST_SEED)
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> ec.Model:
     folder = tmp_path_factory.mktemp("door")
-    write_campaign(folder)
-    cell = (folder / "cell.toml").read_text()
-    (folder / "cell.toml").write_text(f"{cell}\n[tracker]\nsigma_um = 10\n")
-    return ec.Model(folder / "cell.toml")
+    campaign.write(folder)
+    return ec.Model(folder / "placed.toml")
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +124,8 @@ def test_any_seed_is_one(
     q = data.q[:1]
     one, two, three = (ec.simulate(model, q, draw=1, seed=s).position for s in (seed, seed, 0))
     assert np.array_equal(one, two) and not np.array_equal(one, three)
+    four, five = (ec.simulate(model, q, seed=np.random.default_rng(seed)) for _ in "ab")
+    assert np.array_equal(four.position, five.position)
     assert ec.compare(fit, fit, poses=3, seed=seed).verdict
     assert ec.identify(model, data, seed=seed).x.shape == fit.x.shape
     fit.arm.save(tmp_path / "arm.json", seed=seed)

@@ -368,6 +368,11 @@ def test_what_is_the_same_is_equal(folder, model, fit, plan, tmp_path):
     for one, other in pairs:
         assert one == other and hash(one) == hash(other) and len({one, other}) == 1, type(one)
         assert pickle.loads(pickle.dumps(one)) == other
+    # And what differs is not, by however little.
+    assert data != replace(data, position=data.position + 1e-12) and data != "data.csv"
+    assert data != replace(data, marker_names=("M1", "M3", "M2")) and data != data[:-1]
+    heavier = replace(model.cell.tool, load_point=[0.2, 0.0, 0.26])
+    assert ec.Model(replace(model.cell, tool=heavier)) != model != fit and once != fit
 
 
 def test_a_file_is_loaded_by_what_it_is(fit, tmp_path):

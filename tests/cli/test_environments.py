@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.files import write_campaign
+from fuzz.campaign import write
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders and pipes of POSIX")
 
@@ -21,7 +21,7 @@ UNSET = ("HOME", "TERM", "LANG", "LC_CTYPE", "XDG_CACHE_HOME", "PYTHONUTF8",
 @pytest.fixture(scope="module")
 def campaign(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("campaign")
-    write_campaign(folder)
+    write(folder)
     return folder
 
 
@@ -40,7 +40,7 @@ def elastocal(
 
 
 def identified(folder: Path, *words: str, **how) -> subprocess.CompletedProcess[bytes]:
-    return elastocal(folder, "identify", "cell.toml", "data.csv", *words, **how)
+    return elastocal(folder, "identify", "placed.toml", "placed.csv", *words, **how)
 
 
 def test_everything_missing_at_once(campaign, tmp_path):

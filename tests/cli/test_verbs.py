@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 
 import pytest
-from support.files import write_campaign
+from fuzz.campaign import write
 from support.registered import forgotten
 from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from typer.testing import CliRunner, Result
@@ -46,7 +46,8 @@ def test_the_backend_is_what_models_use_and_what_results_state(
     assert "--backend: unknown backend 'nunpy' (did you mean 'numpy'" in done.output
     run("--backend", "auto", "identify", "no-cell.toml", "no-data.csv")
     assert os.environ[VARIABLE] == chosen_backend() == "auto"
-    cell, data = write_campaign(tmp_path)
+    write(tmp_path)
+    cell, data = tmp_path / "placed.toml", tmp_path / "placed.csv"
     files = [tmp_path / "result.json", tmp_path / "report.html"]
     done = run("--backend", "numpy", "identify", cell, data, "-o", files[0], "--report", files[1])
     assert done.exit_code == 0, done.output
@@ -99,7 +100,7 @@ def test_a_first_cell_that_cannot_be_read_is_not_left_behind(
 ) -> None:
     from elastocal.importing import first_cell
 
-    write_campaign(tmp_path)
+    write(tmp_path)
     monkeypatch.setattr(first_cell, "first_cell", lambda *given: "[robot]\nnothing = 1\n")
     done = run("init", tmp_path / "arm.urdf", "-o", tmp_path / "first.toml")
     assert done.exit_code == 2 and "arm.urdf" in done.stderr
@@ -154,7 +155,8 @@ register_noise_model(Mine())
 def test_a_plug_in_that_fails_at_work_is_to_blame_itself(
     module: str, code: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell, data = write_campaign(tmp_path)
+    write(tmp_path)
+    cell, data = tmp_path / "placed.toml", tmp_path / "placed.csv"
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / f"{module.removesuffix('.py')}.py").write_text(code)
     effects = '"joint_offset", "mine"' if "DrivenEffect" in code else '"joint_offset"'
@@ -165,4 +167,4 @@ def test_a_plug_in_that_fails_at_work_is_to_blame_itself(
     with forgotten():
         done = run("identify", cell, data, "--plugins", "-q")
     assert done.exit_code == 2 and re.search(told, done.stderr), done.stderr
-    assert "data.csv" not in done.stderr
+    assert "placed.csv" not in done.stderr

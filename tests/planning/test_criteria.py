@@ -127,9 +127,6 @@ A = np.ones((2, 3, P))
 @pytest.mark.parametrize(
     ("name", "change", "message"),
     [
-        ("d", {}, "criterion 'd' is unknown .did you mean 'D'"),
-        ("V", {}, "there are test_pose, D, A, E, G, I, c, O1, O3, O5"),
-        ("O2", {}, "O2 is gone: its plans had no bound, .* take E or O3"),
         ("robust", {}, "robust is gone: take test_pose; .* next, or diagnose"),
         ("test_pose", {"A": None}, "test_pose needs test poses"),
         ("G", {"A": 0 * A}, "no target depends on the parameters"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -149,9 +150,16 @@ def what_is_predicted_is_the_inverse_of_the_information(
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_a_plan_is_allowed_free_and_worth_what_it_says(name: str) -> None:
+def test_a_plan_is_allowed_free_and_worth_what_it_says(name: str, tmp_path: Path) -> None:
     found = planned(name)
     every_pose_is_allowed_in_every_state(*found)
     every_reading_has_a_stop_and_every_move_is_free(*found)
     the_value_is_that_of_the_poses_and_no_less_than_its_bound(*found)
     what_is_predicted_is_the_inverse_of_the_information(*found)
+    plan = found[0]
+    plan.save(tmp_path / "plan.csv")
+    read, table = plan.model.read_plan(tmp_path / "plan.csv"), plan.table()
+    assert np.allclose(read.q, table.q, rtol=0, atol=1e-9)
+    for column in ("force", "approach", "configuration_labels"):
+        assert np.array_equal(getattr(read, column), getattr(table, column)), column
+    assert (read.approach is not None) == plan.model.cell.design.motion.both_directions

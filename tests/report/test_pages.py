@@ -16,8 +16,6 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 from support.cells import kr270_cell, kr270_chain
-from support.design_commands import design as design_command
-from support.design_commands import everything_in, write_cell
 from support.diagnoses import EXPLAINED, HOSTILE, VERDICTS
 from support.pages import Page
 
@@ -209,20 +207,6 @@ def test_a_plan_shows_its_poses_and_has_600_words_open_with_every_stop(plan: Any
         # Markers are as far from the flange as the cell says.
         away = np.linalg.norm(np.subtract(pose["markers"], pose["line"][-1]), axis=1)
         assert away == pytest.approx(np.linalg.norm(local, axis=1), abs=2e-4)
-
-
-def test_design_writes_its_report_and_checks_the_place_first(tmp_path: Path) -> None:
-    cell = write_cell(tmp_path)
-    for place, complaint in ((tmp_path, "is a directory"), (cell, "ends in .toml"),
-                             (tmp_path / "plan.json", "ends in .json")):  # fmt: skip
-        refused = design_command(cell, "--report", place)
-        assert refused.exit_code == 2 and complaint in refused.stderr
-    assert everything_in(tmp_path) == ["cell.toml"]
-    result = design_command(cell, "--report", tmp_path / "plan.html")
-    assert result.exit_code == 0, result.stderr
-    assert f"wrote {tmp_path / 'plan.html'}" in result.stdout.replace("\n", "")
-    found = Page((tmp_path / "plan.html").read_text(encoding="utf-8"))
-    assert str(cell) in found.named_rows()
 
 
 def test_writing_is_whole_or_not_at_all_and_names_what_was_read(

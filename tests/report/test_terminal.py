@@ -4,6 +4,7 @@ sentence says more than is known."""
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.cells import cell_len
 from rich.console import Console
-from support.diagnoses import VERDICTS
+from support.diagnoses import MANY, VERDICTS
 
 from elastocal.report.blocks import ShownTable, probability, settings_text
+from elastocal.report.diagnosis_view import place_table
 from elastocal.report.identification_view import parameter_table, texts, undetermined_table
 from elastocal.report.renderers import print_report
 
@@ -106,3 +108,9 @@ def test_a_range_of_angles_has_one_unit():
 def test_of_many_orders_the_rest_is_counted():
     told = settings_text({f"order_{k}": float(k) for k in range(1, 10)})
     assert told.startswith("orders 1.000, 2.000") and told.endswith("6.000 and 3 more")
+
+
+def test_an_effect_that_two_findings_share_a_place_with_stands_below_one_of_them_only():
+    both = replace(MANY, groups=(MANY.groups[0], replace(MANY.groups[0], name="other")))
+    kept = [c for c in MANY.components if c.family == "angle"]
+    assert len(place_table(both).rows) == len(kept)

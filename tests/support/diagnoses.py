@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from support.cells import table_of
 
 from elastocal.diagnosis.diagnosis import (
     Candidate,
@@ -25,7 +26,6 @@ from elastocal.diagnosis.diagnosis import (
     Untested,
 )
 from elastocal.identification.scrutiny import BudgetStep
-from elastocal.measurements import Measurements
 
 HOSTILE = "<script>alert(1)</script>\x1b[31m"
 
@@ -42,6 +42,7 @@ ECCENTRICITY = FoundEffect(
     ),
     settings={},
 )
+
 JUMP = FoundEffect(
     effect="encoder_jump",
     where="joint1",
@@ -181,44 +182,24 @@ UNKNOWN = replace(
 )  # fmt: skip
 
 
-def visits(approach: bool = True, time: bool = True) -> Measurements:
-    """Three visits to two poses: X1 unloaded and loaded, X2 loaded."""
-    n = 3
-    return Measurements(
-        source="plan",
-        row=np.arange(n),
-        q=np.linspace(-1.0, 1.0, 6) + np.array([0, 0, 1])[:, None] * 0.1,
-        configuration=np.array([0, 0, 1]),
-        configuration_labels=("X1", "X2"),
-        repeat=np.zeros(n, dtype=np.int64),
-        marker=np.zeros(n, dtype=np.int64),
-        marker_names=("M1",),
-        force=np.array([[0.0, 0, 0], [0, 0, -2600.0], [0, 0, -2600.0]]),
-        approach=np.tile([1.0, -1.0], (n, 3)) if approach else None,
-        time=np.array([0.0, 600.0, 900.5]) if time else None,
-    )
-
-
-EXTRA = ExtraPlan(
+# Rivals that no pose tells apart.
+INSEPARABLE = ExtraPlan(
     rivals=("gear_eccentricity:joint2", "link_mass_error:link2"),
     pairs=(RivalPair("gear_eccentricity:joint2", "link_mass_error:link2", 1.1, 5.6),),
-    plan=visits(),
-    n_poses=2,
-    probability_before=0.69,
-    probability_after=0.997,
-    probability_random=0.85,
-    separable=True,
-    inseparable=(),
-    advice=(f"pull sideways as well {HOSTILE}",),
-)
-INSEPARABLE = replace(
-    EXTRA,
     plan=None,
     n_poses=0,
-    separable=False,
+    probability_before=0.69,
     probability_after=0.69,
-    inseparable=(EXTRA.rivals,),
+    probability_random=0.85,
+    separable=False,
+    inseparable=(("gear_eccentricity:joint2", "link_mass_error:link2"),),
+    advice=(f"pull sideways as well {HOSTILE}",),
 )
+
+EXTRA = replace(
+    INSEPARABLE, plan=table_of(np.zeros((2, 6)), np.zeros(3), ("M1",)), n_poses=2,
+    probability_after=0.997, separable=True, inseparable=(),
+)  # fmt: skip
 
 # Many causes at once: errors of three gears, sag at two joints, and a creep that nobody can name.
 
