@@ -14,10 +14,13 @@ from elastocal.planning.relaxation import (
     check_enough,
     efficiency,
     exact_plan,
+    exchange,
     first_allowed,
     in_terms,
+    random_plan,
     relax,
     sized_plans,
+    values_without,
 )
 
 FIVE = ("test_pose", "D", "E", "G", "O5")
@@ -94,6 +97,26 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
         assert value == pytest.approx(values.min(), rel=1e-6)
         assert problem.value(plan) == pytest.approx(value, rel=1e-6)
         assert 0 < efficiency(value, relaxed.bound) <= 1
+
+
+def test_an_exchange_ends_where_no_single_pose_has_a_better_one():
+    problem, _ = balanced(problem_of("test_pose", 4, N=40, n=6))
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        plan, value = exchange(problem, random_plan(problem, rng))
+        for k, out in enumerate(plan):
+            for into in np.flatnonzero(problem.group == problem.group[out]):
+                if into not in plan:
+                    other = plan.copy()
+                    other[k] = into
+                    assert problem.value(other) >= value * (1 - 1e-8)
+
+
+def test_what_a_plan_loses_without_a_pose():
+    problem = problem_of("D", 0, n=4)
+    plan = np.array([0, 1, 2, 3])
+    expected = [problem.value(np.delete(plan, k)) for k in range(4)]
+    assert values_without(problem, plan) == pytest.approx(np.array(expected), rel=1e-10)
 
 
 def test_the_same_plan_in_parameters_of_any_scale():
