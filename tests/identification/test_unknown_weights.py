@@ -64,7 +64,7 @@ def test_a_compliance_whose_weights_are_held_at_zero_is_left_out() -> None:
     effects = ["base_frame", "joint_offset", "joint_compliance", "link_mass_error", "gravity_sag"]
     chain, rng = kr270_chain(), np.random.default_rng(1)
     m = Model.assembled(chain, kr270_cell(effects))
-    poses = random_table(chain, 8, seed=1)
+    poses = random_table(chain, 12, seed=1)
     table = replace(poses, force=np.zeros_like(poses.force), distance=None)
     x = m.nominal.copy()
     for k, p in enumerate(m.parameters):
