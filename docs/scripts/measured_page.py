@@ -39,9 +39,9 @@ TESTED = """\
 | relaxation and exchange against all plans of small pools | the best one | `tests/planning/test_bounds.py` |
 | realised against predicted error of plans: deflections, positions, a configuration effect | 4 standard errors | `tests/planning/test_promise.py` |
 | exported arms read back (URDF by pinocchio, MJCF at equilibrium under load by MuJoCo, DH tables) | 1 µm | `tests/export` |
-| NIST reference regressions, certified digits: eleven linear sets by ordinary least squares as published | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_nist.py` |
-| the same through the fit of an arm under estimated noise of one size | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_nist.py` |
-| twelve nonlinear NIST sets through the fit of an arm, from both of NIST's starts | 5 | `tests/identification/test_nist.py` |
+| NIST reference regressions, certified digits: eleven linear sets by ordinary least squares as published | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_reference_fits.py` |
+| the same through the fit of an arm under estimated noise of one size | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_reference_fits.py` |
+| twelve nonlinear NIST sets through the fit of an arm, from both of NIST's starts | 5 | `tests/identification/test_reference_fits.py` |
 """
 
 
