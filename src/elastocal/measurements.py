@@ -50,6 +50,7 @@ NUMBERS = (
     "approach", "before", "temperature",
 )  # fmt: skip
 SINGLE = ("distance", "time", "temperature")  # one number in a row
+WHOLE = ("position", "torque", "approach", "before")  # as they stand in the file
 DEFAULT_MARKER = "M1"
 LEAST_FORCE, LARGEST_FORCE = 1e-6, 1e7  # N
 QUATERNION_NORM_TOLERANCE = 1e-3
@@ -116,10 +117,10 @@ class Measurements(Result):
 
     @classmethod
     def of_poses(
-        cls, source: str, q: Array, force: Array, marker: str = DEFAULT_MARKER, **more: Any
+        cls, source: str, q: Array, force: Array, marker: str = DEFAULT_MARKER, /, **more: Any
     ) -> Measurements:
-        """Rows that no file states: a configuration for each row of q, its one marker, its force
-        (n, 3) or (3,); `more` are other columns."""
+        """Rows of which only joints and force (n, 3) or (3,) are stated: a configuration for each
+        row of q, its one marker; `more` are other columns, and these where they are known."""
         n = len(q)
         known: dict[str, Any] = dict(
             row=np.arange(1, n + 1),
@@ -255,19 +256,17 @@ def table(
         told = f"{option(name)} takes a value for each row of q ({n} joints)"
         if given is not None and given.shape not in shapes:
             raise InputError(f"{told}; found an array of shape {given.shape}")
-    pulls = np.broadcast_to(pulls, (n, 3)).copy()
     configuration, markers = Labels.of(map(tuple, joints.tolist())), Labels.of(names)
+    pulls = np.broadcast_to(pulls, (n, 3))
     alike = numbered(configuration.codes, markers.codes, load_states(pulls))
     order = np.argsort(alike, kind="stable")
     repeat = np.empty(n, dtype=np.int64)
     repeat[order] = np.arange(n) - np.searchsorted(alike[order], alike[order])
-    found = Measurements.of_poses("table", joints, pulls, position=places, joint_kinds=kinds)
-    found = replace(
-        found, repeat=repeat, configuration=configuration.codes, marker=markers.codes,
+    return with_moves(Measurements.of_poses(
+        "table", joints, pulls, position=places, joint_kinds=kinds, repeat=repeat,
+        configuration=configuration.codes, marker=markers.codes, marker_names=markers.names,
         configuration_labels=tuple(map(str, range(1, len(configuration.names) + 1))),
-        marker_names=markers.names,
-    )  # fmt: skip
-    return with_moves(found)
+    ))  # fmt: skip
 
 
 # Visits, and the moves between them
@@ -549,41 +548,31 @@ def read_measurements(
         return columns_of(str(path), header, joint_kinds, observe)
 
     raw = tables.read_table(path, choose, text=text)
-    n = len(raw.row)
-    numeric = [name for name, own in raw.columns.items() if not own[0].is_label]
-    found = {name: raw.si(name) for name in numeric}
-    for name, values in found.items():
-        if values is not None and name in RULES:
-            good, rule = RULES[name]
-            raw.check(name, good(values), rule)
+    numeric = (name for name, own in raw.columns.items() if not own[0].is_label)
+    found = {name: values for name in numeric if (values := raw.si(name)) is not None}
+    for name, (good, rule) in RULES.items():
+        if name in found:
+            raw.check(name, good(found[name]), rule)
     # A plan without the column is of all markers.
     marker = _marker(raw, marker_names if observe not in PLANS or "marker" in raw.labels else ())
-    configuration = raw.labels.get("configuration")
-    if configuration is None:
-        configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
-    q, force, repeat = (found.pop(name, None) for name in ("q", "force", "repeat"))
-    if force is not None:
-        # What a subtraction or rotation leaves of no load; scaled by it, numbers overflow.
-        force = np.where(np.linalg.norm(force, axis=1, keepdims=True) < LEAST_FORCE, 0.0, force)
-    polar = found.get("sigma_polar")
-    columns = ("position", "torque", "approach", "before")
-    table = Measurements(
-        source=str(path),
-        row=raw.row,
-        q=np.zeros((n, 0)) if q is None else q,
-        configuration=configuration.codes,
-        configuration_labels=configuration.names,
-        repeat=np.zeros(n, dtype=np.int64) if repeat is None else repeat[:, 0].astype(np.int64),
-        marker=marker.codes,
-        marker_names=marker.names,
-        force=np.zeros((n, 3)) if force is None else force,
-        rotation=rotation_column(raw),
-        sigma=found.get("sigma_cartesian") if polar is None else polar,
-        sigma_frame="cartesian" if polar is None else "polar",
-        joint_kinds=() if q is None else joint_kinds,
-        **{name: found.get(name) for name in columns},
-        **{name: v[:, 0] for name in SINGLE if (v := found.get(name)) is not None},
-    )
+    columns: dict[str, Any] = {name: found[name] for name in WHOLE if name in found}
+    columns |= {name: found[name][:, 0] for name in SINGLE if name in found}
+    for frame in ("cartesian", "polar"):
+        if (sigma := found.get(f"sigma_{frame}")) is not None:
+            columns |= {"sigma": sigma, "sigma_frame": frame}
+    if "repeat" in found:
+        columns["repeat"] = found["repeat"][:, 0].astype(np.int64)
+    if configuration := raw.labels.get("configuration"):
+        columns |= {"configuration": configuration.codes,
+                    "configuration_labels": configuration.names}  # fmt: skip
+    force = found.get("force", np.zeros(3))
+    # What a subtraction or rotation leaves of no load; scaled by it, numbers overflow.
+    force = np.where(np.linalg.norm(force, axis=-1, keepdims=True) < LEAST_FORCE, 0.0, force)
+    table = Measurements.of_poses(
+        str(path), found.get("q", np.zeros((len(raw.row), 0))), force, row=raw.row,
+        marker=marker.codes, marker_names=marker.names, rotation=rotation_column(raw),
+        joint_kinds=joint_kinds if "q" in found else (), **columns,
+    )  # fmt: skip
     if observe != "targets":  # a path may pass a place twice
         _check_duplicates(raw, table)
     return with_moves(table)

@@ -546,9 +546,9 @@ class Refit:
         return self.after < self.before
 
     def to_json(self) -> dict[str, Any]:
-        sizes = {"before": self.before, "after": self.after, "nominal": self.nominal}
-        sizes |= {"with_correction": self.correction}
-        told = {f"marker_rms_{name}_um": microns(size) for name, size in sizes.items()}
+        names = ("before", "after", "nominal", "with_correction")
+        sizes = zip(names, (self.before, self.after, self.nominal, self.correction), strict=True)
+        told = {f"marker_rms_{name}_um": microns(size) for name, size in sizes}
         return {"taken": self.taken, **told, "poses": self.poses, "visits": self.visits}
 
 
@@ -704,12 +704,9 @@ class _Curves:
         n = measured.shape[1]
         self.places = np.linspace(measured.min(axis=0), measured.max(axis=0), KNOTS)
         self.moving = [i for i in range(n) if np.ptp(measured[:, i]) > MOVED]
-        unit = np.eye(KNOTS)
-        hats = [
-            np.column_stack([np.interp(rows.q[:, i], self.places[:, i], u) for u in unit])
-            for i in self.moving
-        ]
-        self.hats = np.stack(hats, axis=1)  # rows, moving joints, KNOTS
+        hats = [np.interp(rows.q[:, i], self.places[:, i], unit)
+                for i in self.moving for unit in np.eye(KNOTS)]  # fmt: skip
+        self.hats = np.column_stack(hats)  # rows, moving joints · KNOTS
         assert rows.approach is not None  # drawn
         self.side, self.n = rows.approach, n
 
@@ -720,9 +717,8 @@ class _Curves:
     def columns(self, B: Array) -> Array:
         """(components, count): what each coefficient moves, by B (components, joints)."""
         size = len(B) // len(self.side)
-        hats = np.repeat(self.hats, size, axis=0)
-        bent = np.einsum("rj,rik->rjik", B, hats).reshape(len(B), -1)
-        return np.hstack([bent, B * np.repeat(self.side, size, axis=0)])
+        hats, side = (np.repeat(values, size, axis=0) for values in (self.hats, self.side))
+        return np.hstack([(B[:, :, None] * hats[:, None, :]).reshape(len(B), -1), B * side])
 
     def correction(self, start: JointCorrection, c: Array) -> JointCorrection:
         bent = c[: -self.n].reshape(self.n, len(self.moving), KNOTS)

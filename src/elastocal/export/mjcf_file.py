@@ -47,12 +47,9 @@ IDENTITY, NOTHING = np.eye(4), LinkMass(0.0, np.zeros(3))
 
 
 def calibrated_mjcf(
-    pieces: ExportNumbers,
-    note: str,
-    inertias: Sequence[Array] = (),
-    compensator: dict[str, float] | None = None,
-    base_frame: bool = False,
-) -> str:
+    pieces: ExportNumbers, note: str, inertias: Sequence[Array],
+    compensator: dict[str, float] | None, base_frame: bool,
+) -> str:  # fmt: skip
     """MJCF text of the exported pieces.
 
     Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
@@ -452,27 +449,9 @@ class _MjcfText(XmlFile):
     def let_act(self) -> list[str]:
         """Let springs yield and weights act in the file, as they do in the model; what that
         changes."""
-        told = self.enable("passive", "spring")
-        if not self.pieces.masses:
-            return told
-        # Gravity along the vertical that was identified, where the file has another.
-        up = self.arm.tree.placed(self.arm.base)[:3, :3] @ self.pieces.T_tracker_base[:3, :3].T
-        wanted = up @ [0.0, 0.0, -STANDARD_GRAVITY]
-        if np.abs(self.model.opt.gravity - wanted).max() >= SMALLEST:
-            self.set_in(self.tags[0], "option", {"gravity": numbers(wanted)})
-        told += self.enable("gravity")
-        for b in (held := self.arm.weightless()):
-            self.set(self.bodies[b], {"gravcomp": "0"})
-        if held:
-            names = listed((self.arm.bodies[b] for b in held), 4)
-            told.append(f"gravcomp of {names} is 0 in this file, so that weights bend the springs")
-        return told
-
-    def enable(self, *names: str) -> list[str]:
-        """Switch on what <flag> of the file switches off, of these."""
-        import mujoco
-
-        flags, kinds = self.anywhere("flag", "option"), mujoco.mjtDisableBit
+        # Flags as versions of MuJoCo have them.
+        names = ["passive", "spring", *(["gravity"] if self.pieces.masses else [])]
+        flags, kinds = self.anywhere("flag", "option"), import_mujoco().mjtDisableBit
         bits = {name: int(getattr(kinds, f"mjDSBL_{name.upper()}", 0)) for name in names}
         off = [name for name, bit in bits.items() if self.model.opt.disableflags & bit]
         for name in off:
@@ -480,7 +459,20 @@ class _MjcfText(XmlFile):
                 raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')
             self.set(flags[-1], {name: "enable"})
         what = "is switched on in this file, so that the springs yield to weights"
-        return [f"{name} {what}" for name in off]
+        told = [f"{name} {what}" for name in off]
+        if not self.pieces.masses:
+            return told
+        # Gravity along the vertical that was identified, where the file has another.
+        up = self.arm.tree.placed(self.arm.base)[:3, :3] @ self.pieces.T_tracker_base[:3, :3].T
+        wanted = up @ [0.0, 0.0, -STANDARD_GRAVITY]
+        if np.abs(self.model.opt.gravity - wanted).max() >= SMALLEST:
+            self.set_in(self.tags[0], "option", {"gravity": numbers(wanted)})
+        for b in (held := self.arm.weightless()):
+            self.set(self.bodies[b], {"gravcomp": "0"})
+        if held:
+            bodies = listed((self.arm.bodies[b] for b in held), 4)
+            told.append(f"gravcomp of {bodies} is 0 in this file, so that weights bend the springs")
+        return told
 
     def correct_flange(self, frames: bool) -> list[str]:
         arm, pieces = self.arm, self.pieces

@@ -478,6 +478,6 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     numbers = np.nan_to_num([[dh.dh_number(table, i, *key) for key in keys] for i in range(n)])
     own = [DhRow(), *(DhRow(*row) for row in numbers.tolist())]
     if convention == "standard":
-        return own
+        return [*own]
     pairs = zip(own, [*own[1:], DhRow()], strict=True)  # θ and d of one, the rest of the next
     return [replace(after, theta=row.theta, d=row.d) for row, after in pairs]

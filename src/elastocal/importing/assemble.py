@@ -21,26 +21,29 @@ from numpy.typing import NDArray
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
 from elastocal.identification.mistakes import NominalFit, nominal_fit
-from elastocal.importing import joining, mapping_file
+from elastocal.importing import joining
 from elastocal.importing.exports import FORCES, Records, Understood, joint_stems, read_records
 from elastocal.importing.joining import Joined
-from elastocal.importing.mapping_file import ImportMapping, MappingTable, SourceTable
+from elastocal.importing.mapping_file import (
+    ImportMapping,
+    LoadStatesTable,
+    MappingTable,
+    SourceTable,
+)
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
+from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
-GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")
 
 
 def forces_of(
-    where: str,
-    points: Records,
-    loads: Mapping[str, NDArray[np.float64] | mapping_file.LoadStatesTable],
-) -> NDArray[np.float64] | None:
+    where: str, points: Records, loads: Mapping[str, Array | LoadStatesTable]
+) -> Array | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
     A mass m hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as
@@ -62,8 +65,8 @@ def forces_of(
     )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in loads.items():
-        if isinstance(stated, mapping_file.LoadStatesTable):
-            stated = np.array([0.0, 0.0, -stated.mass_kg * GRAVITY])
+        if isinstance(stated, LoadStatesTable):
+            stated = np.array([0.0, 0.0, -stated.mass_kg * STANDARD_GRAVITY])
         known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):
         if name not in known and (size := load_in(name)):
@@ -84,7 +87,7 @@ _SIZE = re.compile(
     r"([kK][gG]|kN|N)(?![A-Za-z0-9])"
 )
 _WORD = re.compile(r"(?<!un)(?<!no)(?<!without)[ _-]?(?:pay)?load(?:ed)?(?![a-z])|weight", re.I)
-_NEWTONS = {"kg": GRAVITY, "kn": 1e3, "n": 1.0}
+_NEWTONS = {"kg": STANDARD_GRAVITY, "kn": 1e3, "n": 1.0}
 
 
 def load_in(text: str) -> tuple[str, float] | None:

@@ -82,10 +82,10 @@ def init(
         target is None or force or not target.exists(),
         f"{target} is there already; name another file, or give {option('force', True)}",
     )
-    found = (
-        robot if isinstance(robot, Robot) else robot_of(robot, base, flange, convention, ur_model)
-    )
-    text = first_cell(found, "." if target is None else target.parent)
+    found = robot
+    if not isinstance(found, Robot):
+        found = robot_of(Path(found), base, flange, convention, ur_model)
+    text = first_cell(found, Path() if target is None else target.parent)
     if target is not None:
         with atomic_writer(target) as handle:
             handle.write(text)
@@ -100,17 +100,12 @@ def init(
 
 
 def robot_of(
-    path: str | Path,
-    base: str | None = None,
-    flange: str | None = None,
-    convention: Convention = "standard",
-    ur_model: str | None = None,
+    path: Path, base: str | None, flange: str | None, convention: Convention, ur_model: str | None
 ) -> Robot:
     """The robot that a file describes: URDF, MuJoCo model or DH table, by its ending.
 
     Base and flange are those that are found where none are named, so that a cell states them.
     """
-    path = Path(path)
     kind = ENDINGS.get(path.suffix.lower())
     require(path.suffix.lower() != ".xacro", xacro_left(path, f"the ending '{path.suffix}'"))
     if kind is None:
@@ -138,7 +133,7 @@ def robot_of(
     return Robot.from_mjcf(path, base, next(found, arm.flange))
 
 
-def first_cell(robot: Robot, folder: str | Path = ".") -> str:
+def first_cell(robot: Robot, folder: Path) -> str:
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
     arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None
@@ -152,7 +147,7 @@ def first_cell(robot: Robot, folder: str | Path = ".") -> str:
         *(f"# Note: {printable(note)}." for note in notes_of(robot, chain)),
         f"name = {_text(chain.name)}",
         "",
-        *_robot(robot, kind, path, Path(folder)),
+        *_robot(robot, kind, path, folder),
         *_joints(chain),
         REST.format(**_guesses(chain, reach, *_mount(robot, arm)), markers=_markers(reach, arm)),
     ]

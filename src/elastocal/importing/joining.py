@@ -4,7 +4,7 @@ angles, joint values as the model counts them; and which joint values belong to 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -440,16 +440,13 @@ def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
     return None
 
 
-def _loads_apart(points: Records, log: Records) -> list[tuple[str, IntArray, IntArray]]:
-    if "load" not in points.texts:
-        return [("", np.arange(len(points)), np.arange(len(log)))]
-    loads = np.array(points.texts["load"], dtype=object)
-    own = log.texts.get("load")
-    parts = []
-    for load in dict.fromkeys(points.texts["load"]):
-        rows = np.arange(len(log)) if own is None else np.flatnonzero(np.array(own, object) == load)
-        parts.append((load, np.flatnonzero(loads == load), rows))
-    return parts
+def _loads_apart(points: Records, log: Records) -> Iterator[tuple[str, IntArray, IntArray]]:
+    """Each load of the points, and the rows of both under it."""
+    loads = np.array(points.texts.get("load", [""] * len(points)), dtype=object)
+    own = np.array(log.texts.get("load", ()) if "load" in points.texts else (), dtype=object)
+    for load in dict.fromkeys(loads):
+        rows = np.flatnonzero(own == load) if len(own) else np.arange(len(log))
+        yield load, np.flatnonzero(loads == load), rows
 
 
 def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray:
@@ -473,11 +470,10 @@ def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray
 
 
 def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
-    row = np.full(len(points), -1)
+    row, per = np.full(len(points), -1), settings.points_per_pose
     for load, chosen, rows in _loads_apart(points, log):
-        visits = _visits(points, chosen, settings.points_per_pose)
+        visits = _visits(points, chosen, per)
         count = int(visits.max()) + 1
-        per = settings.points_per_pose
         if count != len(rows) or (per is not None and len(chosen) % per):
             of, hint = f" under load {load}" if load else "", ""
             sizes = np.bincount(visits)
@@ -524,9 +520,10 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
         unused -= {int(r) for r in rows if key(names[r]) in used}
     left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))
     spare = tuple(dict.fromkeys(log.shown(r) for r in sorted(unused)))
-    pairs = [(points.texts["configuration"][i], names[row[i]]) for i in range(len(row))]
-    told = next((f"{a} is {b}" for (a, b), r in zip(pairs, row, strict=True) if r >= 0), "")
-    remarks = (f"by the numbers at the ends of the names ({told})",) if key is _number else ()
+    remarks: tuple[str, ...] = ()
+    for i in np.flatnonzero(row >= 0)[:1] if key is _number else ():
+        told = f"{points.texts['configuration'][i]} is {names[row[i]]}"
+        remarks = (f"by the numbers at the ends of the names ({told})",)
     return Joined("name", row, q[row], None, left_out, spare, remarks)
 
 
@@ -572,9 +569,9 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         )
     stop, apart = _nearest(at, clock[first], clock[last])
     good = apart <= settings.tolerance_s
-    unused: tuple[str, ...] = ()
+    unused, remarks = tuple[str, ...](), list[str]()
     if how == "standstill":
-        remarks = [f"{len(first)} standstills of {shortest:g} s or more in {len(log)} rows"]
+        remarks += [f"{len(first)} standstills of {shortest:g} s or more in {len(log)} rows"]
         empty = np.setdiff1d(np.arange(len(first)), stop[good])
         unused = tuple(f"standstill {k + 1} (from line {log.line[order[first[k]]]})" for k in empty)
     else:
@@ -583,10 +580,9 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         soon = [np.abs(clock[k] - at) <= 2 * settings.tolerance_s for k in ends]
         before, after = (np.where(near, k, stop) for near, k in zip(soon, ends, strict=True))
         moving = np.flatnonzero(good & (np.abs(q[after] - q[before]) > still).any(axis=1))
-        remarks = [
-            f"clocks differ by {apart[good].max():.3g} s at most, {np.median(apart[good]):.3g} s "
-            "in the median"
-        ] if good.any() else []  # fmt: skip
+        if good.any():
+            remarks += [f"clocks differ by {apart[good].max():.3g} s at most, "
+                        f"{np.median(apart[good]):.3g} s in the median"]  # fmt: skip
         if len(moving):
             remarks.append(
                 f"WARNING: the arm moved while {len(moving)} points were measured: "

@@ -463,24 +463,18 @@ def resolve(
 
 
 def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> ColumnKey | None:
-    index, names = [], []
+    index = []
     for part in target.parts:
-        if isinstance(part, int):
-            if part > width:
-                if not target.required:
-                    return None
-                raise InputError(
-                    f"{source}: {target.key} is column {part}, but the first reading has {width} "
-                    "columns; correct the number in [source.columns], or the delimiter"
-                )
-            index.append(part - 1)
-            names.append(header[part - 1] if part <= len(header) else f"column {part}")
-            continue
-        sought = _named(part, target)
-        hits = _find(sought, header)
+        sought = [] if isinstance(part, int) else _named(part, target)
+        hits = [*range(width)][part - 1 : part] if isinstance(part, int) else _find(sought, header)
+        if not hits and not target.required:
+            return None
+        require(
+            bool(hits or sought),
+            f"{source}: {target.key} is column {part}, but the first reading has {width} "
+            "columns; correct the number in [source.columns], or the delimiter",
+        )
         if not hits:
-            if not target.required:
-                return None
             raise InputError(
                 f"{source}: no column {' or '.join(map(quoted, sought))} for {target.key}"
                 f"{did_you_mean(sought[0], header)}; the file has {listed(map(quoted, header))}"
@@ -491,7 +485,7 @@ def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -
                 f"{' or '.join(f'{i + 1} ({header[i]})' for i in hits)}; give its number"
             )
         index.append(hits[0])
-        names.append(header[hits[0]])
+    names = (header[i] if i < len(header) else f"column {i + 1}" for i in index)
     return replace(target, index=tuple(index), header=" + ".join(names))
 
 
