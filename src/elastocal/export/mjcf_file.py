@@ -76,7 +76,6 @@ def calibrated_mjcf(
     _passive(body, pieces.springs_at("base"))
     before: list[SpringValue] = []
     for i, (joint, name) in enumerate(zip(chain.joints, motor_names(chain), strict=True)):
-        drive, in_series = _drive(pieces, i)
         offset, T = pieces.offset_motion(i), pieces.placement(i)
         if before:  # on a body of their own: MuJoCo takes six joints at most in one
             body, T = _body(body, f"link{i}_end", T), np.eye(4)
@@ -86,9 +85,13 @@ def calibrated_mjcf(
             _compensate(root, body, T, joint.axis, compensated)
         mass = pieces.masses[i] if pieces.masses else NOTHING
         body = _body(body, f"link{i + 1}", T @ offset, mass, inertias[i] if inertias else None)
+        # Springs across the axis stand between the joint's own and its motion: turns about
+        # different axes do not commute, and so that one is a passive joint too, with a rigid drive.
+        springs = pieces.springs_at(f"joint{i + 1}")
+        own = all(s.axis == tuple(joint.axis) and s.kind == joint.kind for s in springs)
         # Their axes stand before the body was turned by the joint's offset.
-        _passive(body, in_series, np.asarray(np.linalg.inv(offset)))
-        _motor(body, actuators, joint, name, drive)
+        _passive(body, [] if own else springs, np.asarray(np.linalg.inv(offset)))
+        _motor(body, actuators, joint, name, own * sum(s.compliance for s in springs))
         if compensated:
             # The offset turns the frame about the axis before the joint moves, and the model's
             # angle counts it; so the arm's end stands at angle zero of the joint's own frame.
@@ -107,19 +110,6 @@ def calibrated_mjcf(
     root.append(actuators)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _drive(pieces: ExportNumbers, i: int) -> tuple[float, list[SpringValue]]:
-    """Compliance of joint i's drive, and the springs before it.
-
-    Springs across the axis stand between the joint's own and its motion: turns about different
-    axes do not commute, and so that spring is a passive joint as well, with a rigid drive.
-    """
-    axis = tuple(map(float, pieces.chain.joints[i].axis))
-    springs = pieces.springs_at(f"joint{i + 1}")
-    if all(s.axis == axis and s.kind == pieces.chain.joints[i].kind for s in springs):
-        return sum(s.compliance for s in springs), []
-    return 0.0, springs
 
 
 def _body(

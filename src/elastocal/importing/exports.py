@@ -320,34 +320,30 @@ class NumberCells:
         bare = self._bare(cell)
         return bool(NUMBER.fullmatch(bare)) or bare.casefold() in self.missing - {""}
 
-    def value(self, cell: str) -> float | None:
-        """The number, None for a cell without a value.  Raises ValueError for anything else."""
+    def value(self, source: str, line: int, header: str, cell: str) -> float | None:
+        """The number, None for a cell without a value."""
         text = self._bare(cell)
-        if self.decimal == ",":
-            if "." in text:
-                raise ValueError(cell)
+        pointed = self.decimal == "," and "." in text
+        if self.decimal == "," and not pointed:
             text = text.replace(",", ".")
-        if text.casefold() in self.missing:
+        if not pointed and text.casefold() in self.missing:
             return None
-        if not NUMBER.fullmatch(text) or math.isinf(number := float(text)):
-            raise ValueError(cell)
-        return number
-
-    def complaint(self, source: str, number: int, cell: str, header: str) -> InputError:
-        where = f"{source}, line {number}, column {header}"
-        if self.decimal == "," and "." in cell:
-            return InputError(
+        if not pointed and NUMBER.fullmatch(text) and math.isfinite(number := float(text)):
+            return number
+        where = f"{source}, line {line}, column {header}"
+        if pointed:
+            raise InputError(
                 f"{where}: {quoted(cell)} has a decimal point, but the file is read with decimal "
                 "commas; set decimal or thousands in [source.text]"
             )
         if self.decimal == "." and "," in cell and NUMBER.fullmatch(cell.strip()):
-            return InputError(
+            raise InputError(
                 f"{where}: {quoted(cell)} has a comma, but the file is read with decimal points; "
                 'set decimal = "," or thousands = "," in [source.text]'
             )
-        found = first_bad_cell(source, [(number, [self._bare(cell)])], {0: header}, True)
+        found = first_bad_cell(source, [(line, [self._bare(cell)])], {0: header}, True)
         advice = "if such lines are no readings, pass over them with ignore in [source.text]"
-        return InputError(f"{found or f'{where}: {quoted(cell)} is not a number'}; {advice}")
+        raise InputError(f"{found or f'{where}: {quoted(cell)} is not a number'}; {advice}")
 
 
 def seconds_of(
@@ -661,11 +657,7 @@ def _rows(
         for marker, own in columns.items():
             found = []
             for c in (c for c in own if not c.is_text):
-                cell = row[c.index[0]]
-                try:
-                    value = cells.value(cell)
-                except ValueError:
-                    raise cells.complaint(name, number, cell, c.header) from None
+                value = cells.value(name, number, c.header, row[c.index[0]])
                 if value is None:
                     ignored.append((number, f"no value in column {c.header}"))
                     break

@@ -313,23 +313,20 @@ def _check_on_path(joint: FileJoint, where: str) -> None:
         f"{where} is {joint.kind} and lies between base and flange; only {', '.join(MOVING)} and "
         "fixed joints can, choose a base below it",
     )
-    if not joint.moves:
-        return
+    bounded = joint.moves and joint.kind != "continuous"
+    lower, upper = joint.limit or (-math.inf, math.inf)
     require(
-        joint.follows is None,
+        joint.follows is None or not joint.moves,
         f"{where} mimics '{joint.follows}' and lies between base and flange; coupled joints "
         "are not supported there, remove <mimic> or choose another flange",
     )
-    if joint.kind == "continuous":
-        return
-    if joint.limit is None:
-        raise InputError(
-            f'{where} is {joint.kind} without <limit>; add <limit lower="…" upper="…" '
-            'effort="0" velocity="0"/> or make it continuous'
-        )
-    lower, upper = joint.limit
     require(
-        lower < upper,
+        joint.limit is not None or not bounded,
+        f'{where} is {joint.kind} without <limit>; add <limit lower="…" upper="…" '
+        'effort="0" velocity="0"/> or make it continuous',
+    )
+    require(
+        lower < upper or not bounded,
         f"{where}: limits lower={lower:g}, upper={upper:g} leave no room to move; "
         "lower must be below upper (a URDF takes 0 for one left out)",
     )
@@ -429,20 +426,17 @@ def _name(path: Path, tag: Tag, known: Collection[str]) -> str:
 def _mass(where: str, inertial: Tag | None) -> LinkMass:
     if inertial is None:
         return LinkMass(0.0, np.zeros(3))
-    stated = inertial.first("mass")
-    if stated is None or "value" not in stated.stated:
-        raise InputError(
-            f'{where}: <inertial> without <mass value="…">; add it or remove <inertial>'
-        )
-    mass = _number(f"{where}, mass value", stated.get("value"))
+    if (value := inertial.of("mass", "value")) is None:
+        told = f'{where}: <inertial> without <mass value="…">; add it or remove <inertial>'
+        raise InputError(told)
+    mass = _number(f"{where}, mass value", value)
     require(mass >= 0, f"{where}: mass {mass:g} kg is negative; give kg, zero or more")
     return LinkMass(mass, np.array(_vector(where, inertial, "origin", "xyz")))
 
 
 def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint:
-    kind = tag.stated.get("type")
-    if kind is None:
-        raise InputError(f'{where} has no type; write type="{"|".join(JOINT_TYPES)}"')
+    kind = tag.stated.get("type", "")
+    require("type" in tag.stated, f'{where} has no type; write type="{"|".join(JOINT_TYPES)}"')
     require(
         kind in JOINT_TYPES,
         f"{where}: unknown joint type '{kind}'{did_you_mean(kind, JOINT_TYPES)}; "
@@ -479,8 +473,7 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
 
 
 def _end(where: str, joint: Tag, side: str, links: Collection[str]) -> str:
-    end = joint.first(side)
-    name = "" if end is None else end.get("link")
+    name = joint.of(side, "link") or ""
     require(bool(name), f'{where} has no {side} link; add <{side} link="…"/>')
     require(
         name in links,
@@ -493,9 +486,7 @@ def _end(where: str, joint: Tag, side: str, links: Collection[str]) -> str:
 def _vector(
     where: str, above: Tag, name: str, key: str, default: Vector = (0.0, 0.0, 0.0)
 ) -> Vector:
-    tag = above.first(name)
-    text = None if tag is None else tag.stated.get(key)
-    if text is None:
+    if (text := above.of(name, key)) is None:
         return default
     words, what = text.split(), f"{where}, {name} {key}"
     require(len(words) == 3, f"{what}: '{text}' is not three numbers; write e.g. {key}=\"0 0 1\"")

@@ -48,6 +48,11 @@ class Tag:
     def first(self, name: str) -> Tag | None:
         return next(iter(self.all(name)), None)
 
+    def of(self, name: str, key: str) -> str | None:
+        """What the first tag of that name in it states."""
+        inside = self.first(name)
+        return None if inside is None else inside.stated.get(key)
+
     def within(self, name: str) -> bool:
         return self.above is not None and (self.above.name == name or self.above.within(name))
 
