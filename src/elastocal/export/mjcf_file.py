@@ -91,7 +91,7 @@ def calibrated_mjcf(
         own = all(s.axis == tuple(joint.axis) and s.kind == joint.kind for s in springs)
         # Their axes stand before the body was turned by the joint's offset.
         _passive(body, [] if own else springs, np.asarray(np.linalg.inv(offset)))
-        _motor(body, actuators, joint, name, own * sum(s.compliance for s in springs))
+        _motor(body, actuators, joint, name, sum(s.compliance for s in springs if own))
         if compensated:
             # The offset turns the frame about the axis before the joint moves, and the model's
             # angle counts it; so the arm's end stands at angle zero of the joint's own frame.

@@ -369,13 +369,8 @@ LIMITS = {"revolute": ("lower_rad", "upper_rad"), "prismatic": ("lower_m", "uppe
 ZERO = 1e-14  # m or rad; rounding of a product of rotations
 
 
-@dataclass(frozen=True)
-class Line:
-    """One row of the table: `joint` None for a fixed one."""
-
-    name: str
-    joint: Joint | None
-    row: DhRow
+# One row of the table: its name, its joint, None for a fixed one, and its numbers.
+Line = tuple[str, Joint | None, DhRow]
 
 
 def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> list[Line]:
@@ -387,20 +382,16 @@ def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> lis
         for row, own in zip(_decompose(nominal, like)[0], like, strict=True)
     ]
     rows, F = _decompose(pieces.calibrated_chain(), ideal, keep_last=True)
-    first, *joints = [row.near(old) for row, old in zip(rows, ideal, strict=True)]
     end, last = split(F)
-    flange = [end, DhRow(theta=math.atan2(last[1, 0], last[0, 0]), d=float(last[2, 3]))]
-    lines = [
-        Line("base", None, first),
-        *(Line(j.name, j, row) for j, row in zip(nominal.joints, joints, strict=True)),
-        *(Line(f"flange{k}", None, row) for k, row in enumerate(flange, start=1)),
-    ]
+    rest = DhRow(theta=math.atan2(last[1, 0], last[0, 0]), d=float(last[2, 3]))
+    rows = [*(row.near(old) for row, old in zip(rows, ideal, strict=True)), end, rest]
     if convention == "modified":
-        before = [DhRow(), *(line.row for line in lines[:-1])]
-        pairs = zip(lines, before, strict=True)
-        lines = [replace(k, row=replace(b, theta=k.row.theta, d=k.row.d)) for k, b in pairs]
-    lines = [replace(line, row=line.row.near(DhRow(), ZERO)) for line in lines]
-    return [line for line in lines if line.joint is not None or line.row != DhRow()]
+        pairs = zip(rows, [DhRow(), *rows[:-1]], strict=True)
+        rows = [replace(before, theta=row.theta, d=row.d) for row, before in pairs]
+    rows = [row.near(DhRow(), ZERO) for row in rows]
+    names = ["base", *(joint.name for joint in nominal.joints), "flange1", "flange2"]
+    lines = zip(names, [None, *nominal.joints, None, None], rows, strict=True)
+    return [line for line in lines if line[1] is not None or line[2] != DhRow()]
 
 
 FORMULA = {
@@ -416,17 +407,17 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     begin with #.
     """
     found = []
-    for line in lines:
-        cells = {name: repr(value + 0.0)
-                 for name, value in zip(HEADER[2:], astuple(line.row), strict=True)}  # fmt: skip
-        if (joint := line.joint) is not None:
+    for name, joint, row in lines:
+        numbers = zip(HEADER[2:], astuple(row), strict=True)
+        cells = {header: repr(value + 0.0) for header, value in numbers}
+        if joint is not None:
             ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
-            cells |= {name: repr(value + 0.0) for name, value in ends if math.isfinite(value)}
+            cells |= {end: repr(value + 0.0) for end, value in ends if math.isfinite(value)}
         kind = dh.FIXED if joint is None else joint.kind
-        found.append(cells | dict(zip(HEADER[:2], (line.name, kind), strict=True)))
+        found.append(cells | dict(zip(HEADER[:2], (name, kind), strict=True)))
     bounded = {name for cells in found for name in cells}
     limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
-    with_beta = any(line.row.beta for line in lines)
+    with_beta = any(row.beta for _, _, row in lines)
     header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
     return csv_text(header, ([cells.get(name, "") for name in header] for cells in found), comments)
 

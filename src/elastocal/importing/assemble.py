@@ -432,7 +432,7 @@ def import_files(
         raise InputError(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
-    joined = None if log is None else joining.join(where, points, log, table.join)
+    joined = None if log is None else joining.join(points, log, table.join)
     if log is not None and joined is not None:
         points = with_joint_values(points, log, joined)
     made = assemble(where, points, table)

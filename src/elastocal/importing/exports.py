@@ -144,25 +144,14 @@ def bounded(where: str, texts: Sequence[str]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Rows:
-    """A table under `header`: (line number, cells) each; `ignored`: line and reason.
-
-    `header_line` is 0 without a header; `split_at` names the delimiter, or the kind of program.
-    """
+    """A table under `header`: (line number, cells) each; `ignored`: line and reason; `layout`: how
+    its columns stand, or the kind of program."""
 
     header: tuple[str, ...]
     rows: list[Line]
     ignored: list[tuple[int, str]]
-    header_line: int = 0
-    split_at: str = ""
+    layout: str
     comments: tuple[str, ...] = ()
-
-    @property
-    def layout(self) -> str:
-        if self.split_at in ("KRL", "RAPID"):
-            return self.split_at
-        head = f"header in line {self.header_line}" if self.header_line else "no header"
-        mark = {"tab": "tabs", "space": "blanks"}.get(self.split_at, f"{self.split_at!r}")
-        return f"columns split at {mark}, {head}"
 
 
 def table_rows(
@@ -226,8 +215,10 @@ def table_rows(
             f"{listed(map(quoted, cells), 12)}, but not {listed(absent, 8)}: correct "
             "the names, the delimiter or the comments in [source], or give columns by number"
         )
+    at = {"tab": "tabs", "space": "blanks"}.get(delimiter, f"{delimiter!r}")
+    head = f"header in line {header_line}" if header_line else "no header"
     told = tuple(line for _, line in comments)
-    return Rows(header, rows, ignored, header_line, delimiter, told)
+    return Rows(header, rows, ignored, f"columns split at {at}, {head}", told)
 
 
 def _split(source: str, name: str, lines: Sequence[tuple[int, str]]) -> Iterator[Line]:
@@ -425,7 +416,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
     # Axes that no row has (E1 … of a robot without them) are no columns.
     used = [0, *(i for i in range(1, len(axes) + 1) if any(cells[i] for _, cells in rows))]
     rows = [(line, [cells[i] for i in used]) for line, cells in rows]
-    return Rows(tuple(("name", *axes)[i] for i in used), rows, ignored, split_at=kind.upper())
+    return Rows(tuple(("name", *axes)[i] for i in used), rows, ignored, kind.upper())
 
 
 # Offset into the text, name, and the values by axis or why there are none.

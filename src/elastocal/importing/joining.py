@@ -353,7 +353,7 @@ class Joined:
     remarks: tuple[str, ...]
 
 
-def join(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
+def join(points: Records, log: Records, settings: JoinTable) -> Joined:
     """By name where names agree, by time where both have one, else by order, unless stated."""
     named = points.texts.get("configuration")
     both = points.time is not None and log.time is not None
@@ -365,13 +365,13 @@ def join(where: str, points: Records, log: Records, settings: JoinTable) -> Join
         found = (_by_name if how == "name" else _by_order)(points, log, settings)
     strict = bool(found.left_out) and settings.unmatched != "leave_out"
     if strict or (found.row < 0).all():
-        head = f"{len(found.left_out)} of {len(points)} points have" if strict else "no point has"
-        no = "no " if strict else ""
+        some = f"{len(found.left_out)} of {len(points)} points have no joint values"
         lost = f": {listed(found.left_out, SHOWN)}" if strict else ""
         way = ', or set unmatched = "leave_out" in [join]' if strict else ""
         raise InputError(
-            f"{points.files[0]}: {head} {no}joint values in {listed(log.files, 3)} (joined by "
-            f"{how}){lost}; {_ADVICE[how]}{way}{_likely_offset(points, log, settings, how)}"
+            f"{points.source}: {some if strict else 'no point has joint values'} in "
+            f"{listed(log.files, 3)} (joined by {how}){lost}; {_ADVICE[how]}{way}"
+            f"{_likely_offset(points, log, settings, how)}"
         )
     return found
 

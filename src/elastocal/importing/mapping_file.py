@@ -466,7 +466,7 @@ def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -
     index = []
     for part in target.parts:
         sought = [] if isinstance(part, int) else _named(part, target)
-        hits = [*range(width)][part - 1 : part] if isinstance(part, int) else _find(sought, header)
+        hits = [part - 1] * (part <= width) if isinstance(part, int) else _find(sought, header)
         if not hits and not target.required:
             return None
         require(
