@@ -16,7 +16,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from elastocal.above import effects
     from elastocal.cell.arm_description import Robot, Tool, Tracker
     from elastocal.cell.work_cell import Cell, Workspace, read_cell
     from elastocal.compensation.compensate import Compensation
@@ -35,13 +34,12 @@ if TYPE_CHECKING:
     from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
     from elastocal.saving import load
-    from elastocal.verbs import compensate, design, diagnose, identify, simulate
+    from elastocal.verbs import compensate, design, diagnose, effects, identify, simulate
 
 __version__ = "0.1.0"
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
-    "above": "effects",
     "cell.arm_description": "Robot Tool Tracker",
     "cell.work_cell": "Cell Workspace read_cell",
     "compensation.compensate": "Compensation",
@@ -60,7 +58,7 @@ ROOMS = {
     "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",
     "saving": "load",
-    "verbs": "compensate design diagnose identify simulate",
+    "verbs": "compensate design diagnose effects identify simulate",
 }
 
 __all__ = [

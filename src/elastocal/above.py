@@ -49,7 +49,6 @@ globals().update(later("pandas DataFrame"))
 VIEWS = "elastocal.report.renderers"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
-NAMES = "elastocal.report.blocks"
 
 
 class ByValue:
@@ -210,35 +209,6 @@ def write_page(
 def headline(result: object) -> str:
     """The verdict on a calibration, in the words of terminal, page and notebook."""
     return str(import_module(WORDS).judgement(result).headline)
-
-
-def effects(cell: Any = None) -> DataFrame:
-    """The physical effects that can be fitted.
-
-    Args:
-        cell: The cell, its file or model, whose arm decides on places and sizes; None takes the
-            KR 270 of the demo.
-
-    Returns:
-        A row per effect: name, stage, whether the cell has it `on`, what it is, its places, the
-        columns that it needs, and its parameters with unit, nominal value and typical size.
-
-    Raises:
-        InputError: The cell is wrong.
-
-    Examples:
-        >>> found = ec.effects("cell.toml")
-        >>> "joint_compliance" in set(found["name"])
-        True
-    """
-    import pandas as pd
-
-    given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
-    given = getattr(given, "cell", given)
-    if not isinstance(given, str | Path) and type(given).__name__ != "Cell":
-        found = type(cell).__name__
-        raise InputError(f"{option('cell')} takes a Cell or the path of a cell file; found {found}")
-    return pd.DataFrame(import_module(NAMES).effect_entries(given))
 
 
 # Arguments

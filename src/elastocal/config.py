@@ -320,7 +320,8 @@ def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> 
 
 def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     known, found = {one.name: one for one in keys_of(cls)}, {}
-    more = cls.model_config.get("extra") if issubclass(cls, BaseModel) else "forbid"
+    more = getattr(cls, "more", "forbid")  # of a record
+    more = cls.model_config.get("extra") if issubclass(cls, BaseModel) else more
     others = [name for name in data if name not in known]
     for name in others if more == "forbid" else ():
         raise InputError(f"{spot.path}: {_unknown(cls, name, data[name], spot)}")

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
 from elastocal.text import SHOWN
 
 # What is being written ends so, after the number of the process that writes it.
@@ -41,13 +41,10 @@ def check_regular(path: str | Path, what: str) -> int:
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
-        if stat.S_ISDIR(found.st_mode):
-            raise InputError(f"{path}: is a directory; give the {what} itself")
-        if not stat.S_ISREG(found.st_mode):
-            raise InputError(
-                f"{path}: is {_kind(found.st_mode)}, not a regular file; save the {what} to disk "
-                "first"
-            )
+        kind = _kind(found.st_mode)
+        require(kind != FOLDER, f"{path}: is a directory; give the {what} itself")
+        told = f"is {kind}, not a regular file; save the {what} to disk first"
+        require(not kind, f"{path}: {told}")
         return found.st_size
 
 
@@ -103,10 +100,16 @@ def _read_errors(path: str | Path, what: str) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
+FOLDER = "a directory"
+KINDS = {
+    stat.S_IFREG: "", stat.S_IFDIR: FOLDER, stat.S_IFIFO: "a pipe (FIFO)",
+    stat.S_IFSOCK: "a socket",
+}  # fmt: skip
+
+
 def _kind(mode: int) -> str:
-    if stat.S_ISFIFO(mode):
-        return "a pipe (FIFO)"
-    return "a socket" if stat.S_ISSOCK(mode) else "a device"
+    """What is no regular file; empty of one."""
+    return KINDS.get(stat.S_IFMT(mode), "a device")
 
 
 PIECE = 1 << 20  # bytes read at once
@@ -186,22 +189,14 @@ def decoded(
 
 def check_exists(path: Path, key: str, owner: Path) -> Path:
     """`path`, which `key` of the file `owner` names, where it is an existing file."""
-    try:
+    named, kind = f"{owner}: key {key} names {str(path)!r}", "missing"
+    with suppress(OSError, InputError):
         _check_path(path)
-        mode = os.stat(path).st_mode
-    except (OSError, InputError):
-        raise InputError(
-            f"{owner}: key {key} names {str(path)!r}, which does not exist or cannot be reached; "
-            "paths are relative to the cell file"
-        ) from None
-    if stat.S_ISDIR(mode):
-        raise InputError(
-            f"{owner}: key {key} names {str(path)!r}, a directory; name the file itself"
-        )
-    if not stat.S_ISREG(mode):
-        raise InputError(
-            f"{owner}: key {key} names {str(path)!r}, which is {_kind(mode)}; name a regular file"
-        )
+        kind = _kind(os.stat(path).st_mode)
+    told = "does not exist or cannot be reached; paths are relative to the cell file"
+    require(kind != "missing", f"{named}, which {told}")
+    require(kind != FOLDER, f"{named}, a directory; name the file itself")
+    require(not kind, f"{named}, which is {kind}; name a regular file")
     return path
 
 

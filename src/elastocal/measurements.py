@@ -10,24 +10,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from elastocal import tables
-from elastocal.above import DataFrame, Result, checked_arguments, later
+from elastocal.above import DataFrame, Result, checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import NO_UNIT, Columns, Family, Labels, RawTable, column
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-else:
-    globals().update(later("numpy.typing ArrayLike"))
-
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
 REQUIRED: dict[str, tuple[tuple[str, ...], ...]] = {

@@ -13,31 +13,25 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from elastocal.above import checked_arguments, later
+from elastocal.above import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.model.arm import given_force
+from elastocal.model.calibrated import CalibratedArm, Conditions, read_calibrated
+from elastocal.model.manipulator import Model
 from elastocal.tables import PARQUET, csv_text
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
     from elastocal.cell.work_cell import Cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
-    from elastocal.model.calibrated import CalibratedArm
-    from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
-else:
-    globals().update(later(
-        "numpy.typing ArrayLike", "elastocal.model.calibrated CalibratedArm",
-        "elastocal.model.manipulator Model",
-    ))  # fmt: skip
 
 LARGEST_SUMMARY = 200_000_000  # bytes
 MOST_POSES = 1_000_000
@@ -176,7 +170,6 @@ def wish_of(
     no format goes by the file's ending, costs are stated under `load` (3,) N at random `poses`.
     """
     from elastocal.export.export import Wish, format_of
-    from elastocal.model.calibrated import Conditions
 
     chosen = format_of(path, format)
     for name, value, low, high in (
@@ -261,9 +254,6 @@ def load(path: str | Path, cell: str | Path | None = None) -> Model | Calibrated
         >>> ec.load("result.json")
         <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
     """
-    from elastocal.model.calibrated import read_calibrated
-    from elastocal.model.manipulator import Model
-
     path, kind = Path(path), Path(path).suffix.lower()
     if kind == ".toml":
         return Model(path)

@@ -20,6 +20,7 @@ import logging
 import math
 import os
 import queue
+import re
 import shutil
 import signal
 import sys
@@ -147,20 +148,18 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     for name, what in (("study.py", "tasks() and run()"), ("study.toml", "seed and columns")):
         told = f"{folder}: holds no {name}; a study has one, with its {what}"
         require((folder / name).is_file(), told)
-    path = folder / "study.toml"
+    path, whole = folder / "study.toml", folder.resolve()
     stated = checked(StudyFile, read_toml(path, "study file", 1_000_000), path)
     for name in stated.columns:
         require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
-    sources = Sources(folder.resolve(), _contents(folder.resolve(), stated, path), stated.columns)
+    sources = Sources(whole, _contents(whole, stated, path), stated.columns)
     seed = stated.seed if seed is None else seed
     module = load(sources)
     tasks = tuple(_tasks(folder, module, chosen, sources, seed))
-    return Study(
-        folder, stated.title or folder.resolve().name, seed, chosen, sources, module, tasks
-    )
+    return Study(folder, stated.title or whole.name, seed, chosen, sources, module, tasks)
 
 
 def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
@@ -170,9 +169,9 @@ def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
         told = "outside the folder; a cluster cannot reach it, copy it into the folder"
         require(inside, f"{named}, {told}")
         require((folder / name).is_file(), f"{named}, which is no file of the folder")
-    names = {path.relative_to(folder) for path in folder.rglob("*.py")}
-    hidden = {n for n in names if any(p.startswith((".", "__pycache__")) for p in n.parts)}
-    parts = sorted({n.as_posix() for n in names - hidden} | set(stated.files))
+    names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.py")}
+    shown = {name for name in names if not re.search(r"(^|/)(\.|__pycache__)", name)}
+    parts = sorted(shown | set(stated.files))
     return {name: read_bytes(folder / name, "file of a study", MOST_OF_A_FILE) for name in parts}
 
 
@@ -187,11 +186,11 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
             f"{here}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
             f"it has {listed(options) or 'none'}",
         )
-        default, value = defaults[key], None
-        with suppress(tomllib.TOMLDecodeError):
-            value = tomllib.loads(f"value = {written}")["value"]
-        if isinstance(default, str) and not written.startswith(('"', "'")):
-            value = written
+        default, value = defaults[key], written
+        if not isinstance(default, str) or written.startswith(('"', "'")):
+            value = None
+            with suppress(tomllib.TOMLDecodeError):
+                value = tomllib.loads(f"value = {written}")["value"]
         if type(default) is float and type(value) is int:
             value = float(value)
         kind = ASKED_FOR.get(type(default), f"a TOML value like {quoted(default)}")

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
     from elastocal.measurements import Measurements
-    from elastocal.model.calibrated import CalibratedArm, ToolPoint
+    from elastocal.model.calibrated import CalibratedArm
     from elastocal.model.manipulator import Model
     from elastocal.planning.design import DesignOptions, Effort
     from elastocal.planning.plan import Plan
@@ -50,11 +51,10 @@ else:
         "elastocal.identification.result Calibration",
         "elastocal.identification.weighted_problem WeightKind",
         "elastocal.measurements Measurements",
-        "elastocal.model.calibrated CalibratedArm ToolPoint",
+        "elastocal.model.calibrated CalibratedArm",
         "elastocal.model.manipulator Model",
-        "elastocal.planning.design DesignOptions Effort",
+        "elastocal.planning.design Effort",
         "elastocal.planning.plan Plan",
-        "elastocal.units Array",
         "numpy.random Generator",
     ))  # fmt: skip
 
@@ -394,6 +394,7 @@ def simulated(
     import numpy as np
 
     from elastocal.identification.start import check_limits
+    from elastocal.measurements import Measurements
     from elastocal.model.arm import given_force
     from elastocal.simulation import draw_errors, expand_plan, values_from
     from elastocal.simulation import simulate as run
@@ -402,7 +403,12 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats, 1)
-    poses = _poses(made, plan)
+    if isinstance(plan, str | Path):
+        poses = made.read_plan(plan)
+    elif type(plan).__name__ == "Plan":
+        poses = cast("Plan", plan).table()
+    else:
+        poses = plan if isinstance(plan, Measurements) else made.table(plan)
     check_limits(made, poses)
     rng = np.random.default_rng(seed)
     rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
@@ -419,17 +425,6 @@ def simulated(
     read = run(made, rows, x, rng, noise=noise)
     # Up to here rows are lines of the plan, which messages name.
     return replace(read, row=np.arange(len(read)) + 2), x
-
-
-def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:
-    from elastocal.measurements import Measurements
-    from elastocal.planning.plan import Plan
-
-    if isinstance(plan, Plan):
-        return plan.table()
-    if isinstance(plan, Measurements):
-        return plan
-    return model.read_plan(plan) if isinstance(plan, str | Path) else model.table(plan)
 
 
 @checked_arguments
@@ -506,7 +501,6 @@ def identify(
     from elastocal.identification.identify import identify as run
     from elastocal.identification.options import Options
     from elastocal.measurements import read_matrix
-    from elastocal.planning.test_poses import where_used
 
     if isinstance(covariance, str | Path):
         covariance = read_matrix(covariance, "noise covariance")
@@ -543,7 +537,12 @@ def identify(
         prior = prior or known_prior
     if prior is not None or constraints is not None:
         options = replace(options, constraints=constraints, prior=prior)
-    return run(made, table, options, kept_back, tell, where_used(made))
+    used = None
+    if made.cell.design.states_test_poses:
+        from elastocal.planning.test_poses import test_poses
+
+        used = test_poses(made.cell, made.chain)
+    return run(made, table, options, kept_back, tell, used)
 
 
 @checked_arguments
@@ -658,7 +657,7 @@ def compensate(
 
     from elastocal.compensation.compensate import compensate as run
     from elastocal.model.arm import given_force
-    from elastocal.model.calibrated import given_arm
+    from elastocal.model.calibrated import given_arm, tool_point
 
     arm = given_arm("arm", arm)
     force = given_force(load)
@@ -669,7 +668,11 @@ def compensate(
         start is None or (start.shape == (chain.n_joints,) and bool(np.isfinite(start).all())),
         f"{option('near')} takes {chain.n_joints} joints in rad or m; found {near!r}",
     )
-    where = _tool_point(arm.model.cell, point)
+    if point is not None and not isinstance(point, str):
+        place = np.asarray(point, dtype=float)
+        require(place.shape == (3,), f"{option('point')} takes a marker or three numbers in m")
+        point = ",".join(repr(float(v)) for v in place)
+    where = tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)
     return run(arm, wanted, where, start, cast(int, seed), progress or _silent)
 
@@ -679,18 +682,6 @@ def check_frame(frame: str) -> None:
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
     require(frame in FRAMES, told)
-
-
-def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
-    import numpy as np
-
-    from elastocal.model.calibrated import tool_point
-
-    if point is None or isinstance(point, str):
-        return tool_point(cell, point)
-    place = np.asarray(point, dtype=float)
-    require(place.shape == (3,), f"{option('point')} takes a marker or three numbers in m")
-    return tool_point(cell, ",".join(repr(float(v)) for v in place))
 
 
 def _targets(
@@ -725,6 +716,32 @@ def _targets(
     return targets_at("targets", found, None, frame, force)
 
 
+def effects(cell: Any = None) -> DataFrame:
+    """The physical effects that can be fitted.
+
+    Args:
+        cell: The cell, its file or model, whose arm decides on places and sizes; None takes the
+            KR 270 of the demo.
+
+    Returns:
+        A row per effect: name, stage, whether the cell has it `on`, what it is, its places, the
+        columns that it needs, and its parameters with unit, nominal value and typical size.
+
+    Raises:
+        InputError: The cell is wrong.
+
+    Examples:
+        >>> found = ec.effects("cell.toml")
+        >>> "joint_compliance" in set(found["name"])
+        True
+    """
+    import pandas as pd
+
+    given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
+    entries = import_module("elastocal.report.blocks").effect_entries  # it lies above
+    return pd.DataFrame(entries(_checked_cell(getattr(given, "cell", given), "cell")))
+
+
 # What the verbs take
 
 
@@ -738,13 +755,11 @@ def _model(given: AnyModel) -> Model:
     return given if isinstance(given, Model) else Model(_checked_cell(given))
 
 
-def _checked_cell(given: Any) -> Cell | str | Path:
+def _checked_cell(given: Any, name: str = "model") -> Cell | str | Path:
     if isinstance(given, str | Path) or type(given).__name__ == "Cell":
         return given
-    raise InputError(
-        f"{option('model')} takes a Model, a Cell or the path of a cell file; found "
-        f"{type(given).__name__}"
-    )
+    told = "takes a Model, a Cell or the path of a cell file"
+    raise InputError(f"{option(name)} {told}; found {type(given).__name__}")
 
 
 def _table(name: str, model: Model, given: Table) -> Measurements:

@@ -41,7 +41,7 @@ from elastocal.errors import (
     options_as_flags,
     require,
 )
-from elastocal.files import check_ending
+from elastocal.files import check_ending, together
 from elastocal.screen import complain, interrupts, progress_line, safe_console, say
 from elastocal.text import json_text
 
@@ -273,6 +273,13 @@ class Run:
             require(real not in taken, told)
             taken.add(real)
         return given
+
+    def write(self, *asked: tuple[Path | None, Callable[[Path], Any]]) -> None:
+        """The outputs asked for, each by the function beside it: all of them or none."""
+        with together(self.written):
+            for path, write in asked:
+                if path is not None:
+                    write(path)
 
     def progress(self) -> AbstractContextManager[Callable[[str], None]]:
         """Tells on stderr what is done, where the user wants to know."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -27,8 +28,8 @@ from elastocal.cli.app import (
     whole_numbers,
 )
 from elastocal.errors import InputError, require
-from elastocal.screen import interrupt_check, safe_console, say
-from elastocal.text import json_text, listed
+from elastocal.screen import interrupt_check, say
+from elastocal.text import listed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -144,14 +145,10 @@ CURVE = "--curve takes numbers of poses, as in 10,15,20"
 
 
 def _target(text: str) -> float:
-    try:
+    target = math.nan
+    with suppress(ValueError):
         target = float(text)
-    except ValueError:
-        target = math.nan
-    require(
-        math.isfinite(target) and target > 0,
-        f"--target takes a positive number of µm; found {text}",
-    )
+    require(0 < target < math.inf, f"--target takes a positive number of µm; found {text}")
     return target * 1e-6
 
 
@@ -283,13 +280,11 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
     from elastocal.planning.plan import load_name
 
     loads = plan.forces[(plan.forces != 0).any(axis=1)]
-    carried, hung = "", ""
+    carried, hung = "", "each row under its force, " if len(loads) else ""
     if len(loads) and plan.stated_forces is None:  # else the plan's rows state their forces
         names = listed(load_name(force) for force in plan.forces)
         hung = f"with the loads of its note_load ({names}), "
         carried = f" --load {' '.join(f'{value:g}' for value in loads[0])}"
-    elif len(loads):
-        hung = "each row under its force, "
     added = "" if augment is None else f" (add them to {augment})"
     return (
         f"Next: measure {output} in its order, {hung}a row with x_mm, y_mm, z_mm for each "
@@ -366,7 +361,6 @@ def simulate(
         truth: Write the true values used, as JSON {name: value}.
         no_noise: Exact readings.
     """
-    from elastocal.files import together
     from elastocal.model.manipulator import Model
     from elastocal.saving import WRITERS, write_json
 
@@ -392,10 +386,7 @@ def simulate(
             error=True,
         )
     named = dict(zip(model.names, x.tolist(), strict=True))
-    with together(run.written):
-        table.save(output)
-        if truth is not None:
-            write_json(truth, named)
+    run.write((output, table.save), (truth, lambda path: write_json(path, named)))
     summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
     told = f"wrote {len(table)} readings of {len(poses)} poses to {output}"
     run.answer(
@@ -417,18 +408,18 @@ def demo(
     Args:
         folder: Folder for the example's files, data, result and report.
     """
-    from elastocal.cli.using import write_results
     from elastocal.demo.example import run_demo
-    from elastocal.report.renderers import print_report
+    from elastocal.files import together
+    from elastocal.report.renderers import print_report, write_page
 
+    result, report = folder / "result.json", folder / "report.html"
     with run.progress() as progress:
         done = run_demo(folder, seed, progress)
-        report = folder / "report.html"
         inputs = [done.cell, done.plan, done.data]
-        write_results(
-            done.result, folder / "result.json", report, None, inputs, seed, done.truth,
-            done.published,
-        )  # fmt: skip
+        with together([result, report]):
+            done.result.save(result)
+            write_page(done.result, report, inputs, repeated(), seed, truth=done.truth,
+                       published=done.published)  # fmt: skip
     if run.answer(
         lambda: done.result.to_json() | {"truth": done.truth},
         lambda screen: print_report(screen, done.result, details=False, truth=done.truth),
@@ -478,6 +469,7 @@ def import_(
         angle_unit: Unit of angles where a file does not say: deg, rad, gon.
     """
     from elastocal.cell.work_cell import read_cell
+    from elastocal.files import atomic_write_text
     from elastocal.importing.assemble import import_files
     from elastocal.importing.exports import likely_presets
     from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping, with_units
@@ -488,14 +480,10 @@ def import_(
         say(preset_text(show_preset), end="")
         return
     paths = list(files or ())
-    require(
-        bool(paths),
-        "the argument FILES is missing: the tracker's export, and the log of the joints",
-    )
-    require(
-        output is not None or preview or run.json,
-        "import needs -o data.csv to write to, or --preview to only look",
-    )
+    told = "the argument FILES is missing: the tracker's export, and the log of the joints"
+    require(bool(paths), told)
+    told = "import needs -o data.csv to write to, or --preview to only look"
+    require(output is not None or preview or run.json, told)
     if mapping is None and not preset:
         likely = {path: likely_presets(path) for path in paths if path.is_file()}
         read_by = [
@@ -509,29 +497,19 @@ def import_(
     known = None if cell is None else read_cell(cell)
     run.reads(cell=known)
     found = import_files(paths, read, known, str(output or "the table"))
-    if run.json:
-        say(json_text(_understood(found, output)))
-    elif preview:
-        screen = safe_console()
-        print_blocks(screen, import_blocks(found, screen.width))
+    if preview or run.json:
+        run.answer(
+            lambda: _understood(found, output),
+            lambda screen: print_blocks(screen, import_blocks(found, screen.width)), files=False,
+        )  # fmt: skip
     else:
-        for warning in found.warnings:
-            say(f"Warning: {warning}", error=True)
-        for line in left_out(found):
+        for line in (*(f"Warning: {warning}" for warning in found.warnings), *left_out(found)):
             say(line, error=True)
-    if found.refused:
-        raise InputError(found.refused)
-    if output is None:
-        return
-    from elastocal.files import atomic_write_text
-
-    atomic_write_text(output, found.text)
-    if not run.json:
-        table = found.table
-        say(
-            f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
-            f"{output}"
-        )
+    require(not found.refused, found.refused)
+    run.write((output, partial(atomic_write_text, text=found.text)))
+    if output is not None and not run.json:
+        n, configurations = len(found.table), len(found.table.configuration_labels)
+        say(f"wrote {n} readings of {configurations} configurations to {output}")
 
 
 def _understood(found: Imported, output: Path | None) -> dict[str, Any]:

@@ -38,9 +38,7 @@ from elastocal.text import listed
 if TYPE_CHECKING:
     from elastocal.compensation.correction_table import CorrectionGrid, CorrectionTable
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.identification.result import Calibration
     from elastocal.model.calibrated import CalibratedArm
-    from elastocal.report.identification_view import Published, Truth
     from elastocal.studies import Ending
     from elastocal.units import Array
 
@@ -75,7 +73,8 @@ def identify(
         details: Also method, noise, residuals, intervals, all lists.
     """
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.renderers import print_report
+    from elastocal.report.renderers import print_report, write_page
+    from elastocal.saving import save_published, save_residuals
 
     run.writes(
         (output, ".json"), (report, PAGES), (residuals, ".csv"), (certificate, f"{PAGES} .xml")
@@ -86,8 +85,12 @@ def identify(
     inputs = run.reads(cell, data, *files, cell=known)
     with run.progress() as progress:
         result = verbs.identify(known, data, **asked, progress=progress)
-        write_results(
-            result, output, report, residuals, inputs, asked["seed"], certificate=certificate
+        page = partial(write_page, result, inputs=inputs, command=repeated(), seed=asked["seed"])
+        run.write(
+            (output, partial(save_published, result)),
+            (residuals, partial(save_residuals, result)),
+            (report, page),
+            (certificate, partial(page, certificate=True)),
         )
     run.answer(result.to_json, lambda screen: print_report(screen, result, details))
     if unmet := result.unmet(**limits):
@@ -113,31 +116,6 @@ def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float
             )
         limits[name] = value * 1e-6
     return limits
-
-
-def write_results(
-    result: Calibration, output: Path | None, report: Path | None, residuals: Path | None,
-    inputs: list[Path], seed: int, truth: Truth | None = None, published: Published | None = None,
-    certificate: Path | None = None,
-) -> None:  # fmt: skip
-    """Write what was asked for, all of it or nothing.
-
-    `inputs` are named with their hashes in the report, where `truth` and `published` (SI) stand
-    beside the estimates.
-    """
-    from elastocal.files import together
-    from elastocal.report.renderers import write_page
-    from elastocal.saving import save_residuals, write_json
-
-    with together(p for p in (output, residuals, report, certificate) if p is not None):
-        if output is not None:
-            write_json(output, result.to_json())
-        if residuals is not None:
-            save_residuals(result, residuals)
-        if report is not None:
-            write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
-        if certificate is not None:
-            write_page(result, certificate, inputs, repeated(), seed, certificate=True)
 
 
 # diagnose: why the real arm still differs from the model.
@@ -171,7 +149,6 @@ def diagnose(
         cell_out: Write the cell (TOML) with the effects found added.
     """
     from elastocal.diagnosis.diagnosis import publish
-    from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.renderers import print_report, write_page
     from elastocal.saving import save_diagnosis
@@ -188,18 +165,13 @@ def diagnose(
         found = verbs.diagnose(known, data, **asked, extra_poses=most, progress=progress)
         model = found.model
         assert model is not None  # `diagnose` states it
-        told = []
-        with together(run.written):
-            if output is not None:
-                save_diagnosis(found, output)
-                told.append(f"wrote {output}")
-            if report is not None:
-                write_page(found, report, [cell, data], repeated(), asked["seed"])
-                told.append(f"wrote {report}")
-            if plan is not None:
-                told.append(_write_extra_poses(plan, found, model.chain.kinds))
-            if cell_out is not None:
-                told += _write_extended(cell_out, found, data, run.plugins)
+        told = [f"wrote {path}" for path in (output, report) if path is not None]
+        run.write(
+            (output, partial(save_diagnosis, found)),
+            (report, lambda path: write_page(found, path, [cell, data], repeated(), asked["seed"])),
+            (plan, lambda path: told.append(_write_extra_poses(path, found, model.chain.kinds))),
+            (cell_out, lambda path: told.extend(_write_extended(path, found, data, run.plugins))),
+        )
     if run.answer(
         lambda: publish(found, model, found.data),
         lambda screen: print_report(screen, found),
@@ -277,7 +249,6 @@ def next_command(
         jobs: Processes; -1 for all cores.
     """
     from elastocal.diagnosis.next_poses import next_poses
-    from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan
@@ -294,8 +265,7 @@ def next_command(
             progress=progress,
         )  # fmt: skip
         if found.plan is not None:
-            with together(run.written):
-                save_plan(found.plan, output, repeated())
+            run.write((output, partial(save_plan, found.plan, command=repeated())))
     show = partial(print_report, result=found)
     if run.answer(found.to_json, show, files=found.plan is not None) and found.plan is None:
         say(f"{output} not written")
@@ -333,10 +303,9 @@ def compare(
         poses: Random poses.
     """
     from elastocal.diagnosis.changes import compare as compared
-    from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.renderers import print_report
-    from elastocal.saving import write_json
+    from elastocal.report.renderers import print_report, write_page
+    from elastocal.saving import save_published
 
     if old_order := new is None:
         cell, old, new = _in_old_order(cell, old, cell_of_old)
@@ -350,11 +319,10 @@ def compare(
         run.reads(cell=arms[0].model.cell)
         progress("comparing")
         found = compared(*arms, load=load, level=level, poses=poses, seed=seed)
-    with together(run.written):
-        if output is not None:
-            write_json(output, found.to_json())
-        if report is not None:
-            found.report(report, inputs=inputs, command=repeated(), seed=seed)
+    run.write(
+        (output, partial(save_published, found)),
+        (report, lambda path: write_page(found, path, inputs, repeated(), seed)),
+    )
     run.answer(found.to_json, lambda screen: print_report(screen, found))
 
 
@@ -417,7 +385,7 @@ def compensate(
         one_target,
         summary,
     )
-    from elastocal.files import atomic_write_text, together
+    from elastocal.files import atomic_write_text
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
     from elastocal.report.renderers import print_blocks
@@ -428,7 +396,7 @@ def compensate(
     force = given_force(asked.get("load"))
     _check(targets, target, output, table, (grid, box, rotation))
     run.writes((output, ".csv"), (table, ".csv"))
-    content, texts = {}, {}
+    content, commands, corrections = {}, "", ""
     with run.progress() as progress:
         progress("reading")
         arm = read_calibrated(cell, result, run.plugins)
@@ -442,21 +410,21 @@ def compensate(
                 check_reached(found)
             kinds = found.chain.kinds
             content["commands"] = summary(found, kinds, commands=output is None)
-            if output is not None:
-                texts[output] = commands_csv(found, kinds)
+            commands = commands_csv(found, kinds)
         if table is not None and lines is not None:
             from elastocal.compensation.correction_table import correction_table
             from elastocal.model.calibrated import tool_point
 
             where = tool_point(arm.model.cell, asked.get("point"))
-            corrections = correction_table(arm, lines, where, force, start, asked["seed"], progress)
-            content["table"], texts[table] = _table(corrections, arm, partial)
+            made = correction_table(arm, lines, where, force, start, asked["seed"], progress)
+            content["table"], corrections = _table(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
-        with together(run.written):
-            for path, text in texts.items():
-                atomic_write_text(path, text)
+        run.write(
+            (output, lambda path: atomic_write_text(path, commands)),
+            (table, lambda path: atomic_write_text(path, corrections)),
+        )
     shown = run.answer(
-        lambda: content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"},
+        lambda: content.pop("commands", {}) | content,
         lambda screen: print_blocks(screen, compensation_blocks(content)),
     )
     if shown and output is not None:
@@ -471,23 +439,14 @@ def _check(
     of_a_table: tuple[str, str | None, str | None],
 ) -> None:  # fmt: skip
     """Raises InputError for options that do not go together."""
-    _, box, rotation = of_a_table
-    require(
-        targets is not None or target is not None or table is not None,
-        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
-    )
-    require(
-        targets is None or target is None,
-        f"both {targets} and --target are given; drop one of them",
-    )
-    require(
-        output is None or targets is not None or target is not None,
-        "-o writes the commands of targets; name a table of them, or give --target",
-    )
-    require(
-        table is not None or of_a_table == ("5", None, None),
-        "--grid, --box and --rotation belong to a correction table; give --table FILE",
-    )
+    (_, box, rotation), given = of_a_table, (targets is not None) + (target is not None)
+    need = "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE"
+    require(given > 0 or table is not None, need)
+    require(given < 2, f"both {targets} and --target are given; drop one of them")
+    need = "-o writes the commands of targets; name a table of them, or give --target"
+    require(given > 0 or output is None, need)
+    need = "--grid, --box and --rotation belong to a correction table; give --table FILE"
+    require(table is not None or of_a_table == ("5", None, None), need)
     require(rotation is None or box is not None, "--rotation belongs to --box")
 
 
@@ -722,10 +681,8 @@ def study(
 
 def _told(ending: Ending, results: Path) -> str:
     text = f"{ending.done} of {ending.total} tasks done"
-    if ending.before:
-        text += f" ({ending.before} were there)"
-    if ending.failed:
-        text += f", {ending.failed} failed"
+    text += f" ({ending.before} were there)" if ending.before else ""
+    text += f", {ending.failed} failed" if ending.failed else ""
     text += f"; results in {results}"
     if ending.failed:
         from elastocal.studies import read_results

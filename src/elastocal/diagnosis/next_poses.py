@@ -36,7 +36,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import check_levels
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Gain, Plan
-from elastocal.planning.test_poses import where_used
+from elastocal.planning.test_poses import test_poses
 from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.
@@ -200,7 +200,9 @@ def _error_now(fit: Calibration, unknown: float) -> PredictedError | None:
     """
     model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
-    poses = where_used(model) or over_the_workspace(model.cell, model, observed.table)
+    cell, table = model.cell, observed.table
+    stated = cell.design.states_test_poses
+    poses = test_poses(cell, model.chain) if stated else over_the_workspace(cell, model, table)
     return predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -16,7 +16,7 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.above import Saved, checked_arguments
 from elastocal.cell.work_cell import Cell
-from elastocal.config import Table, checked, is_number, key, required
+from elastocal.config import Many, Table, checked, is_number, key, keyed, record, required
 from elastocal.errors import InputError, option, require
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
@@ -38,7 +38,28 @@ ANEW = "write the result anew with identify"
 MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
 
 
-@dataclass(frozen=True)
+def _array(*columns: int) -> PlainValidator:
+    """The validator of a table of numbers, an array (n, columns) or of whatever shape without
+    them; null is NaN where the shape is free."""
+
+    def check(value: object) -> Array:
+        try:
+            found = np.array(value, dtype=float)
+            found = found.reshape(len(found), *columns) if columns else found
+        except (TypeError, ValueError, OverflowError):
+            found = np.full(1, np.inf)
+        if np.isinf(found).any() or (columns and np.isnan(found).any()):
+            raise PydanticCustomError("numbers", "numbers")
+        return found
+
+    return PlainValidator(check)
+
+
+Matrix = Annotated[Array, _array()]
+Triples = Annotated[Array, _array(3)]
+
+
+@record
 class OpenParameters:
     """The parameters D that the data left open, by `names` (D,), and what they stand for.
 
@@ -49,10 +70,11 @@ class OpenParameters:
     that has one parameter too many, and nothing needs to be done.
     """
 
-    names: tuple[str, ...]
-    mixing: Array
-    typical: Array
-    redundant: tuple[str, ...] = ()
+    more: ClassVar[str] = "ignore"
+    names: Many[str] = keyed("a list of names", required=True)
+    mixing: Matrix = keyed("shares, a row for each parameter of covariance_of", required=True)
+    typical: Matrix = keyed("a number for each of its names", required=True)
+    redundant: Many[str] = keyed("a list of names", default=())
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready; numbers in SI units."""
@@ -62,13 +84,14 @@ class OpenParameters:
         }  # fmt: skip
 
 
-@dataclass(frozen=True)
+@record
 class ShownPoses:
     """How sure a fit is where it was measured: of each of `configurations` the standard deviation
     in m of the place predicted from the others is `most` at most."""
 
-    most: float
-    configurations: int
+    more: ClassVar[str] = "ignore"
+    most: float = keyed("a number", "largest_std_um", required=True)
+    configurations: int = keyed("a whole number", required=True)
 
     def chance(self, beyond: int, n: int) -> float:
         """Probability that so many of n poses or more are less sure than all that were measured,
@@ -80,13 +103,14 @@ class ShownPoses:
         return {"largest_std_um": self.most * 1e6, "configurations": self.configurations}
 
 
-@dataclass(frozen=True)
+@record
 class MeasuredVisits:
     """Where an arm was measured: commanded joints `q` (k, joints) in rad or m, and the `force`
     (k, 3) N at each."""
 
-    q: Array
-    force: Array
+    more: ClassVar[str] = "ignore"
+    q: Matrix = keyed("joints, a row for each visit", required=True)
+    force: Triples = keyed("forces, three numbers for each visit", "force_N", required=True)
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready; joints to a µrad or µm, forces to a mN."""
@@ -268,7 +292,8 @@ def read_calibrated(
         f"{result_path}: covariance of {stated.covariance.size} numbers for {n} names in "
         f"covariance_of; {ANEW}",
     )
-    entries = {entry["name"]: entry for entry in raw}
+    entries, visits = {entry["name"]: entry for entry in raw}, stated.measured_visits
+    shape = None if visits is None else (len(visits.force), model.chain.n_joints)
     return CalibratedArm(
         model,
         np.array([held[name] for name in model.names]),
@@ -279,30 +304,11 @@ def read_calibrated(
         _left_open(stated.open, model, determined, result_path),
         float(lacking if is_number(lacking) else 0.0) * 1e-6,
         stated.loads_N.reshape(-1, 3),
-        _shown(stated.measured_poses),
-        _visits(stated.measured_visits, model.chain.n_joints),
+        stated.measured_poses,
+        visits if visits is not None and len(visits.q) and visits.q.shape == shape else None,
     )
 
 
-def _array(*columns: int) -> PlainValidator:
-    """The validator of a table of numbers, an array (n, columns) or of whatever shape without
-    them; null is NaN where the shape is free."""
-
-    def check(value: object) -> Array:
-        try:
-            found = np.array(value, dtype=float)
-            found = found.reshape(len(found), *columns) if columns else found
-        except (TypeError, ValueError, OverflowError):
-            found = np.full(1, np.inf)
-        if np.isinf(found).any() or (columns and np.isnan(found).any()):
-            raise PydanticCustomError("numbers", "numbers")
-        return found
-
-    return PlainValidator(check)
-
-
-Matrix = Annotated[Array, _array()]
-Triples = Annotated[Array, _array(3)]
 NONE = np.zeros(0)
 
 
@@ -319,33 +325,16 @@ class _Entry(_Stated):
     combined_with: list[str] | None = key("a list of names")
 
 
-class _Open(_Stated):
-    names: list[str] = required("a list of names")
-    mixing: Matrix = required("shares, a row for each parameter of covariance_of")
-    typical: Matrix = required("a number for each of its names")
-    redundant: list[str] = key("a list of names", [])
-
-
-class _Shown(_Stated):
-    largest_std_um: float | None = key("a number")
-    configurations: int = required("a whole number")
-
-
-class _Visits(_Stated):
-    q: Matrix = required("joints, a row for each visit")
-    force_N: Triples = required("forces, three numbers for each visit")
-
-
 class _Result(_Stated):
     parameters: list[_Entry] = required("a list of parameters")
     nominal_flange: Annotated[Array, _array(4)] | None = key("3 rows of 4 numbers")
     covariance_of: list[str] = key("a list of names", [])
     covariance: Matrix = key("a square table of finite numbers", NONE)
-    open: _Open | None = key("a table of the parameters left open")
+    open: OpenParameters | None = key("a table of the parameters left open")
     predicted_new_poses_um: dict[str, Any] | None = key("a table")
     loads_N: Triples = key("a list of forces, three numbers each", NONE)
-    measured_poses: _Shown | None = key("a table")
-    measured_visits: _Visits | None = key("a table")
+    measured_poses: ShownPoses | None = key("a table")
+    measured_visits: MeasuredVisits | None = key("a table")
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:
@@ -390,7 +379,7 @@ def _read_result(path: Path) -> tuple[list[dict[str, Any]], _Result]:
 
 
 def _left_open(
-    stated: _Open | None, model: Model, determined: tuple[str, ...], path: str | Path
+    stated: OpenParameters | None, model: Model, determined: tuple[str, ...], path: str | Path
 ) -> OpenParameters:
     """What the result says of the parameters that the data left open; where it says nothing, each
     that was not determined counts by itself."""
@@ -407,22 +396,8 @@ def _left_open(
         f"{path}: open does not say names, typical sizes and shares of the parameters left open; "
         f"{ANEW}",
     )
-    return OpenParameters(
-        tuple(stated.names), stated.mixing.reshape(shape), stated.typical.ravel(),
-        tuple(stated.redundant),
-    )  # fmt: skip
-
-
-def _shown(stated: _Shown | None) -> ShownPoses | None:
-    if stated is None or stated.largest_std_um is None or stated.configurations < 1:
-        return None
-    return ShownPoses(stated.largest_std_um * 1e-6, stated.configurations)
-
-
-def _visits(stated: _Visits | None, n_joints: int) -> MeasuredVisits | None:
-    if stated is None or not len(stated.q) or stated.q.shape != (len(stated.force_N), n_joints):
-        return None
-    return MeasuredVisits(stated.q, stated.force_N)
+    mixing, typical = stated.mixing.reshape(shape), stated.typical.ravel()
+    return replace(stated, mixing=mixing, typical=typical)
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

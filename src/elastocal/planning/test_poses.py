@@ -187,11 +187,6 @@ def test_poses(
     )
 
 
-def where_used(model: Model) -> NewPoses | None:
-    stated = model.cell.design.states_test_poses
-    return test_poses(model.cell, model.chain) if stated else None
-
-
 def everywhere(
     cell: Cell, chain: Chain, feasibility: Feasibility | None = None, seed: int = 0
 ) -> TargetPoses | None:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell, HalfSpace, Solid
 from elastocal.errors import ElastocalError, require
@@ -368,14 +369,7 @@ MOST_NUMBERED = 80  # beyond that numbers hide each other
 LONGEST_NAME = 24
 SIGNS = ("o", "s", "^", "D", "v", "P")  # of groups, which differ in more than colour
 # Rows: to the right and upwards on paper, and towards the reader.
-_TURN, _TILT = np.radians(-50.0), np.radians(22.0)
-OBLIQUE = np.array(
-    [
-        [-np.sin(_TURN), np.cos(_TURN), 0.0],
-        [-np.sin(_TILT) * np.cos(_TURN), -np.sin(_TILT) * np.sin(_TURN), np.cos(_TILT)],
-        [np.cos(_TILT) * np.cos(_TURN), np.cos(_TILT) * np.sin(_TURN), np.sin(_TILT)],
-    ]
-)
+OBLIQUE = Rotation.from_euler("zy", [50.0, 22.0], degrees=True).as_matrix()[[1, 2, 0]]
 TOP = np.eye(3)
 SIDE = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 

@@ -1,7 +1,7 @@
 """What a result says as a list of blocks, made once and shown by terminal, page and notebook;
 numbers, names and effects as text.
 
-Each kind of result has a function that gives its `Report`.  Texts are plain: a renderer escapes
+Each kind of result has a function that gives its blocks.  Texts are plain: a renderer escapes
 them, typesets minus signs and decides on the layout.  A terminal shows what stands open, and with
 details the folds that are `printed`; it leaves out figures.  Numbers have the units people think in
 and the digits that are known.
@@ -132,21 +132,6 @@ class Fold:
 
 
 Block = ShownVerdict | KeyFigures | Heading | Sentence | Lines | ShownTable | Figure | Fold
-
-
-@dataclass(frozen=True)
-class Report:
-    """A result as blocks: `kind` of page and what its `title` names; what the run depended on.
-
-    `filed`: the page is to be printed and kept, so that nothing is folded.
-    """
-
-    kind: str
-    title: str
-    blocks: Iterable[Block]
-    backend: str = ""
-    seed: int | None = None
-    filed: bool = False
 
 
 def unfolded(blocks: Iterable[Block], which: Callable[[Fold], bool]) -> Iterator[Block]:

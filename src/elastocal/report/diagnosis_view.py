@@ -48,15 +48,7 @@ FAMILIES = {
 }
 
 
-def diagnosis_report(d: Diagnosis) -> say.Report:
-    title, backend = printable(d.data), ""
-    if d.model is not None:
-        title = say.title_of(d.model.chain.name, d.model.cell.name)
-        backend = d.model.backend_report()
-    return say.Report("Diagnosis", title, _blocks(d), backend)
-
-
-def _blocks(d: Diagnosis) -> Iterator[say.Block]:
+def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     headline, floor = say.length(d.gap.calibrated), say.length(d.gap.noise_floor)
     figures = [("calibrated arm, held out", headline)]
     if d.effects:

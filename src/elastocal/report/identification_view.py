@@ -59,18 +59,10 @@ READINGS = {
 }
 
 
-def calibration_report(
+def calibration_blocks(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
-) -> say.Report:
-    """An identification; `truth` and `published` (SI) stand beside the estimates."""
-    found = _blocks(result, truth, published)
-    title = say.title_of(result.model.chain.name, result.model.cell.name)
-    return say.Report("Identification", title, found, result.model.backend_report())
-
-
-def _blocks(
-    result: Calibration, truth: Truth | None, published: Published | None
 ) -> Iterator[say.Block]:
+    """An identification; `truth` and `published` (SI) stand beside the estimates."""
     budget = cache(lambda: gap_budget(result))
     yield say.Fold("", lambda: [_key(result, budget())])
     verdict = judgement(result)

@@ -19,14 +19,6 @@ if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
 
 
-def plan_report(plan: Plan) -> say.Report:
-    model = plan.model
-    title = say.title_of(model.chain.name, model.cell.name)
-    return say.Report(
-        "Measurement plan", title, plan_blocks(plan), model.backend_report(), plan.seed
-    )
-
-
 def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     def curve() -> Iterator[say.Block]:
         from elastocal.report.figures import plan_curve
@@ -62,14 +54,11 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     yield say.Fold("What the plan is worth", lambda: [say.Lines([*plan_lines(plan)])], printed=True)
 
 
-def next_report(found: NextPoses) -> say.Report:
-    def blocks() -> Iterator[say.Block]:
-        yield say.Lines([*next_lines(found)])
-        yield say.Fold("", lambda: [_gain(found)], figures=("gain",))
-        if found.plan is not None:
-            yield from plan_blocks(found.plan)
-
-    return say.Report("Next poses", printable(found.source), blocks())
+def next_blocks(found: NextPoses) -> Iterator[say.Block]:
+    yield say.Lines([*next_lines(found)])
+    yield say.Fold("", lambda: [_gain(found)], figures=("gain",))
+    if found.plan is not None:
+        yield from plan_blocks(found.plan)
 
 
 def _key(plan: Plan) -> say.KeyFigures:

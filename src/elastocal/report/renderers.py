@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
+import math
 import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -32,6 +33,7 @@ from rich.text import Text
 from elastocal import __version__
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, check_ending, open_input
+from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
 from elastocal.screen import safe_console, shown
@@ -42,28 +44,30 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from elastocal.compensation.compensate import Compensation
-    from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
 
 
-def report_of(result: object, certificate: bool = False, **told: Any) -> say.Report:
+def blocks_of(result: object, certificate: bool = False, **told: Any) -> Iterable[say.Block]:
     """What is to be said of a result.  Each kind has its view, which no other result loads."""
-    room, view = VIEWS["certificate" if certificate else type(result).__name__]
-    found: say.Report = getattr(import_module(f"elastocal.report.{room}"), view)(result, **told)
+    room, view, _ = VIEWS["certificate" if certificate else type(result).__name__]
+    found: Iterable[say.Block] = getattr(import_module(f"elastocal.report.{room}"), view)(
+        result, **told
+    )
     return found
 
 
+# Kind of a result → module and function that say it, and what its page is.
 VIEWS = {
-    "certificate": ("smaller_views", "certificate_report"),
-    "Calibration": ("identification_view", "calibration_report"),
-    "Diagnosis": ("diagnosis_view", "diagnosis_report"),
-    "Plan": ("plan_view", "plan_report"),
-    "NextPoses": ("plan_view", "next_report"),
-    "Comparison": ("smaller_views", "changes_report"),
-    "Compensation": ("smaller_views", "compensation_report"),
-    "Measurements": ("smaller_views", "readings_report"),
+    "certificate": ("smaller_views", "certificate_blocks", "Calibration certificate"),
+    "Calibration": ("identification_view", "calibration_blocks", "Identification"),
+    "Diagnosis": ("diagnosis_view", "diagnosis_blocks", "Diagnosis"),
+    "Plan": ("plan_view", "plan_blocks", "Measurement plan"),
+    "NextPoses": ("plan_view", "next_blocks", "Next poses"),
+    "Comparison": ("smaller_views", "changes_blocks", "Comparison"),
+    "Compensation": ("smaller_views", "commands_blocks", "Compensation"),
+    "Measurements": ("smaller_views", "readings_blocks", "Readings"),
 }
 
 
@@ -76,7 +80,7 @@ LONGEST_WHOLE = 28  # letters; a longer name breaks where its column ends
 def print_report(console: Console, result: object, details: bool = True, **told: Any) -> None:
     """Show a result: what stands open in its report, and unless `details` are left out what is
     folded and `printed`."""
-    print_blocks(console, report_of(result, **told).blocks, details)
+    print_blocks(console, blocks_of(result, **told), details)
     if not details:
         more = f"{option('details', True)} tells of method, noise, residuals, intervals"
         console.print(Text(f"{more} and every combination; so does the report.", style="dim"))
@@ -188,8 +192,8 @@ def write_page(
 
 
 def page_of(
-    result: object, inputs: Inputs = None, command: str | None = None, seed: int | None = None,
-    **told: Any,
+    result: Any, inputs: Inputs = None, command: str | None = None, seed: int | None = None,
+    certificate: bool = False, **told: Any,
 ) -> str:  # fmt: skip
     """The page of a result as text.
 
@@ -199,16 +203,25 @@ def page_of(
     InputError where an input cannot be read.
     """
     named = digests(inputs)
-    report = report_of(result, **told)
-    body = html_of(report.blocks)
+    body = html_of(blocks_of(result, certificate, **told))
+    kind = VIEWS["certificate" if certificate else type(result).__name__][2]
+    if certificate and result.model.cell.certificate.missing:
+        kind = "Calibration report"
+    model = getattr(getattr(result, "old", result), "model", None)
+    names = [getattr(result, name, "") for name in ("source", "data")]
+    if model is not None:
+        names = [model.chain.name, model.cell.name]
+    elif hasattr(result, "chain"):
+        names = [result.chain.name]
+    head = f"{kind} of {text_of(say.title_of(*names), False)}"
     space = VIEW in body
     libraries = (*LIBRARIES, "plotly") if space else LIBRARIES
     versions = [f"{name} {metadata.version(name)}" for name in libraries]
     found = (
         ("command", command), ("elastocal", __version__), ("made on", date.today().isoformat()),
         ("with", ", ".join([f"Python {platform.python_version()}", *versions])),
-        ("model evaluated by", report.backend),
-        ("seed", seed if report.seed is None else report.seed),
+        ("model evaluated by", None if model is None else model.backend_report()),
+        ("seed", getattr(result, "seed", seed)),
         *((name, f"SHA-256 {digest}") for name, digest in named.items()),
     )  # fmt: skip
     rows = "".join(
@@ -217,10 +230,9 @@ def page_of(
         for name, value in found if value not in (None, "")
     )  # fmt: skip
     last = f'<table class="repeat"><tbody>{rows}</tbody></table>'
-    if not report.filed:
+    if not certificate:  # which is to be printed and kept, so that nothing is folded
         last = f"<details><summary>To repeat this</summary>{last}</details>"
-    return _framed(f"{report.kind} of {text_of(report.title, False)}", body + last, space,
-                   "filed" if report.filed else "")  # fmt: skip
+    return _framed(head, body + last, space, "filed" * certificate)
 
 
 def _framed(head: str, body: str, space: bool, kind: str) -> str:
@@ -411,7 +423,7 @@ DEFAULTS = {"Calibration": "residuals", "Diagnosis": "budget"}
 
 
 def html(result: object) -> str:
-    return html_of(report_of(result).blocks, 4, pictures=False)
+    return html_of(blocks_of(result), 4, pictures=False)
 
 
 def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) -> Any:
@@ -420,7 +432,7 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
 
     Raises InputError for a kind that the result does not have, and one that cannot be turned.
     """
-    folds = [block for block in report_of(result).blocks if isinstance(block, say.Fold)]
+    folds = [block for block in blocks_of(result) if isinstance(block, say.Fold)]
     every = [name for fold in folds for name in fold.figures]
     arms = [name for name in every if name in ("space", "poses")]
     chosen = kind or DEFAULTS.get(type(result).__name__, every[0])
@@ -461,33 +473,31 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
 
 
 def frame(result: object) -> pd.DataFrame:
-    return FRAMES[type(result).__name__](result)
+    import pandas as pd
+
+    return pd.DataFrame(FRAMES[type(result).__name__](result))
 
 
-def _estimates(result: Calibration) -> pd.DataFrame:
+def _estimates(result: Calibration) -> list[dict[str, Any]]:
     """One row per parameter, SI units: NaN where the data do not determine it alone."""
-    import pandas as pd
-
-    rows = [
-        {"parameter": e.name, "unit": e.unit, "value": e.value, "std": e.std}
-        | dict(zip(("ci95_low", "ci95_high"), e.ci95 or (None, None), strict=True))
-        | {"nominal": e.nominal, "held": e.held, "identifiable": e.identifiable}
-        | {"combined_with": ", ".join(e.combined_with), "note": e.note}
+    none = math.nan, math.nan
+    return [
+        {
+            "parameter": e.name, "unit": e.unit, "value": value, "std": std, "ci95_low": low,
+            "ci95_high": high, "nominal": e.nominal, "held": e.held,
+            "identifiable": e.identifiable, "combined_with": ", ".join(e.combined_with),
+            "note": e.note,
+        }
         for e in result.estimates
-    ]
-    frame = pd.DataFrame(rows)
-    numbers = ["value", "std", "ci95_low", "ci95_high", "nominal", "held"]
-    return frame.astype(dict.fromkeys(numbers, float))
+        for value, std in (none if e.value is None else (e.value, e.std),)
+        for low, high in (e.ci95 or none,)
+    ]  # fmt: skip
 
 
-def _plan_frame(plan: Plan | None) -> pd.DataFrame:
+def _plan_frame(plan: Plan | None) -> dict[str, Any]:
     """One row per pose: joints in ° or mm, place in the order, and the load where it states one."""
-    import pandas as pd
-
-    from elastocal.measurements import in_file_units, joint_columns
-
     if plan is None:
-        return pd.DataFrame()
+        return {}
     columns: dict[str, Any] = {"configuration": list(plan.configurations)}
     kinds = plan.model.chain.kinds
     columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
@@ -495,16 +505,14 @@ def _plan_frame(plan: Plan | None) -> pd.DataFrame:
         columns["level"] = plan.group + 1
     order = say.first_stops(plan)
     columns["order"] = [order.get(k) for k in range(len(plan.q))]
-    return pd.DataFrame(columns)
+    return columns
 
 
-def _candidates(d: Diagnosis) -> pd.DataFrame:
+def _candidates(d: Diagnosis) -> list[dict[str, Any]]:
     """One row per hypothesis, best first; whether it is held to be real; `score` in nats.
 
     What was found only where all causes are judged together comes first, without a score.
     """
-    import pandas as pd
-
     found = {(f.effect, f.where): f for f in d.effects}
     tried = {(c.effect, c.where): c for c in d.candidates}
     rows = []
@@ -519,7 +527,7 @@ def _candidates(d: Diagnosis) -> pd.DataFrame:
                 "gap_reduction": getattr(f, "gap_reduction", np.nan),
             }
         )  # fmt: skip
-    return pd.DataFrame(rows)
+    return rows
 
 
 def _commands(c: Compensation) -> pd.DataFrame:
@@ -535,18 +543,12 @@ def _commands(c: Compensation) -> pd.DataFrame:
     return frame
 
 
-def _changes(c: Comparison) -> pd.DataFrame:
-    import pandas as pd
-
-    return pd.DataFrame([vars(change) for change in c.changes])
-
-
-FRAMES: dict[str, Callable[[Any], pd.DataFrame]] = {
+FRAMES: dict[str, Callable[[Any], Any]] = {
     "Calibration": _estimates,
     "Plan": _plan_frame,
     "NextPoses": lambda found: _plan_frame(found.plan),
     "Diagnosis": _candidates,
-    "Comparison": _changes,
+    "Comparison": lambda c: [vars(change) for change in c.changes],
     "Compensation": _commands,
     "Measurements": lambda table: table.to_dataframe(),
 }

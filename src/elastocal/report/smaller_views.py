@@ -17,6 +17,7 @@ from elastocal.errors import InputError
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
+from elastocal.measurements import in_file_units, joint_columns
 from elastocal.report import blocks as say
 from elastocal.report.identification_view import (
     at_new_poses,
@@ -50,13 +51,7 @@ OF_LOADS = {
 }
 
 
-def changes_report(c: Comparison) -> say.Report:
-    model = c.old.model
-    title = say.title_of(model.chain.name, model.cell.name)
-    return say.Report("Comparison", title, _changes(c), model.backend_report())
-
-
-def _changes(c: Comparison) -> Iterator[say.Block]:
+def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     rms, noise = (say.length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
     most = say.length(float(c.distance.max()))
     figures = [
@@ -64,28 +59,28 @@ def _changes(c: Comparison) -> Iterator[say.Block]:
         ("all parameters together", say.size_of(c.p)),
     ]  # fmt: skip
     yield say.Fold("", lambda: [say.KeyFigures(f"moved by {rms} (noise {noise})", figures)])
-    same = c.verdict == "no_change_shown" and not c.one_result
-    names = ", ".join(printable(change.name) for change in c.changed[:MOST_NAMED])
-    names += f" and {len(c.changed) - MOST_NAMED} more" if len(c.changed) > MOST_NAMED else ""
-    verdict = f"The arm has changed: {names}."
     steps = [
         "Use the new calibration (elastocal compensate, elastocal export).",
         "Look for the cause at the joints and links named. A missing effect can look like a change "
         "if poses or loads differ (elastocal diagnose with the new data).",
     ]
+    tone: say.Tone = "warn"
     if c.one_result:
         verdict = (
             f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
             "same result, equal to the last digit."
         )
         steps = ["Give the results of two sessions: this is one of them and its copy."]
-    elif same:
+    elif c.verdict == "no_change_shown":
+        tone, verdict = "good", "No significant change: the differences are within the noise."
         steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
-    if not c.changed and not c.one_result:
+    elif c.changed:
+        more, names = len(c.changed) - MOST_NAMED, [printable(change.name) for change in c.changed]
+        told = ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+        verdict = f"The arm has changed: {told}."
+    else:
         verdict = "The arm has changed, but no single parameter is significant."
-        if c.verdict == "no_change_shown":
-            verdict = "No significant change: the differences are within the noise."
-    yield say.ShownVerdict("good" if same else "warn", verdict)
+    yield say.ShownVerdict(tone, verdict)
     loads = say.loads_text(c.forces, "{}", "{} loads in turn")
     moved = (
         f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
@@ -147,9 +142,8 @@ def _moves(c: Comparison) -> say.Figure:
 # Commands
 
 
-def compensation_report(c: Compensation) -> say.Report:
+def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     from elastocal.compensation.compensate import summary
-    from elastocal.measurements import in_file_units, joint_columns
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     table, kinds = c.targets.table, c.chain.kinds
@@ -168,13 +162,12 @@ def compensation_report(c: Compensation) -> say.Report:
     more = len(c.status) - len(rows)
     note = f"and {more} more in the file of commands" if more else ""
     commands = say.ShownTable(heads, rows, (0, len(heads) - 1), note=note)
-    told = compensation_blocks({"commands": summary(c, kinds, commands=False)})
-    errors = say.Fold(
+    yield from compensation_blocks({"commands": summary(c, kinds, commands=False)})
+    yield say.Fold(
         "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, lengths=True)],
         figures=("errors",),
     )  # fmt: skip
-    blocks = [*told, errors, say.Fold("Commands", lambda: [commands])]
-    return say.Report("Compensation", printable(c.chain.name), blocks)
+    yield say.Fold("Commands", lambda: [commands])
 
 
 def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
@@ -228,8 +221,7 @@ def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
 # Readings
 
 
-def readings_report(table: Measurements) -> say.Report:
-    from elastocal.measurements import in_file_units, joint_columns
+def readings_blocks(table: Measurements) -> Iterator[say.Block]:
     from elastocal.report.figures import rows_of_dots
 
     rows = [
@@ -239,8 +231,7 @@ def readings_report(table: Measurements) -> say.Report:
         for name, values in table.columns().items() if len(values)
     ]  # fmt: skip
     heads = ("column", "different", "least", "largest")
-    source = printable(table.source)
-    shown = say.ShownTable(heads, rows, title=f"{len(table)} rows of {source}")
+    yield say.ShownTable(heads, rows, title=f"{len(table)} rows of {printable(table.source)}")
     q = in_file_units(table.q, table.kinds)
     ends = [(float(v.min()), float(v.max())) if len(v) else (0.0, 0.0) for v in q.T]
     dots = [
@@ -248,8 +239,7 @@ def readings_report(table: Measurements) -> say.Report:
         for name, (a, b) in zip(joint_columns(table.kinds), ends, strict=True)
     ]
     axis, title = "middle and ends of the values, in ° or mm", "Where each joint stood"
-    joints = say.Fold("", lambda: [rows_of_dots("joints", title, dots, axis)], figures=("joints",))
-    return say.Report("Readings", source, [shown, joints])
+    yield say.Fold("", lambda: [rows_of_dots("joints", title, dots, axis)], figures=("joints",))
 
 
 # The calibrated arm in a file
@@ -426,15 +416,8 @@ FEWEST = 3  # readings of one place from which on a repeatability is told
 SIDES = math.sqrt(3.0)  # a 3-D rms over that of one coordinate
 
 
-def certificate_report(result: Calibration) -> say.Report:
+def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     """A page to print and file: entries, verdict, conformity, uncertainty, pose accuracy."""
-    cell = result.model.cell
-    kind = "Calibration report" if cell.certificate.missing else "Calibration certificate"
-    title = say.title_of(result.model.chain.name, cell.name)
-    return say.Report(kind, title, _certificate(result), result.model.backend_report(), filed=True)
-
-
-def _certificate(result: Calibration) -> Iterator[say.Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
     verdict, certified = judgement(result), certified_values(result, budget)
     yield say.ShownVerdict(verdict.tone, verdict.headline)
