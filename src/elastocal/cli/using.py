@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -36,11 +36,8 @@ from elastocal.screen import complain, progress_line, say
 from elastocal.text import listed
 
 if TYPE_CHECKING:
-    from elastocal.compensation.correction_table import CorrectionGrid, CorrectionTable
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.model.calibrated import CalibratedArm
     from elastocal.studies import Ending
-    from elastocal.units import Array
 
 
 @command(
@@ -344,6 +341,9 @@ def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, 
 # compensate and export: what a result is for.
 
 
+GRID = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
+
+
 @command(verb=verbs.compensate, offers="frame point load seed", texts={"point": ("POINT", str)})
 def compensate(
     cell: CellFile,
@@ -385,9 +385,15 @@ def compensate(
         one_target,
         summary,
     )
+    from elastocal.compensation.correction_table import (
+        correction_table,
+        grid_of,
+        posture_of,
+        summary_and_csv,
+    )
     from elastocal.files import atomic_write_text
     from elastocal.model.arm import given_force
-    from elastocal.model.calibrated import read_calibrated
+    from elastocal.model.calibrated import read_calibrated, tool_point
     from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import compensation_blocks
 
@@ -401,8 +407,9 @@ def compensate(
         progress("reading")
         arm = read_calibrated(cell, result, run.plugins)
         run.reads(cell, result, targets, cell=arm.model.cell)
-        start = _posture(arm, near)
-        lines = None if table is None else _grid(arm, grid, box, rotation)
+        start = posture_of(arm, near)
+        counts = tuple(whole_numbers(grid, GRID))
+        lines = None if table is None else grid_of(arm, counts, box, rotation)
         wanted = targets if target is None else one_target(target, asked["frame"], force)
         if wanted is not None:
             found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
@@ -412,12 +419,9 @@ def compensate(
             content["commands"] = summary(found, kinds, commands=output is None)
             commands = commands_csv(found, kinds)
         if table is not None and lines is not None:
-            from elastocal.compensation.correction_table import correction_table
-            from elastocal.model.calibrated import tool_point
-
             where = tool_point(arm.model.cell, asked.get("point"))
             made = correction_table(arm, lines, where, force, start, asked["seed"], progress)
-            content["table"], corrections = _table(made, arm, partial)
+            content["table"], corrections = summary_and_csv(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(
             (output, lambda path: atomic_write_text(path, commands)),
@@ -448,100 +452,6 @@ def _check(
     need = "--grid, --box and --rotation belong to a correction table; give --table FILE"
     require(table is not None or of_a_table == ("5", None, None), need)
     require(rotation is None or box is not None, "--rotation belongs to --box")
-
-
-GRID_REMEDIES = {
-    "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
-    "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
-    "--rotation or another --near",
-    "no equilibrium": "no static equilibrium under this load: check --load",
-}
-
-
-def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
-    import numpy as np
-
-    from elastocal.measurements import in_file_units
-    from elastocal.model.calibrated import numbers
-    from elastocal.model.chain import joint_limits
-
-    if text is None:
-        return None
-    chain = arm.model.chain
-    n = chain.n_joints
-    values = numbers("--near", text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
-    values = values / in_file_units(np.ones(n), chain.kinds)
-    lower, upper = joint_limits(arm.model.cell, chain)
-    if ((values < lower) | (values > upper)).any():
-        j = int(np.argmax((values < lower) | (values > upper)))
-        raise InputError(f"--near: joint {j + 1} is beyond its limits; give a posture within them")
-    return values
-
-
-def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) -> CorrectionGrid:
-    import numpy as np
-    from scipy.spatial.transform import Rotation
-
-    from elastocal.compensation.correction_table import box_grid, joint_grid
-    from elastocal.model.calibrated import numbers
-
-    takes = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
-    counts = tuple(whole_numbers(grid, takes))
-    if box is None:
-        return joint_grid(arm, counts)
-    corners = numbers("--box", box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
-    turned = None
-    if rotation is not None:
-        vector = numbers("--rotation", rotation, (3,), "a rotation vector rx,ry,rz in degrees")
-        turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
-    return box_grid(corners[:3], corners[3:], counts, turned)
-
-
-def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[dict[str, Any], str]:
-    """Summary of the correction table, and the table as CSV; refused where points are not
-    reached and `partial` does not allow for that."""
-    import numpy as np
-
-    from elastocal.compensation.compensate import check_status, spread
-    from elastocal.compensation.correction_table import EXACT, FIRST_ORDER
-    from elastocal.measurements import in_file_units, joint_columns
-    from elastocal.tables import csv_text
-
-    kinds = arm.model.chain.kinds
-    if found.grid.joints:
-        heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
-    else:
-        heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
-    known = np.all(np.isfinite(found.correction), axis=1).tolist()
-    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
-    # A grid point has no line in any file of the user's: it is named by where it lies.
-    named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
-    what = f"--table: %d of %d grid points ({', '.join(heads)})"
-    if not partial:
-        check_status(what, named, plain, EXACT, GRID_REMEDIES)
-    heads += ["dx_mm", "dy_mm", "dz_mm"]
-    columns = [found.correction[:, :3] * 1e3]
-    if found.oriented:
-        heads += ["drx_deg", "dry_deg", "drz_deg"]
-        columns.append(np.degrees(found.correction[:, 3:]))
-    values, rows = np.hstack(columns), []
-    for i in np.lexsort(found.points.T[::-1]):
-        cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
-        rows.append([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
-    content: dict[str, Any] = {
-        "points": len(found.status),
-        "exact": found.status.count(EXACT),
-        "first_order": found.status.count(FIRST_ORDER),
-        "levels": [len(axis) for axis in found.grid.axes],
-        "checked_between": len(found.between),
-        "error_without_um": spread(found.before[:, 0]),
-        "error_with_um": spread(found.between[:, 0]),
-        "warnings": list(found.warnings),
-    }
-    if found.oriented:
-        content["rotation_without_urad"] = spread(found.before[:, 1])
-        content["rotation_with_urad"] = spread(found.between[:, 1])
-    return content, csv_text([*heads, "status"], rows)
 
 
 # export: the calibrated arm for other programs.

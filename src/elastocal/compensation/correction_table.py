@@ -15,20 +15,18 @@ from elastocal.compensation.compensate import (
     Compensation,
     Goals,
     Targets,
+    check_status,
     compensate,
+    spread,
     targets_at,
 )
 from elastocal.errors import InputError, option
 from elastocal.measurements import in_file_units, joint_columns
-from elastocal.model.calibrated import (
-    CalibratedArm,
-    CalibratedTool,
-    ToolPoint,
-    lasting,
-)
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint, lasting, numbers
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.inverse_kinematics import Reaching
 from elastocal.model.rigid import nominal_flanges
+from elastocal.tables import csv_text
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray
 
@@ -293,3 +291,82 @@ def _interpolated(grid: CorrectionGrid, points: Array, correction: Array, where:
     values = values.reshape(*(shape[k] for k in wide), 6)
     follow = RegularGridInterpolator([grid.axes[k] for k in wide], values)
     return np.asarray(follow(where[:, wide]))
+
+
+# As the command line states and writes them.
+
+GRID_REMEDIES = {
+    "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
+    "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
+    "--rotation or another --near",
+    "no equilibrium": "no static equilibrium under this load: check --load",
+}
+
+
+def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
+    if text is None:
+        return None
+    chain = arm.model.chain
+    n = chain.n_joints
+    values = numbers("--near", text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
+    values = values / in_file_units(np.ones(n), chain.kinds)
+    lower, upper = joint_limits(arm.model.cell, chain)
+    if ((values < lower) | (values > upper)).any():
+        j = int(np.argmax((values < lower) | (values > upper)))
+        raise InputError(f"--near: joint {j + 1} is beyond its limits; give a posture within them")
+    return values
+
+
+def grid_of(
+    arm: CalibratedArm, counts: tuple[int, ...], box: str | None, rotation: str | None
+) -> CorrectionGrid:
+    if box is None:
+        return joint_grid(arm, counts)
+    corners = numbers("--box", box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
+    turned = None
+    if rotation is not None:
+        vector = numbers("--rotation", rotation, (3,), "a rotation vector rx,ry,rz in degrees")
+        turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
+    return box_grid(corners[:3], corners[3:], counts, turned)
+
+
+def summary_and_csv(
+    found: CorrectionTable, arm: CalibratedArm, partial: bool
+) -> tuple[dict[str, Any], str]:
+    """Summary of the correction table, and the table as CSV; refused where points are not
+    reached and `partial` does not allow for that."""
+    kinds = arm.model.chain.kinds
+    if found.grid.joints:
+        heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
+    else:
+        heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
+    known = np.all(np.isfinite(found.correction), axis=1).tolist()
+    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
+    # A grid point has no line in any file of the user's: it is named by where it lies.
+    named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
+    what = f"--table: %d of %d grid points ({', '.join(heads)})"
+    if not partial:
+        check_status(what, named, plain, EXACT, GRID_REMEDIES)
+    heads += ["dx_mm", "dy_mm", "dz_mm"]
+    columns = [found.correction[:, :3] * 1e3]
+    if found.oriented:
+        heads += ["drx_deg", "dry_deg", "drz_deg"]
+        columns.append(np.degrees(found.correction[:, 3:]))
+    values, rows = np.hstack(columns), []
+    for i in np.lexsort(found.points.T[::-1]):
+        cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
+        rows.append([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
+    content: dict[str, Any] = {
+        "points": len(found.status),
+        "exact": found.status.count(EXACT),
+        "first_order": found.status.count(FIRST_ORDER),
+        "levels": [len(axis) for axis in found.grid.axes],
+        "checked_between": len(found.between),
+        "error_without_um": spread(found.before[:, 0]),
+        "error_with_um": spread(found.between[:, 0]),
+        "warnings": list(found.warnings),
+    }
+    if found.oriented:
+        content["rotation_without_urad"] = spread(found.before[:, 1])
+        content["rotation_with_urad"] = spread(found.between[:, 1])
+    return content, csv_text([*heads, "status"], rows)
