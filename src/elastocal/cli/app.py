@@ -143,11 +143,9 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
                 command(*args, **kwargs)
         except (ElastocalError, OSError, KeyboardInterrupt) as error:
             raise typer.Exit(_ended(error)) from None
-        except (typer.Exit, typer.Abort):
-            raise
         except Exception as error:
-            if hasattr(error, "show"):  # of typer's own: a usage error
-                raise
+            if isinstance(error, typer.Exit | typer.Abort) or hasattr(error, "show"):
+                raise  # typer's own, as a usage error
             if len(interrupts) > before:  # which a library has turned into an error of its own
                 raise typer.Exit(INTERRUPTED) from None
             if os.environ.get(TRACEBACK):
@@ -233,6 +231,18 @@ def whole_numbers(text: str, takes: str) -> list[int]:
         return [int(part) for part in text.split(",")]
     except ValueError:
         raise InputError(f"{takes}; found '{text}'") from None
+
+
+def named_numbers(stated: Iterable[str], takes: str) -> dict[str, float]:
+    """Texts NAME=NUMBER, for an option that `takes` such."""
+    found = {}
+    for text in stated:
+        name, _, number = text.partition("=")
+        try:
+            found[name.strip()] = float(number)
+        except ValueError:
+            raise InputError(f"{takes}; found '{text}'") from None
+    return found
 
 
 class Run:

@@ -24,6 +24,7 @@ from elastocal.cli.app import (
     Seed,
     command,
     files_of,
+    named_numbers,
     repeated,
     whole_numbers,
 )
@@ -307,23 +308,19 @@ def _check_names(programs: list[Path], picture: Path | None) -> None:
 def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[Path, str]:
     """Robot programs of a plan by their paths; without one only whether they can be written for
     this arm, which is told before the work and not after it."""
-    import numpy as np
-
-    from elastocal.cell.plan_wishes import Motion
     from elastocal.model.chain import joint_limits
     from elastocal.model.manipulator import load_chain
-    from elastocal.planning.execution import Execution
-    from elastocal.planning.programs import robot_program
+    from elastocal.planning.programs import LANGUAGES, check_six_axes, robot_program
 
-    written, chain = {}, load_chain(cell)
-    nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0, 0)
-    told = (nothing, chain, (), None) if plan is None else (
-        plan.execution, chain, plan.configurations, plan.forces
-    )  # fmt: skip
-    limits = None if plan is None else joint_limits(cell, chain)
+    written, chain = dict[Path, str](), load_chain(cell)
     for path in paths:
         try:
-            written[path] = robot_program(path.suffix, *told, name=path.stem, limits=limits)
+            check_six_axes(chain, LANGUAGES[path.suffix.lower()][0])
+            if plan is not None:
+                written[path] = robot_program(
+                    path.suffix, plan.execution, chain, plan.configurations, plan.forces,
+                    name=path.stem, limits=joint_limits(cell, chain),
+                )  # fmt: skip
         except InputError as error:
             raise InputError(f"--program {path}: {error}") from None
     return written
@@ -369,14 +366,7 @@ def simulate(
     model = Model(cell, plugins=run.plugins)
     run.reads(cell, plan, cell=model.cell)
     poses = model.read_plan(plan)
-    values: dict[str, float] = {}
-    for text in set_ or ():
-        name, _, value = text.partition("=")
-        try:
-            values[name.strip()] = float(value)
-        except ValueError:
-            told = f"--set takes NAME=VALUE with a number in SI units; found '{text}'"
-            raise InputError(told) from None
+    values = named_numbers(set_ or (), "--set takes NAME=VALUE with a number in SI units")
     table, x = verbs.simulated(model, poses, **asked, values=values, noise=not no_noise)
     planned = model.cell.design.loads
     if "load" not in asked and not table.force.any() and planned is not None and planned.any():

@@ -28,6 +28,7 @@ from elastocal.cli.app import (
     Run,
     Seed,
     command,
+    named_numbers,
     repeated,
     whole_numbers,
 )
@@ -94,25 +95,17 @@ def identify(
         raise NotAcceptedError(f"not accepted: {'; '.join(unmet)}")
 
 
-def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float | None]:
+def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float]:
     """NAME=UM as limits in m, NAME one of `names`, by default of all."""
     from elastocal.cell.work_cell import Acceptance
 
     names = names or tuple(vars(Acceptance()))
-    limits: dict[str, float | None] = {}
-    for text in stated:
-        name, _, number = text.partition("=")
-        try:
-            value = float(number)
-        except ValueError:
-            value = math.nan
-        if name not in names or not 0 < value < math.inf:
-            raise InputError(
-                f"{option('require')} takes NAME=UM, NAME one of {listed(names)} and UM a positive "
-                f"number in µm; found '{text}'"
-            )
-        limits[name] = value * 1e-6
-    return limits
+    takes = f"NAME=UM, NAME one of {listed(names)} and UM a positive number in µm"
+    found = named_numbers(stated, f"{option('require')} takes {takes}")
+    for name, um in found.items():
+        fits = name in names and 0 < um < math.inf
+        require(fits, f"{option('require')} takes {takes}; found '{name}={um:g}'")
+    return {name: um * 1e-6 for name, um in found.items()}
 
 
 # diagnose: why the real arm still differs from the model.
