@@ -186,11 +186,11 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
             f"{here}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
             f"it has {listed(options) or 'none'}",
         )
-        default, value = defaults[key], written
-        if not isinstance(default, str) or written.startswith(('"', "'")):
-            value = None
-            with suppress(tomllib.TOMLDecodeError):
-                value = tomllib.loads(f"value = {written}")["value"]
+        default, value = defaults[key], None
+        with suppress(tomllib.TOMLDecodeError):
+            value = tomllib.loads(f"value = {written}")["value"]
+        if isinstance(default, str) and not written.startswith(('"', "'")):
+            value = written
         if type(default) is float and type(value) is int:
             value = float(value)
         kind = ASKED_FOR.get(type(default), f"a TOML value like {quoted(default)}")

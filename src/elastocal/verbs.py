@@ -403,12 +403,13 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats, 1)
-    if isinstance(plan, str | Path):
-        poses = made.read_plan(plan)
-    elif type(plan).__name__ == "Plan":
-        poses = cast("Plan", plan).table()
+    given: Any = plan
+    if isinstance(given, str | Path):
+        poses = made.read_plan(given)
+    elif type(given).__name__ == "Plan":
+        poses = given.table()
     else:
-        poses = plan if isinstance(plan, Measurements) else made.table(plan)
+        poses = given if isinstance(given, Measurements) else made.table(given)
     check_limits(made, poses)
     rng = np.random.default_rng(seed)
     rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
