@@ -107,12 +107,19 @@ def point(T: ca.SX, p: Any) -> ca.SX:
     return T[:3, :3] @ ca.SX(p) + T[:3, 3]
 
 
+def nominal_frames(chain: Chain, q: ca.SX, base: ca.SX) -> list[ca.SX]:
+    """(4, 4) of each joint of the nominal chain after its motion, at joint values q (n,), and of
+    the flange, where `base` (4, 4) is that of the chain's base."""
+    frames = [base]
+    for i, joint in enumerate(chain.joints):
+        motion = joint_motion(joint.kind, joint.axis, q[i])
+        frames.append(frames[-1] @ constant(joint.placement) @ motion)
+    return [*frames[1:], frames[-1] @ constant(chain.flange_placement)]
+
+
 def nominal_flange(chain: Chain, q: ca.SX) -> ca.SX:
     """T_base_flange (4, 4) of the nominal chain at joint values q (n,)."""
-    T = ca.SX.eye(4)
-    for i, joint in enumerate(chain.joints):
-        T = T @ constant(joint.placement) @ joint_motion(joint.kind, joint.axis, q[i])
-    return T @ constant(chain.flange_placement)
+    return nominal_frames(chain, q, ca.SX.eye(4))[-1]
 
 
 def nominal_flanges(chain: Chain, q: Array) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
 from elastocal.files import check_regular, check_size
 from elastocal.model.chain import Chain
 from elastocal.text import did_you_mean, listed
@@ -256,29 +256,27 @@ def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
         *(() if workspace.load is None else hanging(workspace.load)),
         *(Body(solid, WORLD, "obstacle") for solid in workspace.obstacles),
     )
-    names: set[str] = set()
-    for body in bodies:
-        if body.name in names:
-            raise InputError(
-                f"{cell.path or cell.name}: [workspace] has two bodies named '{body.name}'; "
-                "rename one (base, link1 … and rope are taken)"
-            )
-        names.add(body.name)
+    names = [body.name for body in bodies]
+    for k, name in enumerate(names):
+        require(
+            name not in names[:k],
+            f"{cell.path or cell.name}: [workspace] has two bodies named '{name}'; rename one "
+            "(base, link1 … and rope are taken)",
+        )
     return bodies
 
 
 def _arm(cell: Cell, chain: Chain) -> Iterator[Body]:
     workspace = cell.workspace
     where = f"{cell.path or cell.name}: [workspace]"
-    if workspace.urdf_geometry and workspace.link_radius:
-        raise InputError(
-            f'{where} gives link_radius and geometry = "urdf"; the arm can have only one'
-        )
+    require(
+        not (workspace.urdf_geometry and workspace.link_radius),
+        f'{where} gives link_radius and geometry = "urdf"; the arm can have only one',
+    )
     if workspace.urdf_geometry:
         for solid, carrier in urdf_bodies(cell, chain):
-            on_base = carrier == WORLD
-            placed = replace(solid, placement=data_base(cell) @ solid.placement)
-            yield Body(placed if on_base else solid, carrier, "arm")
+            placed = _moved(data_base(cell), solid) if carrier == WORLD else solid
+            yield Body(placed, carrier, "arm")
     elif workspace.link_radius:
         yield from skeleton(chain, workspace.link_radius, data_base(cell), where)
 
@@ -289,11 +287,11 @@ def skeleton(
     """Capsules along the chain: link i from joint i's origin to joint i+1's at zero offset, the
     last to the flange, "base" from the base's origin to joint 1; none where a radius is 0."""
     radius = radius * chain.n_joints if len(radius) == 1 else radius
-    if len(radius) != chain.n_joints:
-        raise InputError(
-            f"{where} link_radius_mm has {len(radius)} values, but robot '{chain.name}' has "
-            f"{chain.n_joints} links; give one for each, or one for all"
-        )
+    require(
+        len(radius) == chain.n_joints,
+        f"{where} link_radius_mm has {len(radius)} values, but robot '{chain.name}' has "
+        f"{chain.n_joints} links; give one for each, or one for all",
+    )
     ends = [T[:3, 3] for T in distal_placements(chain)]
     foot, first = T_data_base[:3, 3], (T_data_base @ chain.joints[0].placement)[:3, 3]
     if radius[0] > 0 and np.linalg.norm(first - foot) > 0:
@@ -315,12 +313,12 @@ def _carried(body: CarriedBody, cell: Cell, chain: Chain) -> Body:
     if body.on == "flange":
         return Body(_moved(chain.flange_placement, solid), chain.n_joints - 1, "carried")
     links = [f"link{i + 1}" for i in range(chain.n_joints)]
-    if body.on not in links:
-        valid = ["base", *links, "flange"]
-        raise InputError(
-            f"{cell.path or cell.name}: [workspace] body '{solid.name}' is on '{body.on}'"
-            f"{did_you_mean(body.on, valid)}; valid: {listed(valid)}"
-        )
+    valid = ["base", *links, "flange"]
+    require(
+        body.on in valid,
+        f"{cell.path or cell.name}: [workspace] body '{solid.name}' is on '{body.on}'"
+        f"{did_you_mean(body.on, valid)}; valid: {listed(valid)}",
+    )
     return Body(solid, links.index(body.on), "carried")
 
 
@@ -385,8 +383,7 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
         # What joint 1 turns stays at its height.
         standing = [body for body in drawn if body.carrier > 0]
         pairs += [Pair(body, plane, 0.0, "mounting_plane") for body in standing]
-    load = workspace.load
-    if load is not None and load.min_height is not None:
+    if (load := workspace.load) is not None and load.min_height is not None:
         floor = HalfSpace(FLOOR, load.min_height * UP, UP)
         pairs += [Pair(body, floor, 0.0, "load_height") for body in bodies if body.kind == "load"]
     pairs += [Pair(b, o, workspace.clearance, "obstacle") for b in moving for o in obstacles]
@@ -439,14 +436,12 @@ def _outline(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> Iterator[Bod
 def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:
     workspace = cell.workspace
     valid = [body.name for body in bodies] + [space.name for space in workspace.keep_out]
-    for pair in workspace.ignored_pairs:
-        for name in pair:
-            if name not in valid:
-                raise InputError(
-                    f"{cell.path or cell.name}: [workspace] ignored_pairs names '{name}', "
-                    f"but the cell has no such body"
-                    f"{did_you_mean(name, valid)}; valid: {listed(valid)}"
-                )
+    for name in sum(workspace.ignored_pairs, ()):
+        require(
+            name in valid,
+            f"{cell.path or cell.name}: [workspace] ignored_pairs names '{name}', but the cell has "
+            f"no such body{did_you_mean(name, valid)}; valid: {listed(valid)}",
+        )
     return {frozenset(pair) for pair in workspace.ignored_pairs}
 
 

@@ -96,8 +96,7 @@ class Boxes:
         return replace(cell, tool=tool, tracker=tracker)
 
 
-@dataclass(frozen=True)
-class RelaxedPoint:
+class RelaxedPoint(NamedTuple):
     cell: Cell
     setup: Setup
     pool: FeasiblePool

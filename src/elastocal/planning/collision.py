@@ -61,25 +61,15 @@ class Poses:
         return Poses(self.q[index], self.force[index], self.frames[index], self.flange_placement)
 
 
-def arm_frames(chain: Chain, T_data_base: Array, q: ca.SX) -> tuple[list[ca.SX], ca.SX]:
-    """T_data_joint_i(q) = T_data_base X_1 J_1(q_1) … X_i J_i(q_i) after each joint's motion, and
-    the flange's frame."""
-    T, frames = rigid.constant(T_data_base), []
-    for i, joint in enumerate(chain.joints):
-        T = T @ rigid.constant(joint.placement) @ rigid.joint_motion(joint.kind, joint.axis, q[i])
-        frames.append(T)
-    return frames, T @ rigid.constant(chain.flange_placement)
-
-
 class Kinematics:
-    """Frames of the rigid nominal arm in whole batches, as `arm_frames` has them."""
+    """Frames of the rigid nominal arm in whole batches."""
 
     def __init__(self, cell: Cell, chain: Chain) -> None:
         self.chain = chain
         self.T_data_base = data_base(cell)
         self.load_point = np.asarray(cell.tool.load_point, dtype=float)
         q = ca.SX.sym("q", chain.n_joints)
-        frames, flange = arm_frames(chain, self.T_data_base, q)
+        *frames, flange = rigid.nominal_frames(chain, q, rigid.constant(self.T_data_base))
         self._compiled = BatchFunction([q], [*frames, rigid.point(flange, self.load_point)])
 
     def poses(self, q: Array, force: Array) -> Poses:
@@ -105,15 +95,19 @@ class Collisions:
     will in every pose."""
 
     def __init__(self, kinematics: Kinematics, pairs: Sequence[Pair], free: int = 0) -> None:
-        self.pairs = tuple(pairs)
+        import pinocchio as pin
+
         self._margins = np.array([pair.margin for pair in pairs])
         model = arm_model(kinematics, free)
         geometry = geometry_of(kinematics, [item for p in pairs for item in (p.body, p.other)])
         hangs = np.array([pair.hangs for pair in pairs], dtype=bool)
-        self._always, self._loaded = (
-            (own, _pool(model, geometry, [pairs[int(k)] for k in own]))
-            for own in (np.flatnonzero(~hangs), np.flatnonzero(hangs))
-        )
+        self._pools = []
+        for own in (np.flatnonzero(~hangs), np.flatnonzero(hangs)):
+            tested = geometry.copy()
+            for k in own:
+                a, b = (tested.getGeometryId(name) for name in pairs[k].names)
+                tested.addCollisionPair(pin.CollisionPair(a, b))
+            self._pools.append((own, pin.GeometryPool(model, tested, 1)))
 
     def hits(
         self, poses: Poses, extra: float | Array = 0.0, placed: Array | None = None
@@ -128,7 +122,7 @@ class Collisions:
         upright = Rotation.from_matrix(last.transpose(0, 2, 1)).as_quat()
         configuration = np.hstack([poses.q, upright, *([] if placed is None else [placed])])
         margins, found = self._margins + extra, np.zeros(len(poses), dtype=bool)
-        for (own, pool), counts in ((self._always, ~found), (self._loaded, poses.loaded)):
+        for (own, pool), counts in zip(self._pools, (~found, poses.loaded), strict=True):
             left = np.flatnonzero(counts & ~found)
             if not len(own) or not len(left):
                 continue
@@ -138,16 +132,6 @@ class Collisions:
             rows = configuration[left].T
             found[left] = np.array(pin.computeCollisionsInParallel(1, pool, rows, True))
         return found
-
-
-def _pool(model: Any, geometry: Any, pairs: Sequence[Pair]) -> Any:
-    import pinocchio as pin
-
-    geometry = geometry.copy()
-    for pair in pairs:
-        a, b = (geometry.getGeometryId(name) for name in pair.names)
-        geometry.addCollisionPair(pin.CollisionPair(a, b))
-    return pin.GeometryPool(model, geometry, 1)
 
 
 def hits_by_pair(
@@ -358,10 +342,8 @@ class MotionBound:
         world = np.concatenate(placed, axis=2)
         for j in reversed(range(n)):
             S[:, j:, j] = S[:, j:, j + 1] + half[:, j, None]
-            across = self._across[j]
-            if across is not None:
-                start = self._first[j]
-                frame = poses.frames[:, j]
+            if (across := self._across[j]) is not None:
+                start, frame = self._first[j], poses.frames[:, j]
                 turned = across @ frame[:, :3, :3].transpose(0, 2, 1)
                 arm = turned @ world[:, :, start:] - turned @ frame[:, :3, 3:]
                 levers = np.hypot(arm[:, 0], arm[:, 1]) + self._radii[start:]
@@ -444,9 +426,10 @@ class Paths:
         doubtful = np.flatnonzero(~certain)
         refused = np.zeros(len(poses), dtype=bool)
         refused[doubtful] = self._collisions.hits(poses.take(doubtful)) | (octave[doubtful] == 0)
-        if self._load is None or self._load.rope_axis is None or self._load.max_angle is None:
-            return certain, refused
-        angle = np.where(poses.loaded, rope_angle(poses, self._load.rope_axis), 0.0)
-        turned = half @ self._revolute
-        certain &= angle + turned <= self._load.max_angle + ROPE_TOLERANCE
-        return certain, refused | (angle > self._load.max_angle + ROPE_TOLERANCE)
+        load = self._load
+        if load is not None and load.rope_axis is not None and load.max_angle is not None:
+            most = load.max_angle + ROPE_TOLERANCE
+            angle = np.where(poses.loaded, rope_angle(poses, load.rope_axis), 0.0)
+            certain &= angle + half @ self._revolute <= most
+            refused |= angle > most
+        return certain, refused

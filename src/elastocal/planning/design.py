@@ -160,7 +160,6 @@ class _Design:
             cell = replace(cell, design=replace(cell.design, candidates=POOL))
         self.checkpoint, self.progress, self.options = checkpoint, progress, options
         self.model = Model(cell, options.done.marker_names if options.done else ())
-        self.conditions: tuple[Model, tuple[str, ...]] | None = None
         self._leave_out()
         # What the cell as it stands says of test poses and of measurements holds for others too.
         self.work: Model = self.model if first is None else first.work
@@ -173,43 +172,49 @@ class _Design:
         self.space = joint_space(self.cell, self.chain)
         pins = self.options.pins
         self.feasibility = Feasibility(self.cell, self.chain, None if pins is None else pins.struck)
-        _check_home(self.cell, self.feasibility)
+        if (home := self.cell.design.motion.home) is not None:
+            met = blockers_of(self.feasibility)(home, home, False)
+            require(
+                not met,
+                f"{cell.path or cell.name}: [design.motion] home brings {listed(met)} too close to "
+                "each other; state another home, or correct the bodies and clearances of "
+                "[workspace]",
+            )
 
     def _leave_out(self) -> None:
         """Smooth functions, and effects of what a pose has only once it stands in an order."""
         functions = tuple(dict.fromkeys(p.effect for p in self.model.parameters if p.shrunk))
-        if functions:
-            self._drop(
-                functions,
-                f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made "
-                "for the other parameters; to show functions too, measure many poses all over the "
-                "joints' ranges",
-            )
+        self._drop(
+            functions,
+            f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made for "
+            "the other parameters; to show functions too, measure many poses all over the joints' "
+            "ranges",
+        )
         cell = self.model.cell
         effects = dict.fromkeys(c.name for c in cell.model.effects)
         needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
         open_ = tuple(name for name in effects if needs[name])
         done = self.options.done is not None
         unknown = tuple(name for name in open_ if done or "temperature" in needs[name])
-        if unknown:
-            self._drop(
-                unknown,
-                f"the plan is made for the other parameters and holds {listed(unknown)} at "
-                "nominal: what drives them is not known before; record times and temperatures, and "
-                f"ask for reference poses ({option('reference_every', '10')}), so that "
-                "identification can tell them",
-            )
+        self._drop(
+            unknown,
+            f"the plan is made for the other parameters and holds {listed(unknown)} at nominal: "
+            "what drives them is not known before; record times and temperatures, and ask for "
+            f"reference poses ({option('reference_every', '10')}), so that identification can tell "
+            "them",
+        )
         late = tuple(name for name in open_ if name not in unknown)
-        if late:
-            self.conditions = self.model, self.options.fixed
-            self._drop(
-                late,
-                f"poses are chosen for the other parameters, as time and order alone show "
-                f"{listed(late)}; the intervals count them, at the times and from the sides of "
-                "plan.csv: keep its order, and record times",
-            )
+        self.conditions = (self.model, self.options.fixed) if late else None
+        self._drop(
+            late,
+            f"poses are chosen for the other parameters, as time and order alone show "
+            f"{listed(late)}; the intervals count them, at the times and from the sides of "
+            "plan.csv: keep its order, and record times",
+        )
 
     def _drop(self, effects: tuple[str, ...], told: str) -> None:
+        if not effects:
+            return
         self.warnings.append(told)
         model = self.model
         gone = {k for k, p in enumerate(model.parameters) if p.effect in effects}
@@ -260,7 +265,7 @@ class _Design:
                 "share", lambda: {"share": share_within(search, pool, shares, cap, progress)}
             )
             setup = replace(setup, share=float(state["share"]))
-        search = setup.having(pinned)
+            search = setup.having(pinned)
         searches = Searches(search, self.space, self.feasibility)
         effort = EFFORTS[options.effort]
         effort = effort.in_pool if self.cell.design.candidates is None else effort
@@ -323,9 +328,7 @@ class _Design:
 
     def _drawn(self) -> State:
         spec, asked = self.cell.design, (self.cell, self.chain, self.forces, self.feasibility)
-        lots: list[Candidates] = []
-        names: list[str] = []
-        told, options = "", self.options
+        lots, names, told, options = list[Candidates](), list[str](), "", self.options
         if spec.taught is not None:
             self.progress(f"checking the poses of {spec.taught}")
             table = self.model.read_plan(spec.taught)
@@ -438,6 +441,9 @@ class _Design:
         numbers *= blocks.shape[1] // (observed * read.shape[2])
         numbers *= 2 if spec.motion.both_directions else 1
         numbers += 0 if known.done is None else known.done.numbers
+        R, gain = setup.target_rows, None
+        if known.done is not None and R is not None:
+            gain = Gain.of(R, setup.prior, M, self.options.seed)
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
         return Plan(
@@ -473,16 +479,12 @@ class _Design:
             names=self._names(found),
             chance=Chance.of(phi, found.value, setup.criterion),
             everywhere=Everywhere.of(
-                setup.target_rows, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
+                R, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
             ),
             seen=None if seen.all() else seen,
             readings=readings,
             states=self.states,
-            gain=(
-                None
-                if known.done is None or setup.target_rows is None
-                else Gain.of(setup.target_rows, setup.prior, M, self.options.seed)
-            ),
+            gain=gain,
         )  # fmt: skip
 
     def _names(self, found: Selection) -> tuple[str, ...]:
@@ -506,18 +508,6 @@ class _Design:
             names.append(name)
             of_pose[q[i].tobytes()] = name, read[i] if same is None else before | read[i]
         return tuple(names)
-
-
-def _check_home(cell: Cell, feasibility: Feasibility) -> None:
-    home = cell.design.motion.home
-    if home is None:
-        return
-    met = blockers_of(feasibility)(home, home, False)
-    require(
-        not met,
-        f"{cell.path or cell.name}: [design.motion] home brings {listed(met)} too close to each "
-        "other; state another home, or correct the bodies and clearances of [workspace]",
-    )
 
 
 def _check_criterion(model: Model) -> None:

@@ -362,10 +362,7 @@ def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> lis
             return None
         new[low : high + 1] = new[low : high + 1][::-1]
         return new
-    alone = (i == 0 or load[tour[i - 1]] != here) and (
-        i + 1 == len(tour) or load[tour[i + 1]] != here
-    )
-    if alone:
+    if all(load[node] != here for node in (*tour[max(i - 1, 0) : i], *tour[i + 1 : i + 2])):
         return None  # its block would be gone
     new.insert(j, new.pop(i))
     return new
@@ -403,13 +400,8 @@ def with_references(
         if k < len(tour):
             found.append((node, 0))
     most = min((n for s, n in times.items() if not moves.loaded[s]), default=0)
-    if paired:
-        found = [
-            (node, again)
-            for node, again in found
-            if again <= most or not moves.loaded[moves.load[node - 1]]
-        ]
-    return found
+    loaded = moves.loaded[moves.load]
+    return [(v, again) for v, again in found if not paired or again <= most or not loaded[v - 1]]
 
 
 # The order of execution as it is handed on: stops, how to get to them, what it takes.
@@ -504,27 +496,22 @@ class Execution:
 def _stops(moves: Moves, u: int, v: int) -> list[Stop]:
     """The reading of node v after node u, or two where it is approached from both sides."""
     _, way = moves.way(u, v)
-    node = v - 1
+    node, both = v - 1, moves.signs is not None
     pose, load, leave = int(moves.pose[node]), int(moves.load[node]), int(moves.leave[node])
     q, side = moves.points[leave], int(moves.side[node])
     before, after = moves.carries(u), moves.carries(v)
-    if moves.signs is None:
-        passed = way[1:-1] if len(way) > 1 else []
-        change = None if before == after else 0 if after < 0 else len(passed) + 1
-        time = _time(moves, way)
-        return [Stop(pose, load, q, moves.points[passed], time, change)]
-    # The load is exchanged before the last stretch, which is the approach.
-    passed = way[1:] if len(way) > 1 else way
-    change = None if before == after else 0 if after < 0 else len(passed)
-    signs, opposite = moves.signs[pose], 1 - side
-    time = _time(moves, [*way, leave])
+    whole = [*way, leave] if both else way
+    passed = whole[1:-1] or way[:both]
+    # The load is exchanged before the last stretch where that is the approach.
+    change = None if before == after else 0 if after < 0 else len(passed) + (not both)
+    signs = (None, None) if moves.signs is None else moves.signs[pose]
+    time = _time(moves, whole)
     first = Stop(pose, load, q, moves.points[passed], time, change, signs[side], side)
-    if not moves.free[node, opposite]:
+    if not both or not moves.free[node, 1 - side]:
         return [first]
-    other = int(moves.sides[node, opposite])
-    time = _time(moves, [leave, other, leave])
-    via = moves.points[[other]]
-    return [first, Stop(pose, load, q, via, time, None, signs[opposite], opposite)]
+    other = int(moves.sides[node, 1 - side])
+    via, time = moves.points[[other]], _time(moves, [leave, other, leave])
+    return [first, Stop(pose, load, q, via, time, None, signs[1 - side], 1 - side)]
 
 
 def _time(moves: Moves, way: list[int]) -> float:

@@ -229,11 +229,9 @@ def _root(A: Array, weight: Array) -> Array:
 def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...]:
     if len(unseen) < 2:
         return tuple(why(model, found, i) for i in unseen)
-    names = [model.names[i] for i in unseen]
-    loaded = model.cell.design.loads is not None and bool(np.any(model.cell.design.loads))
-    remedy = (
-        "change the load's direction or the limits" if loaded else "state a load ([design] loads_N)"
-    )
+    names, loads = [model.names[i] for i in unseen], model.cell.design.loads
+    loaded, remedy = loads is not None and loads.any(), "state a load ([design] loads_N)"
+    remedy = "change the load's direction or the limits" if loaded else remedy
     return (
         f"no feasible pose shows {listed(names)}: they move no marker in any of them; {remedy}, or "
         f"leave them out ({option('fixed', names[0])})",
@@ -244,9 +242,7 @@ def _combination(model: Model, found: Estimable) -> Array | None:
     wanted = model.cell.design.combination
     if not wanted:
         return None
-    a = np.zeros(len(model.names))
-    for name, factor in wanted.items():
-        a[model.names.index(name)] = factor
+    a = np.array([wanted.get(name, 0.0) for name in model.names])
     lost = unpredictable(a[None, None], found)
     if lost is not None:
         raise InsufficientDataError(
@@ -339,10 +335,9 @@ def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, kno
     own = np.isin([model.names[c] for c in kept], without.names)
     shown = predicted(model, found, M, len(B))
     names = dict.fromkeys(p.effect for p in model.parameters if p.name not in without.names)
-    try:
+    errors: tuple[float | None, float | None] = (None, None)
+    with suppress(InsufficientDataError):
         A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
-    except InsufficientDataError:
-        return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
-    R = _root(A, targets.weight)
-    errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
+        R = _root(A, targets.weight)
+        errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
     return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
