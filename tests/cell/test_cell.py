@@ -283,6 +283,7 @@ WRONG = {
     "[workspace.obstacle]\nname = 'a'": "key workspace.obstacle takes tables|[[work",
     "[workspace]\nobstacle = [1]": "[[workspace.obstacle]] no. 1 takes a table|1",
     BOX + "radius_m = 1": "radius_m of|no meaning for a box, which takes size_m",
+    BOX + BOX.replace("[1, 2, 3]", "'x'"): "key size_m of [[workspace.obstacle]] no. 2 takes",
     BOX + BOX: "name of [[workspace.obstacle]] no. 2 repeats 'table'|no. 1",
     BOX.replace("'table'", "' a'"): "one line without blanks",
     BOX.replace("table", "link2"): "'link2', which names a part of the arm",
