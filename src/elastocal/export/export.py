@@ -479,13 +479,13 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
         arm.model.opt.gravity[:] = 0.0
     at_rest = partial(MujocoRest(text, arm).points, pieces=pieces)
     distance = _check_rest(at_rest, pieces, kept, arm.tree.placed(arm.base), wish.seed)
-    if pieces.yielding and not pieces.masses:
+    if pieces.springs and not pieces.masses:
         warnings.append(
             "the links weigh in this file and did not in the model that was identified: their "
             "weights deflect the springs a second time; set [model] link_gravity = true and "
             "identify anew, or switch gravity off in the file"
         )
-    if pieces.yielding:
+    if pieces.springs:
         warnings += _rigid_joints(pieces, "")
         warnings.append(
             "the springs stand in series with the joints: hold those by stiff actuators, whose "
@@ -496,7 +496,7 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
 
 
 def _rigid_joints(pieces: ExportNumbers, how: str) -> list[str]:
-    springs = {s.site for s in pieces.yielding}
+    springs = {s.site for s in pieces.springs}
     joints = [f"joint{i + 1}" for i in range(pieces.chain.n_joints)]
     rigid = ", ".join(joint for joint in joints if joint not in springs)
     return [f"no compliance was identified for {rigid}: rigid in this file{how}"] if rigid else []

@@ -204,8 +204,8 @@ class ExportNumbers:
 
     `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of
     the joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point`
-    (3,) in the flange frame; `load_scale`: what acts per newton declared; `masses`: as in Chain,
-    empty where no weights act.
+    (3,) in the flange frame; `load_scale`: what acts per newton declared; `springs`: those that
+    yield; `masses`: as in Chain, empty where no weights act.
     """
 
     chain: Chain
@@ -228,12 +228,8 @@ class ExportNumbers:
         """`masses`, else those of the robot's description, where no weights act in the model."""
         return self.masses or self.chain.masses
 
-    @property
-    def yielding(self) -> list[SpringValue]:
-        return [s for s in self.springs if s.compliance > 0]
-
     def springs_at(self, site: str) -> list[SpringValue]:
-        return [s for s in self.yielding if s.site == site]
+        return [s for s in self.springs if s.site == site]
 
     @property
     def points(self) -> Array:
@@ -296,6 +292,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
         springs=tuple(
             SpringValue(s.name, s.site, s.kind, s.axis, float(k))
             for s, k in zip(arm.springs, compliances[:, 0], strict=True)
+            if k > 0
         ),
         masses=_masses(model.chain, values, model.cell.model.link_gravity),
     )

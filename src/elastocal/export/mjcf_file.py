@@ -344,7 +344,7 @@ def corrected_mjcf(
             text.move(body, X @ correction @ np.linalg.inv(X))
         sprung[j] = text.add_springs(i, j)
     text.lengthen_keys(sprung)
-    told = text.let_act() if pieces.yielding else []
+    told = text.let_act() if pieces.springs else []
     told += text.correct_flange(frames)
     text.correct_masses()
     text.insert_in(text.tags[0], f"\n  {comment(note)}")

@@ -454,7 +454,7 @@ def _decompose(
     return rows, carried
 
 
-def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[DhRow | None]:
+def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> Sequence[DhRow | None]:
     """What the user's own table says of links 0 … n; None where it is in another convention."""
     nothing: list[DhRow | None] = [None] * (chain.n_joints + 1)
     if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in UR_ENDINGS:
@@ -469,6 +469,6 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     numbers = np.nan_to_num([[dh.dh_number(table, i, *key) for key in keys] for i in range(n)])
     own = [DhRow(), *(DhRow(*row) for row in numbers.tolist())]
     if convention == "standard":
-        return [*own]
+        return own
     pairs = zip(own, [*own[1:], DhRow()], strict=True)  # θ and d of one, the rest of the next
     return [replace(after, theta=row.theta, d=row.d) for row, after in pairs]
