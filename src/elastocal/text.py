@@ -40,6 +40,13 @@ def listed(names: Iterable[str], limit: int = 40) -> str:
     return ", ".join(names[:limit]) + more
 
 
+def some(names: Iterable[str], most: int, joint: str = ", ", more: str = " and {} more") -> str:
+    """ "a, b and 3 more": the first of them, and how many there are besides."""
+    names = list(names)
+    rest = len(names) - most
+    return joint.join(names[:most]) + (more.format(rest) if rest > 0 else "")
+
+
 def counted(n: int, one: str, many: str | None = None) -> str:
     """ "1 pose", "2 poses"."""
     return f"{n} {one if n == 1 else many or one + 's'}"

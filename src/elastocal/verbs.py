@@ -536,8 +536,7 @@ def identify(
             f"{option('prior')} and {option('knowledge')} both state a prior; drop one",
         )
         prior = prior or known_prior
-    if prior is not None or constraints is not None:
-        options = replace(options, constraints=constraints, prior=prior)
+    options = replace(options, constraints=constraints, prior=prior)
     used = None
     if made.cell.design.states_test_poses:
         from elastocal.planning.test_poses import test_poses

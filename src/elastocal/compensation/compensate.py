@@ -45,7 +45,7 @@ from elastocal.model.inverse_kinematics import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import nominal_flanges, reach_of
 from elastocal.tables import column, csv_text
-from elastocal.text import listed, plain
+from elastocal.text import listed, plain, some
 from elastocal.units import Array, BoolArray, IntArray
 
 # Targets: where the tool is to be, and in which frame that is stated.
@@ -630,8 +630,7 @@ def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: BoolArray) -> Arr
 def _rows(targets: Targets, which: NDArray) -> str:
     """ "targets.csv, line 7 and 3 more" of a mask or of row indices."""
     rows = np.flatnonzero(which) if which.dtype == bool else which
-    more = f" and {len(rows) - 1} more" if len(rows) > 1 else ""
-    return f"{targets.place(int(rows[0]))}{more}"
+    return some((targets.place(int(row)) for row in rows), 1)
 
 
 # Commands as files: the table that a robot program is made from, and a summary.
@@ -666,10 +665,9 @@ def check_status(
     kinds = dict.fromkeys(s for _, s in lost)
     # That they are not reached has been said; why is told of each where the reasons differ.
     same = len(kinds) == 1
-    named = ", ".join(row if same else f"{row} ({s})" for row, s in lost[:NAMED])
-    more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
+    named = some((row if same else f"{row} ({s})" for row, s in lost), NAMED)
     raise InsufficientDataError(
-        f"{what % (len(lost), len(status))} are not reached: {named}{more}{': ' if same else '. '}"
+        f"{what % (len(lost), len(status))} are not reached: {named}{': ' if same else '. '}"
         + (remedies[lost[0][1]] if same else "; ".join(f"{k}: {remedies[k]}" for k in kinds))
         + f". Nothing was written; {option('partial', True)} writes the others"
     )

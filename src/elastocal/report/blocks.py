@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from elastocal.errors import InputError
+from elastocal.measurements import in_file_units
 from elastocal.model.chain import numbered
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of
 from elastocal.model.manipulator import load_chain
@@ -344,12 +345,9 @@ def joint_heads(kinds: Sequence[str]) -> list[str]:
     return [f"q{i + 1} {'°' if kind == 'revolute' else 'mm'}" for i, kind in enumerate(kinds)]
 
 
-def joint_texts(q: Iterable[float], kinds: Sequence[str], decimals: int = 2) -> list[str]:
+def joint_texts(q: Array, kinds: Sequence[str], decimals: int = 2) -> list[str]:
     """Joints q (n,) in rad or m as texts in ° or mm."""
-    return [
-        f"{math.degrees(v) if kind == 'revolute' else v * 1e3:.{decimals}f}"
-        for v, kind in zip(q, kinds, strict=True)
-    ]
+    return [f"{v:.{decimals}f}" for v in in_file_units(q, kinds)]
 
 
 def first_stops(plan: Plan) -> dict[int, int]:

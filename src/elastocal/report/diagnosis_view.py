@@ -21,7 +21,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.measurements import by_rows
 from elastocal.report import blocks as say
-from elastocal.text import printable
+from elastocal.text import printable, some
 
 MOST_CANDIDATES = 8
 MOST_TESTS = 12
@@ -314,10 +314,9 @@ def sensitivity(d: Diagnosis) -> list[str]:
     faint = [c for c in d.candidates if c.hidden]
     text = f"of {len(d.candidates)} candidates {len(visible)} would have been found at typical size"
     if faint:
-        names = list(dict.fromkeys(say.plain_name(c.effect) for c in faint))
-        more = len(names) - MOST_NAMED
-        text += f"; below the noise even then: {len(faint)} ({', '.join(names[:MOST_NAMED])}"
-        text += f" and {more} more kinds)" if more > 0 else ")"
+        kinds = dict.fromkeys(say.plain_name(c.effect) for c in faint)
+        names = some(kinds, MOST_NAMED, more=" and {} more kinds")
+        text += f"; below the noise even then: {len(faint)} ({names})"
     return [*lines, f"{text}."]
 
 

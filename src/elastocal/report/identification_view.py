@@ -37,7 +37,7 @@ from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import judgement_view as words
 from elastocal.report.judgement_view import judgement, warnings_beside
-from elastocal.text import listed, printable
+from elastocal.text import listed, printable, some
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -491,9 +491,8 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.S
         if kind == COMBINED:
             why = f"only as {shortened(result.combination(e.name))}"
         elif kind == ABSORBED:
-            several = len(e.combined_with) - 3
-            names = ", ".join(printable(n) for n in e.combined_with[:3])
-            why = f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
+            names = some(map(printable, e.combined_with), 3, more=" + {} more")
+            why = f"held: absorbed in {names}"
         elif kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}: {limits(result, e)}"
         else:

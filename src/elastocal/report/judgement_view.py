@@ -20,7 +20,7 @@ from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
-from elastocal.text import gathered, listed, printable
+from elastocal.text import gathered, listed, printable, some
 
 
 @dataclass(frozen=True)
@@ -287,8 +287,7 @@ def constraints_line(result: Calibration) -> str | None:
         value, unit = say.display(a.value, units[a.names[0]])
         return f"{printable(a.names[0])} {SIGNS[a.kind]} {say.plain(value)} {unit}"
 
-    more = len(active) - MOST_NAMED
-    text = "; ".join([*map(told, active[:MOST_NAMED]), *([f"and {more} more"] * (more > 0))])
+    text = some(map(told, active), MOST_NAMED, "; ", "; and {} more")
     bound = any(a.kind != "equality" for a in active)
     want = "; the readings alone would go beyond the bounds" if bound else ""
     held = "Intervals take these for exact"
@@ -309,13 +308,10 @@ def prior_line(result: Calibration) -> str | None:
     if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
         return f"No estimate is mostly prior (largest share {percent(largest)})."
-    mostly = [str(name) for name in found.listed("parameters")]
-    named = ", ".join(f"{printable(n)} {percent(shares[n])}" for n in mostly[:MOST_NAMED])
-    more = len(mostly) - MOST_NAMED
-    tail = f", and {more} more" if more > 0 else ""
-    return (
-        f"Mostly prior, share of the information: {named}{tail}. Measure poses that load them more."
-    )
+    mostly = map(str, found.listed("parameters"))
+    told = (f"{printable(name)} {percent(shares[name])}" for name in mostly)
+    named = some(told, MOST_NAMED, more=", and {} more")
+    return f"Mostly prior, share of the information: {named}. Measure poses that load them more."
 
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes

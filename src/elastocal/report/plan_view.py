@@ -13,7 +13,7 @@ from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name
 from elastocal.report import blocks as say
-from elastocal.text import listed, printable
+from elastocal.text import listed, printable, some
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
@@ -122,11 +122,8 @@ def interval_table(plan: Plan) -> say.ShownTable:
     rows: list[tuple[str, ...]] = []
     for p in plan.predicted:
         shown, unit = say.display(p.half_width, p.unit)
-        names = [printable(name) for name in p.combined_with]
-        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-        rows.append(
-            (printable(p.name), say.significant(shown, 2), unit, ", ".join(names[:3]) + more)
-        )
+        others = some(map(printable, p.combined_with), 3)
+        rows.append((printable(p.name), say.significant(shown, 2), unit, others))
     heads = ("parameter", "± 95 %", "unit", "together with")
     table = say.ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
     return table if any(p.combined_with for p in plan.predicted) else table.without(3)

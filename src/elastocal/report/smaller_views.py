@@ -29,7 +29,7 @@ from elastocal.report.identification_view import (
     what_was_identified,
 )
 from elastocal.report.judgement_view import judgement, method_and_weights
-from elastocal.text import listed, printable
+from elastocal.text import listed, printable, some
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -75,9 +75,8 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         tone, verdict = "good", "No significant change: the differences are within the noise."
         steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
     elif c.changed:
-        more, names = len(c.changed) - MOST_NAMED, [printable(change.name) for change in c.changed]
-        told = ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-        verdict = f"The arm has changed: {told}."
+        names = some((printable(change.name) for change in c.changed), MOST_NAMED)
+        verdict = f"The arm has changed: {names}."
     else:
         verdict = "The arm has changed, but no single parameter is significant."
     yield say.ShownVerdict(tone, verdict)
@@ -293,11 +292,10 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
         yield say.Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
-    if held := list(done.held):
-        more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+    if done.held:
         yield say.Sentence(
             "Not determined by the data, at the values that the identification predicts with: "
-            f"{', '.join(held[:8])}{more}."
+            f"{some(done.held, 8)}."
         )
     if done.of_the_measurement:
         left = ", ".join(done.of_the_measurement)
@@ -392,7 +390,7 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
         f"{say.load_text(force)}: {say.counted(int(n), 'reading')}"
         for force, n in zip(forces, sizes, strict=True)
     ]
-    yield "Loads", "; ".join(loads[:8] + [f"{len(loads) - 8} more"] * (len(loads) > 8))
+    yield "Loads", some(loads, 8, "; ", "; {} more")
     if joined is not None:
         remarks = [r for r in joined.remarks if not r.startswith("WARNING: ")]
         yield "Joined", "; ".join([f"by {joined.how}", *remarks])
@@ -443,10 +441,12 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     stated = result.model.cell.tracker.noise
     noise = "none stated" if result.observations.table.sigma is None else "stated with each reading"
     if stated is not None:
+        # The numbers of three axes, or the one that all have.
+        each = {name: dict.fromkeys(np.atleast_1d(v).tolist()) for name, v in vars(stated).items()}
         noise = ", ".join(
-            f"{name.replace('_', ' ')} {', '.join(map(say.length, _each(value)))}"
+            f"{name.replace('_', ' ')} {', '.join(map(say.length, sizes))}"
             + (" per m" if name.endswith("per_m") else "")
-            for name, value in vars(stated).items()
+            for name, sizes in each.items()
         )
     facts = [
         ("Robot", printable(result.model.chain.name)),
@@ -460,11 +460,6 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         *prediction_lines(result),
     ]
     yield say.ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
-
-
-def _each(value: float | Array) -> list[float]:
-    """A number, the numbers of three axes, or the one that all have."""
-    return [float(v) for v in dict.fromkeys(np.atleast_1d(value).tolist())]
 
 
 @dataclass(frozen=True)
