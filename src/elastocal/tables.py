@@ -61,7 +61,6 @@ class CsvLines:
     """An open CSV file: `header` and `delimiter` from its first line, and `rows`, the others.
 
     `comments`: lines that begin with # are passed over, and so are lines of empty cells.
-    Raises InputError where the file is empty, not UTF-8 text, or its first line is blank.
     """
 
     def __init__(

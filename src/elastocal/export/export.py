@@ -44,9 +44,7 @@ PARAMETERS = "elastocal/parameters/1"
 KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
 
 
-def _parameters(
-    calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost, format: str
-) -> str:  # fmt: skip
+def _parameters(calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost, format: str) -> str:
     """Everything to be written: estimates, the geometry they make, and that geometry's cost.
 
     Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
@@ -240,9 +238,8 @@ def export(
 ) -> Exported:
     """The calibrated arm as the text of a file.
 
-    Raises InputError where the format cannot be written for this robot, InsufficientDataError
-    where no random pose has an equilibrium under the load, and ElastocalError where the text,
-    read back, is another arm than the model.
+    Raises InsufficientDataError where no random pose has an equilibrium under the load, and
+    ElastocalError where the text, read back, is another arm than the model.
     """
     for asked, given, formats in (
         (option("base_frame"), wish.base_frame, FRAMED),

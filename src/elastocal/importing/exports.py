@@ -342,8 +342,7 @@ def seconds_of(
 ) -> list[float]:
     """Seconds since 1970 (UTC) of the times of a column; one without a zone is taken as UTC.
 
-    The first of `formats` (strptime, or ISO 8601) that reads the first text reads all.  Raises
-    InputError where none does.
+    The first of `formats` (strptime, or ISO 8601) that reads the first text reads all.
     """
     chosen, found = [*formats, ISO], list[float]()
     for line, text in zip(lines, texts, strict=True):
