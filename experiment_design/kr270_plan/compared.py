@@ -66,7 +66,7 @@ class Study:
     def rho(self, q: np.ndarray) -> float:
         """Predicted ρ₀ in µm of the poses q (N, n)."""
         value = self.setup.value(q)
-        return self.setup.criterion.reported(value)[0]
+        return self.setup.criterion.figure(value)
 
     def allowed(self, q: np.ndarray) -> np.ndarray:
         """(N,) poses that the cell allows in every load state."""

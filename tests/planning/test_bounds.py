@@ -62,7 +62,7 @@ def by_cone(problem, name):
         limits.append(cp.bmat([[M, X], [X, np.eye(p)]]) >> 0)
         goal = cp.Minimize(cp.matrix_frac(np.eye(p), X))
     else:
-        F = one.A if name == "G" else one.F[None]
+        F = one.F if name == "G" else one.F[None]
         goal = cp.Minimize(cp.maximum(*[sum(cp.matrix_frac(f, M) for f in F_t) for F_t in F]) if
                            len(F) > 1 else sum(cp.matrix_frac(f, M) for f in F[0]))  # fmt: skip
     found = cp.Problem(goal, limits).solve(solver=cp.CLARABEL)

@@ -117,8 +117,8 @@ def test_every_criterion_is_what_its_definition_says():
     assert set(expected) == set(CRITERIA)
     for name, (figure, unit) in expected.items():
         phi = criterion(name)
-        told = phi.reported(float(phi.of_information(rows.T @ rows)))
-        assert told == (pytest.approx(figure, rel=1e-9), unit), name
+        told = phi.figure(float(phi.of_information(rows.T @ rows)))
+        assert told == pytest.approx(figure, rel=1e-9) and phi.unit == unit, name
 
 
 A = np.ones((2, 3, P))
@@ -169,7 +169,7 @@ OWN = {
         ((Named,), {}, 'has no name that a cell file can state; add one, as in name = "my_'),
         ((Named,), {"name": "two\nlines"}, "has no name that a cell file can state"),
         ((TraceCriterion,), {"name": "own"}, r"\('own'\) is not complete: define of$"),
-        ((SpectralCriterion,), {"name": "own"}, "not complete: define figure, phi, phi_slope"),
+        ((SpectralCriterion,), {"name": "own"}, "not complete: define phi, phi_slope"),
         ((SpectralCriterion,), OWN, "is certifiable but states no curvature"),
         ((), {"name": "own"}, "takes a class derived from ScenarioCriterion"),
     ],

@@ -117,14 +117,14 @@ def the_value_is_that_of_the_poses_and_no_less_than_its_bound(
 ) -> None:
     value = setup.value(plan.q)
     assert plan.value == pytest.approx(value, rel=1e-9)
-    assert (plan.reported, plan.unit) == setup.criterion.reported(plan.value)
+    assert plan.reported == setup.criterion.figure(plan.value)
     c = plan.certificate
     assert c.bound_pool is not None and c.efficiency_pool is not None
     assert 0 < c.bound_pool <= value * (1 + 1e-9)
     assert 0 < c.efficiency_pool <= 1
     assert c.efficiency_pool == pytest.approx(min(c.bound_pool / value, 1.0), rel=1e-9)
     assert 0 < c.efficiency_continuum <= c.efficiency_pool * (1 + 1e-9)
-    assert plan.bound_reported == setup.criterion.reported(c.bound_pool)[0]
+    assert plan.bound_reported == setup.criterion.figure(c.bound_pool)
     assert c.pool >= plan.model.cell.design.candidates  # with what polish found
 
 

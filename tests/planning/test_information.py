@@ -105,11 +105,11 @@ def test_a_marker_is_seen_in_range_turned_to_the_tracker_and_behind_nothing() ->
     # L is turned away; R is behind the ball, then out of range as well as C; then C behind it.
     q = gantry_at((0.2, 0, 0), (-0.05, 0, 0), (0.2, 1.0, 0), (-2, 0, 0))
     one = rules(1)
-    assert one.partial
+    assert one.seen is not None
     assert one.seen(q[:2], NOTHING).tolist() == [[False, True, False]] * 2
     assert one.feasible(q, NOTHING).tolist() == [True, True, False, False]
     assert not rules(2).feasible(q, NOTHING).any()
-    assert not rules(3).partial
+    assert rules(3).seen is None
     assert "min_markers" in rules(2).advice(rules(2).check(q, NOTHING))
 
 

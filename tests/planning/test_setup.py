@@ -102,7 +102,7 @@ def test_the_value_is_what_identification_would_leave_at_the_test_poses(case: st
     expected = remaining_error(cell, chain, q, targets)
     value = setup.value(q)
     assert value == pytest.approx(expected, rel=1e-5)
-    assert setup.criterion.reported(value) == (pytest.approx(1e6 * np.sqrt(expected)), "µm")
+    assert setup.criterion.figure(value) == pytest.approx(1e6 * np.sqrt(expected))
 
 
 # --- what is known before --------------------------------------------------------------------
@@ -201,9 +201,8 @@ def test_a_combination_has_the_variance_of_its_terms() -> None:
     V = V * np.outer(setup.information.sizes, setup.information.sizes)
     expected = V[0, 0] - 4 * V[0, 1] + 4 * V[1, 1]
     assert setup.value(TABLE_2) == pytest.approx(expected, rel=1e-9)
-    assert setup.criterion.reported(setup.value(TABLE_2)) == pytest.approx(
-        (np.sqrt(expected), "rad/(N*m)")
-    )
+    assert setup.criterion.figure(setup.value(TABLE_2)) == pytest.approx(np.sqrt(expected))
+    assert setup.criterion.unit == "rad/(N*m)"
 
 
 def test_a_plan_estimates_what_identification_will() -> None:

@@ -9,12 +9,17 @@ class Discs:
     """Moves are free where they stay out of discs (k, 3) of x, y, radius; the load adds `grow`
     to the radii.  Counts what it is asked."""
 
+    named = ()  # what it says is in the way
+
     def __init__(self, discs=(), grow=0.0):
         self.discs, self.grow, self.asked = np.reshape(discs, (-1, 3)), grow, []
 
     def paths_free(self, q_from, q_to, loaded):
         self.asked += [(tuple(a), tuple(b), loaded) for a, b in zip(q_from, q_to, strict=True)]
         return np.array([self.free(a, b, loaded) for a, b in zip(q_from, q_to, strict=True)])
+
+    def blockers(self, q_from, q_to, loaded):
+        return self.named
 
     def free(self, a, b, loaded):
         step = b - a

@@ -124,12 +124,11 @@ def visit_pool_of(
 def _hidden(model: Model, q: Array, forces: Array, markers: tuple[str, ...]) -> BoolArray:
     """(N·L·M,): the tracker does not see the marker of pose q (N, n) under that of `forces` (L, 3),
     or for deflections under another of them."""
-    sight, stated = model.cell.workspace.visibility, list(model.cell.tool.markers)
-    if sight is None or sight.min_markers is None:
+    seen, stated = Feasibility(model.cell, model.chain).seen, list(model.cell.tool.markers)
+    if seen is None:
         return np.zeros(len(q) * len(forces) * len(markers), dtype=bool)
-    rules = Feasibility(model.cell, model.chain)
     own = [stated.index(name) for name in markers]
-    hidden = np.stack([~rules.seen(q, force)[:, own] for force in forces], axis=1)
+    hidden = np.stack([~seen(q, force)[:, own] for force in forces], axis=1)
     if model.observe == "deflection":
         hidden |= hidden.any(axis=1, keepdims=True)
     return hidden.ravel()

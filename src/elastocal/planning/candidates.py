@@ -122,9 +122,13 @@ def draw(
     drawn: list[Candidates] = []
     for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
         progress(f"drawing candidates, level {group + 1} of {groups}")
-        chunks = _checked(checker, forces, group, sobol(space, group, stream), jobs)
-        lot = _fill(chunks, n // groups + (group < n % groups))
-        if not len(lot.q):
+        wanted, lots, count = n // groups + (group < n % groups), list[Candidates](), 0
+        for lot in _checked(checker, forces, group, sobol(space, group, stream), jobs):
+            lots.append(lot)
+            count += len(lot.q)
+            if count >= wanted or len(lots) * CHUNK >= max(TRIES * wanted if count else 0, GIVE_UP):
+                break
+        if not count:
             some = np.concatenate([*islice(sobol(space, group, stream), PER_TASK)])
             at, j = "", space.held
             if j is not None:
@@ -133,7 +137,8 @@ def draw(
                 f"{cell.path or cell.name}: no feasible pose found{at}; "
                 f"{checker.advice(checker.every(some, forces))}"
             )
-        drawn.append(lot)
+        lot = Candidates.join(lots)
+        drawn.append(replace(lot, q=lot.q[:wanted], group=lot.group[:wanted]))
     return Candidates.join(drawn)
 
 
@@ -214,15 +219,6 @@ def _checked(
         while True:
             wave = islice(chunks, PER_TASK * effective_n_jobs(jobs))
             yield from pool([delayed(_check)(checker, forces, group, q) for q in wave])
-
-
-def _fill(chunks: Iterator[Candidates], wanted: int) -> Candidates:
-    lots, count = list[Candidates](), 0
-    while count < wanted and len(lots) * CHUNK < max(TRIES * wanted if count else 0, GIVE_UP):
-        lots.append(next(chunks))
-        count += len(lots[-1].q)
-    found = Candidates.join(lots)
-    return replace(found, q=found.q[:wanted], group=found.group[:wanted])
 
 
 def told(chain: Chain, j: int, value: float) -> str:

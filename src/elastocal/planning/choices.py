@@ -146,14 +146,14 @@ class Choice:
         ):
             found, after = replace(found, cell=cell), before
         assert after is not None
-        figure, unit = after.setup.criterion.reported(after.relaxed.value)
+        criterion = after.setup.criterion
         places = np.stack([boxes.places(cell), boxes.places(found.cell)], axis=1)
         return Chosen(
             places=dict(zip(boxes.names, places, strict=True)),
             loads=None if freedom.loads is None else found.cell.design.loads,
-            before=None if before is None else after.setup.criterion.figure(before.relaxed.value),
-            after=figure,
-            unit=unit,
+            before=None if before is None else criterion.figure(before.relaxed.value),
+            after=criterion.figure(after.relaxed.value),
+            unit=criterion.unit,
             candidates=len(after.pool),
             share=(None if before is None else before.share, after.share),
         )
@@ -236,7 +236,7 @@ class Choice:
             drawn = self.draw(cell, drawn) if isinstance(drawn, int) else drawn
             setup = set_up(
                 Model.assembled(chain, cell), drawn.q, int(shares.sum()), self.targets, self.known,
-                self.region, rules.seen if rules.partial else None, self.work,
+                self.region, rules.seen, self.work,
             )  # fmt: skip
             if read is not None:
                 setup = replace(setup, ways=cell.design.repeats * read)

@@ -82,12 +82,21 @@ def triangular(F: Array) -> Array:
     return np.asarray(R, dtype=np.float64)
 
 
+def root(A: Array, weight: Array) -> Array:
+    """R (r, p) with RᵀR = Σ_t w_t A_tᵀ A_t, A (T, r, p)."""
+    return triangular((np.sqrt(weight)[:, None, None] * A).reshape(-1, A.shape[-1]))
+
+
 @dataclass(frozen=True)
 class TangentBound:
     """Φ(M') ≥ `value`²/⟨G, M'⟩ for every M' (p, p), of a certifiable criterion; G (p, p)."""
 
     value: float
     G: Array
+
+    def bound(self, prior: Array, reach: float) -> float:
+        """On Φ wherever ⟨G, M'⟩ is at most `reach` more than ⟨G, prior⟩."""
+        return self.value**2 / (float((self.G * prior).sum()) + reach)
 
 
 # What a criterion is made from, and what it is.
@@ -157,13 +166,15 @@ class ScenarioCriterion(ABC):
     the figure a user knows (see `figure`), and `better` which figure is the better one.
     `needs`: what is worked out for it from the cell.  `certifiable`: 1/Φ is concave in M = V⁻¹ and
     `curvature` is stated; otherwise plans come by exchange and polish alone, and `without_bound`
-    completes "criterion NAME …".
+    completes "criterion NAME …".  `kinked`: Φ is the largest of many, a power mean whose field
+    `order` is inf.
     """
 
     name: str
     title: str = ""
     unit: str = ""
     better: Literal["smaller", "larger"] = "smaller"
+    scale: float = 1.0
     needs: ClassVar[tuple[Need, ...]] = ()
     certifiable: bool = False
     without_bound: str = "states no curvature"
@@ -186,13 +197,11 @@ class ScenarioCriterion(ABC):
         """D²Φ[X_i, X_j] (k, k) for directions X (k, p, p) of V; 0 where Φ is linear in V."""
         return 0.0
 
-    @abstractmethod
     def figure(self, value: float) -> float:
-        """The figure a user knows, from Φ."""
-
-    def reported(self, value: float) -> tuple[float, str]:
-        """The figure a user knows, from Φ, and its unit."""
-        return self.figure(value), self.unit
+        """The figure a user knows, from Φ: `scale` · √Φ, its reciprocal where the larger is the
+        better one."""
+        root = self.scale * float(np.sqrt(value))
+        return 1 / root if self.better == "larger" else root
 
     def of_information(self, M: Array) -> Array:
         """Φ (...,) of M (..., p, p); inf where M is singular."""
@@ -201,9 +210,14 @@ class ScenarioCriterion(ABC):
         return np.where(ok, self.value(V), np.inf)
 
     def tangent_at(self, V: Array) -> TangentBound:
-        """The tangent of 1/Φ at V (p, p)."""
-        value, C = self.tangent(V)
-        return TangentBound(value, V @ C @ V)
+        """The tangent of 1/Φ at V (p, p), or nearer to a maximum that is softened here: where its
+        pieces count with weights that sum to 1."""
+        (value, C), total = self.slope(V), self.weight(V)
+        return TangentBound(value / total, V @ C @ V / total)
+
+    def weight(self, V: Array) -> float:
+        """Of all pieces of a softened maximum together in the slope at V (p, p)."""
+        return 1.0
 
     def turned(self, T: Array) -> ScenarioCriterion:
         """The same criterion of the parameters z, y = T z, T (p, k)."""
@@ -212,24 +226,15 @@ class ScenarioCriterion(ABC):
     def softened(self, q: float) -> ScenarioCriterion:
         """A smooth criterion nowhere above this one, towards which it grows with q: kinks (a
         largest eigenvalue or pose) become power means.  Without kinks it is its own."""
-        return self
-
-    def tangent(self, V: Array) -> tuple[float, Array]:
-        """L and C with L = ⟨C, V⟩ and ⟨C, V'⟩ or Φ(V') of concave reciprocal below Φ everywhere;
-        at a kink of weights that sum to 1, so that it is as near Φ as can be."""
-        return self.slope(V)
+        return replace(self, order=q) if self.kinked else self  # type: ignore[type-var]
 
 
-@dataclass(frozen=True)
 class Turned(ScenarioCriterion):
     """Φ(T V Tᵀ): `base` of the parameters y = T z, as a function of the covariance V of z."""
 
-    base: ScenarioCriterion
-    T: Array
-
-    def __post_init__(self) -> None:
-        for what in ("name", "title", "unit", "better", "certifiable", "without_bound", "kinked"):
-            object.__setattr__(self, what, getattr(self.base, what))
+    def __init__(self, base: ScenarioCriterion, T: Array) -> None:
+        self.base, self.T, self.name = base, T, base.name
+        self.certifiable, self.without_bound = base.certifiable, base.without_bound
 
     def value(self, V: Array) -> Array:
         return self.base.value(self.T @ V @ self.T.T)
@@ -250,10 +255,6 @@ class Turned(ScenarioCriterion):
     def softened(self, q: float) -> Turned:
         return Turned(self.base.softened(q), self.T)
 
-    def tangent(self, V: Array) -> tuple[float, Array]:
-        value, C = self.base.tangent(self.T @ V @ self.T.T)
-        return value, self.T.T @ C @ self.T
-
 
 # Variances of linear functions of the parameters.
 
@@ -269,7 +270,6 @@ class TraceCriterion(ScenarioCriterion):
 
     F: Array
     name = "L"
-    scale = 1.0
     certifiable = True
 
     def __post_init__(self) -> None:
@@ -292,11 +292,7 @@ class TraceCriterion(ScenarioCriterion):
     def turned(self, T: Array) -> ScenarioCriterion:
         if type(self).value is not TraceCriterion.value:
             return Turned(self, T)
-        F = self.F @ T
-        return replace(self, F=triangular(F))
-
-    def figure(self, value: float) -> float:
-        return self.scale * float(np.sqrt(value))
+        return replace(self, F=triangular(self.F @ T))
 
 
 # Eigenvalues of the covariance of the parameters of interest.
@@ -366,22 +362,24 @@ def _positive(lam: Array) -> Array:
 
 @dataclass(frozen=True)
 class MeanCriterion(SpectralCriterion):
-    """Φ the mean of the λ of order q (Kiefer's matrix means): D at 0, O5 at ½, A at 1, E at inf.
+    """Φ = c · the mean of the λ of order q (Kiefer's matrix means): D at 0, O5 at ½, A at 1, E at
+    inf; c = `factor`.
 
     Source: Kiefer 1974, Annals of Statistics 2, 849–879; Pukelsheim 2006, ch. 6.
     """
 
     order: float = 1.0
+    factor: float = 1.0
     certifiable = True
 
     def phi(self, lam: Array) -> Array:
-        return power_mean(lam, self.order)
+        return self.factor * power_mean(lam, self.order)
 
     def phi_slope(self, lam: Array) -> Array:
-        return mean_slope(lam, self.order)
+        return self.factor * mean_slope(lam, self.order)
 
     def phi_curvature(self, lam: Array) -> Array:
-        return mean_curvature(lam, self.order)
+        return self.factor * mean_curvature(lam, self.order)
 
 
 # The criteria there are: variances of linear functions of the parameters.
@@ -408,8 +406,7 @@ class RemainingError(TraceCriterion):
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:
         A, weights = inputs.targets(), inputs.target_weights()
-        rows = np.sqrt(weights / weights.sum())[:, None, None] * A
-        return cls(triangular(rows.reshape(-1, A.shape[-1])))
+        return cls(root(A, weights / weights.sum()))
 
 
 @dataclass(frozen=True)
@@ -470,30 +467,22 @@ class CombinationVariance(TraceCriterion):
 
 
 @dataclass(frozen=True)
-class GCriterion(ScenarioCriterion):
+class GCriterion(TraceCriterion):
     """Φ = max_t tr(A_t V A_tᵀ), V = M⁻¹, in m²: the worst of a region's T points.
 
-    A (T, r, p) in m per scaled parameter: what is predicted at point t, as r components.
+    F (T, r, p), the A_t, in m per scaled parameter: what is predicted at point t, as r components.
     A finite `order` q gives the power mean (Σ_t φ_t^q / T)^{1/q} ≤ Φ, smooth.  `reported`: √Φ in
     µm, the root mean square error at the worst point.
     Source: Kiefer & Wolfowitz 1960; Atkinson, Donev & Tobias 2007, ch. 9 and 10.
     """
 
-    A: Array
     order: float = np.inf
     name = "G"
     title = "G-optimality: error of prediction at the worst test pose, rms"
     unit = "µm"
+    scale = 1e6
     needs = ("test_poses",)
-    certifiable = True
     kinked = True
-
-    def __post_init__(self) -> None:
-        require(
-            bool(self.A.any()),
-            "A of the G criterion is zero: no target depends on the parameters; check the test "
-            "poses and loads",
-        )
 
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:
@@ -501,7 +490,7 @@ class GCriterion(ScenarioCriterion):
 
     @cached_property
     def C(self) -> Array:
-        return np.asarray((self.A.swapaxes(-1, -2) @ self.A).reshape(len(self.A), -1))
+        return np.asarray((self.F.swapaxes(-1, -2) @ self.F).reshape(len(self.F), -1))
 
     def _each(self, V: Array) -> Array:
         return np.asarray(V.reshape(*V.shape[:-2], -1) @ self.C.T)
@@ -518,20 +507,11 @@ class GCriterion(ScenarioCriterion):
         along = self._each(X)
         return np.asarray(along @ mean_curvature(self._each(V), self.order) @ along.T)
 
-    def tangent(self, V: Array) -> tuple[float, Array]:
-        each = self._each(V)
-        weights = mean_slope(each, self.order)
-        weights = weights / weights.sum()
-        return float(weights @ each), (weights @ self.C).reshape(V.shape)
+    def weight(self, V: Array) -> float:
+        return float(mean_slope(self._each(V), self.order).sum())
 
     def turned(self, T: Array) -> GCriterion:
-        return replace(self, A=self.A @ T)
-
-    def softened(self, q: float) -> GCriterion:
-        return replace(self, order=q)
-
-    def figure(self, value: float) -> float:
-        return 1e6 * float(np.sqrt(value))
+        return replace(self, F=self.F @ T)
 
 
 @dataclass(frozen=True)
@@ -545,29 +525,19 @@ class DeterminantCriterion(MeanCriterion):
     """
 
     order: float = 0.0
-    volume: float = 1.0
     name = "D"
     title = "D-optimality: volume of the confidence ellipsoid"
     unit = "log det"
 
     def value(self, V: Array) -> Array:
         K = self.E @ V @ self.E.T
-        return np.asarray(self.volume * np.exp(np.linalg.slogdet(K)[1] / len(self.E)))
-
-    def phi(self, lam: Array) -> Array:
-        return self.volume * power_mean(lam, 0.0)
-
-    def phi_slope(self, lam: Array) -> Array:
-        return self.volume * mean_slope(lam, 0.0)
-
-    def phi_curvature(self, lam: Array) -> Array:
-        return self.volume * mean_curvature(lam, 0.0)
+        return np.asarray(self.factor * np.exp(np.linalg.slogdet(K)[1] / len(self.E)))
 
     def turned(self, T: Array) -> ScenarioCriterion:
         """E T = L Q: what L stretches is a factor, so that Q keeps the determinant's digits."""
         Q, L = np.linalg.qr((self.E @ T).T)
         stretched = np.exp(2 * np.log(np.abs(np.diag(L))).mean())
-        return replace(self, E=Q.T, volume=self.volume * float(stretched))
+        return replace(self, E=Q.T, factor=self.factor * float(stretched))
 
     def figure(self, value: float) -> float:
         return len(self.E) * float(np.log(value))
@@ -589,17 +559,8 @@ class EigenvalueCriterion(MeanCriterion):
     unit = "typical sizes"
     kinked = True
 
-    def softened(self, q: float) -> Self:
-        return replace(self, order=q)
-
-    def tangent(self, V: Array) -> tuple[float, Array]:
-        lam, U = self._eigen(V)
-        weights = self.phi_slope(lam)
-        weights = weights / weights.sum()
-        return float(weights @ lam), (U * weights) @ U.T
-
-    def figure(self, value: float) -> float:
-        return float(np.sqrt(value))
+    def weight(self, V: Array) -> float:
+        return float(self.phi_slope(self._eigen(V)[0]).sum())
 
 
 @dataclass(frozen=True)
@@ -611,18 +572,16 @@ class FirstObservability(DeterminantCriterion):
     Source: Menq & Borm 1988; Borm & Menq 1991, Int. J. Robotics Research 10(1), 51–63.
     """
 
-    n_poses: int = 1
+    scale: float = 1.0
     name = "O1"
     title = "observability index: volume of the ellipsoid of the singular values"
     unit = ""
     better = "larger"
+    figure = ScenarioCriterion.figure
 
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:
-        return cls(inputs.counted(), n_poses=inputs.n_poses)
-
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(self.n_poses * value))
+        return cls(inputs.counted(), scale=inputs.n_poses**0.5)
 
 
 @dataclass(frozen=True)
@@ -638,9 +597,6 @@ class ThirdObservability(EigenvalueCriterion):
     unit = ""
     better = "larger"
 
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(value))
-
 
 @dataclass(frozen=True)
 class FifthObservability(MeanCriterion):
@@ -653,12 +609,14 @@ class FifthObservability(MeanCriterion):
     """
 
     order: float = 0.5
+    scale: float = 1.0
     name = "O5"
     title = "observability index: harmonic sum of the singular values"
     better = "larger"
 
-    def figure(self, value: float) -> float:
-        return float(1 / (len(self.E) * np.sqrt(value)))
+    @classmethod
+    def of(cls, inputs: CriterionInputs) -> Self:
+        return cls(E := inputs.counted(), scale=len(E))
 
 
 # By name.  Cell files, command line, documentation, design and relaxation all ask this.

@@ -40,7 +40,6 @@ from elastocal.planning.information import (
     next_number,
     plan_forces,
 )
-from elastocal.planning.moves import blockers_of
 from elastocal.planning.plan import (
     CandidateCounts,
     Chance,
@@ -60,7 +59,14 @@ from elastocal.planning.relaxation import (
     sized_plans,
     values_without,
 )
-from elastocal.planning.search import EFFORTS, POOL, Search, Selection, ordered
+from elastocal.planning.search import (
+    EFFORTS,
+    POOL,
+    Search,
+    SearchEffort,
+    Selection,
+    ordered,
+)
 from elastocal.planning.setup import (
     OPEN,
     FeasiblePool,
@@ -173,7 +179,7 @@ class _Design:
         pins = self.options.pins
         self.feasibility = Feasibility(self.cell, self.chain, None if pins is None else pins.struck)
         if (home := self.cell.design.motion.home) is not None:
-            met = blockers_of(self.feasibility)(home, home, False)
+            met = self.feasibility.blockers(home, home, False)
             require(
                 not met,
                 f"{cell.path or cell.name}: [design.motion] home brings {listed(met)} too close to "
@@ -249,7 +255,7 @@ class _Design:
         progress("information of the candidates")
         setup = set_up(
             self.model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen if self.feasibility.partial else None, self.work,
+            region, self.feasibility.seen, self.work,
         )  # fmt: skip
         self.warnings += setup.warnings
         pinned = setup.pool(pins.q, pinned_at) if pins is not None and len(pins.q) else None
@@ -268,7 +274,8 @@ class _Design:
             search = setup.having(pinned)
         searches = Searches(search, self.space, self.feasibility)
         effort = EFFORTS[options.effort]
-        effort = effort.in_pool if self.cell.design.candidates is None else effort
+        if self.cell.design.candidates is None:  # the plan is one of the poses that were brought
+            effort = SearchEffort(starts=0, rounds=0, exchanges=max(effort.starts, 1))
 
         def sought(shares: IntArray, checkpoint: Checkpoint) -> tuple[Search, Selection]:
             seek = Search(
@@ -444,14 +451,13 @@ class _Design:
         R, gain = setup.target_rows, None
         if known.done is not None and R is not None:
             gain = Gain.of(R, setup.prior, M, self.options.seed)
-        value, unit = setup.criterion.reported(found.value)
-        bound = found.certificate.bound_pool
+        figure, bound = setup.criterion.figure, found.certificate.bound_pool
         return Plan(
             model=self.model,
             criterion=spec.criterion,
             value=found.value,
-            reported=value,
-            unit=unit,
+            reported=figure(found.value),
+            unit=setup.criterion.unit,
             q=q,
             forces=self.forces,
             group=pool.group[chosen],
@@ -460,8 +466,7 @@ class _Design:
             execution=execution,
             candidates=counts,
             certificate=replace(
-                found.certificate,
-                starts=tuple(setup.criterion.figure(v) for v in found.certificate.starts),
+                found.certificate, starts=tuple(map(figure, found.certificate.starts))
             ),
             predicted=predicted(model, setup.found, left, numbers),
             reasons=reasons(
@@ -472,7 +477,7 @@ class _Design:
             seed=self.options.seed,
             polished=found.polished,
             curve=curve,
-            bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
+            bound_reported=None if bound is None else figure(bound),
             warnings=tuple(self.warnings),
             made_for="" if known.done is None else known.done.note,
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),

@@ -19,7 +19,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.identification.noise_structure import course_waves
 from elastocal.planning.information import PoseInformation
-from elastocal.planning.moves import BlockersOf, Moves, PathChecker
+from elastocal.planning.moves import Moves, PathChecker
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 
@@ -539,7 +539,6 @@ def schedule(
     read: BoolArray | None = None,
     limits: tuple[Array, Array] | None = None,
     via: Array | None = None,
-    blockers: BlockersOf | None = None,
     alias: Alias | None = None,
     paired: bool = False,
     seed: int = 0,
@@ -558,10 +557,10 @@ def schedule(
 
     With an `alias` the order is one in which a drift does little to what the plan is for, as far as
     `motion.extra_time` and `motion.load_changes` allow.  Raises Unreachable for a pose which no
-    free move reaches, with what is in the way if `blockers` can tell.
+    free move reaches, with what is in the way if the `checker` can tell.
     """
     forces = np.zeros((1, 3)) if loads is None else loads
-    moves = Moves.of(q, motion, checker, forces, limits, via, read, blockers)
+    moves = Moves.of(q, motion, checker, forces, limits, via, read)
     moves.check_reach()
     # Load states one after the other, without load first.
     used = sorted(set(moves.load.tolist()), key=lambda state: (moves.loaded[state], state))

@@ -69,14 +69,15 @@ class Rule(ABC):
 class Bound(Rule):
     """lower ≤ quantity ≤ upper: joint values, range, incidence, rope angle, torque.
 
-    `quantity` gives (N, m), `labels` (m) name its columns, `units` (m) or one for all are what
-    messages show them in: "°" for quantities in rad.  `key`: what the user calls the limit.
+    `quantity` gives (N, m), `lower` and `upper` are (m,) or one for all, as `units`, which messages
+    show it in: "°" for quantities in rad.  `labels` (m) name the columns, `key` is what the user
+    calls the limit.
     """
 
     name: str
     quantity: Callable[[Poses], Array]
-    lower: Array
-    upper: Array
+    lower: Array | float
+    upper: Array | float
     labels: tuple[str, ...]
     key: str
     units: tuple[str, ...]
@@ -245,10 +246,13 @@ def rule_book(
             sight = (LineOfSight(kinematics, bodies, eye, stated.beam_radius, markers),)
     if least is not None and least < len(markers):
         bounds, sight = (), (EnoughMarkers((*bounds, *sight), tuple(markers), least),)
+    units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
+    joints = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
+    limits = joint_limits(cell, chain)
     return (
-        _joints(cell, chain),
+        Bound("joint_limits", lambda p: p.q, *limits, joints, "a limit", units),
         *bounds,
-        *_load(cell, chain),
+        *_load(cell, chain, joints),
         *(
             KeepApart(rule, kinematics, own)
             for rule in RULES
@@ -256,16 +260,6 @@ def rule_book(
         ),
         *sight,
     )
-
-
-def _joints(cell: Cell, chain: Chain) -> Rule:
-    (lower, upper), labels = joint_limits(cell, chain), _labels(chain)
-    units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
-    return Bound("joint_limits", lambda p: p.q, lower, upper, labels, "a limit", units)
-
-
-def _labels(chain: Chain) -> tuple[str, ...]:
-    return tuple(f"joint{i + 1}" for i in range(chain.n_joints))
 
 
 def _visibility(cell: Cell) -> Iterator[Rule]:
@@ -284,20 +278,18 @@ def _visibility(cell: Cell) -> Iterator[Rule]:
         return np.asarray(np.linalg.norm(marker_positions(poses, markers) - eye, axis=2))
 
     if near > 0 or np.isfinite(far):
-        low, high = np.full(len(names), near), np.full(len(names), far)
-        yield Bound("range", distance, low, high, names, "a range_m", ("m",))
+        yield Bound("range", distance, near, far, names, "a range_m", ("m",))
     observed = tuple(name for name in names if name in sight.normals)
     if sight.max_incidence is not None and observed:
         at = [cell.tool.markers[name] for name in observed]
         axes = [sight.normals[name] for name in observed]
-        low, high = np.zeros(len(observed)), np.full(len(observed), sight.max_incidence)
         yield Bound(
-            "incidence", lambda p: incidence(p, at, axes, eye), low, high, observed,
+            "incidence", lambda p: incidence(p, at, axes, eye), 0.0, sight.max_incidence, observed,
             "a max_incidence_deg", ("°",),
         )  # fmt: skip
 
 
-def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
+def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
     load = cell.workspace.load
     if load is not None and load.max_angle is not None and load.rope_axis is not None:
         axis = load.rope_axis
@@ -305,8 +297,8 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
         def angle(poses: Poses) -> Array:
             return np.where(poses.loaded, rope_angle(poses, axis), 0.0)[:, None]
 
-        low, high = np.zeros(1), np.array([load.max_angle])
-        yield Bound("rope_angle", angle, low, high, ("the rope",), "a max_angle_deg", ("°",))
+        label, key = ("the rope",), "a max_angle_deg"
+        yield Bound("rope_angle", angle, 0.0, load.max_angle, label, key, ("°",))
     if cell.workspace.torque_limits:
         bound = np.array(cell.workspace.torque_limits)
         if len(bound) != chain.n_joints:
@@ -316,37 +308,15 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
             )
         torque = StaticTorque(cell, chain)
         yield Bound(
-            "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, _labels(chain),
+            "torque", lambda p: np.abs(torque(p)), 0.0, bound, joints,
             "a torque_limits_Nm", ("N m",),
         )  # fmt: skip
 
 
-# Which rule to relax when next to nothing is feasible.
+# All rules at once, and which to relax when next to nothing is feasible.
 
 SAMPLE = 2000  # candidates whose causes are looked at
-
-
-def advice(verdict: PoseFeasibility, rules: Sequence[Rule], kinematics: Kinematics) -> str:
-    """The smallest set of rules that stops candidates by itself, and of these the one that stops
-    most: dropping it frees as many, and no smaller set frees any."""
-    sets, which, counts = np.unique(verdict.broken, axis=0, return_inverse=True, return_counts=True)
-    which = which.ravel()
-    size = sets.sum(axis=1)
-    stopped = np.flatnonzero(size > 0)
-    tried, feasible = len(verdict.broken), int(verdict.ok.sum())
-    head = f"{feasible} of {tried} candidates are feasible"
-    if not len(stopped):
-        return f"{head}; no rule removes any"
-    best = stopped[np.lexsort((-counts[stopped], size[stopped]))[0]]
-    chosen = [rule for rule, used in zip(rules, sets[best], strict=True) if used]
-    rows = np.flatnonzero(which == best)[:SAMPLE]
-    poses = kinematics.poses(verdict.q[rows], verdict.force[rows])
-    names = " and ".join(f"'{rule.name}'" for rule in chosen)
-    text = f"{head}; relax {names}, which {'alone stops' if len(chosen) == 1 else 'stop'} "
-    text += f"{counts[best]} of them: "
-    return text + "; ".join(rule.remedy(poses) for rule in chosen)
-
-
+ON_THE_WAY = 200  # samples of a move, in which bodies that come too close are sought
 LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
 MOST_TRIED = 300  # random poses in which a pair must once keep apart to be believed
 
@@ -400,19 +370,29 @@ class Feasibility:
         return self.under(q, np.atleast_2d(forces)).ok
 
     @property
-    def partial(self) -> bool:
-        return any(isinstance(rule, EnoughMarkers) for rule in self.rules)
-
-    def seen(self, q: Array, force: Array) -> BoolArray:
-        """(N, markers): which markers the tracker sees of poses that are feasible."""
-        poses = self._poses(q, force)
-        for rule in self.rules:
-            if isinstance(rule, EnoughMarkers):
-                return rule.seen(poses)
-        return np.ones((len(poses), len(self.cell.tool.markers)), dtype=bool)
+    def seen(self) -> Callable[[Array, Array], BoolArray] | None:
+        """Joints (N, n), force (3,) → (N, markers): which markers the tracker sees of poses that
+        are feasible; None where it sees all of them."""
+        rule = next((rule for rule in self.rules if isinstance(rule, EnoughMarkers)), None)
+        return None if rule is None else lambda q, force: rule.seen(self._poses(q, force))
 
     def advice(self, verdict: PoseFeasibility) -> str:
-        text = advice(verdict, self.rules, self.kinematics)
+        """The smallest set of rules that stops candidates by itself, and of these the one that
+        stops most: dropping it frees as many, and no smaller set frees any."""
+        tried, feasible = len(verdict.broken), int(verdict.ok.sum())
+        text, stopped = f"{feasible} of {tried} candidates are feasible", ~verdict.ok
+        if not stopped.any():
+            return f"{text}; no rule removes any"
+        sets, which, counts = np.unique(
+            verdict.broken[stopped], axis=0, return_inverse=True, return_counts=True
+        )
+        best = np.lexsort((-counts, sets.sum(axis=1)))[0]
+        chosen = [rule for rule, used in zip(self.rules, sets[best], strict=True) if used]
+        rows = np.flatnonzero(stopped)[which.ravel() == best][:SAMPLE]
+        poses = self.kinematics.poses(verdict.q[rows], verdict.force[rows])
+        names = " and ".join(f"'{rule.name}'" for rule in chosen)
+        text += f"; relax {names}, which {'alone stops' if len(chosen) == 1 else 'stop'} "
+        text += f"{counts[best]} of them: " + "; ".join(rule.remedy(poses) for rule in chosen)
         for a, b in self.always_in_contact:
             text += (
                 f"; {a} and {b} are too close in every pose, which is probably a wrong size or "
@@ -438,6 +418,14 @@ class Feasibility:
         start, end = self._poses(q_from, LOADED).q, self._poses(q_to, LOADED).q
         start, end = np.broadcast_arrays(start, end)
         return self._paths.free(start, end, np.broadcast_to(loaded, len(start)))
+
+    def blockers(self, q_from: Array, q_to: Array, loaded: bool) -> list[str]:
+        """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are
+        met."""
+        step = np.linspace(0.0, 1.0, ON_THE_WAY)[:, None]
+        poses = self.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
+        hits = hits_by_pair(self.kinematics, self.pairs, poses)
+        return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
 
     @cached_property
     def _paths(self) -> Paths:

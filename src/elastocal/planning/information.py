@@ -150,8 +150,7 @@ def reading_noise(
         visit, axes = numbered(observed.configuration, force), np.eye(observed.size)[:, :3]
         shared.append(common_to(visit, tau * axes, "visit"))
     shared += stated_deviations(model, observed, x, (JOINTS,))
-    for effect in shared:
-        Z = effect.columns()
+    for Z in (effect.columns() for effect in shared):
         covariance = covariance + Z @ Z.T
     covariance = covariance / visits
     for effect in stated_deviations(model, observed, x, (CONFIGURATION,)):

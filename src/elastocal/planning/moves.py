@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
@@ -14,8 +14,6 @@ from scipy.sparse import csgraph
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning.collision import hits_by_pair
-from elastocal.planning.feasibility import LOADED, Feasibility
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which joint moves are free: a graph over joint vectors whose edges are checked when needed.
@@ -25,10 +23,12 @@ PER_EDGE = 1e-9
 
 
 class PathChecker(Protocol):
-    """Are all configurations from q_from to q_to (M, n), ends included, allowed (M,)?  The answer
-    for the way back is the same."""
+    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
+        """Are all configurations from q_from to q_to (M, n), ends included, allowed (M,)?  The
+        answer for the way back is the same."""
 
-    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray: ...
+    def blockers(self, q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
+        """What is in the way of the straight move between two joint vectors (n,)."""
 
 
 def travel_times(points: Array, speed: Array | None) -> Array:
@@ -45,6 +45,7 @@ class Roadmap:
 
     def __init__(self, points: Array, times: Array, loaded: bool, checker: PathChecker) -> None:
         self.points, self.loaded, self.checker = points, loaded, checker
+        self.carrying = " with the load" if loaded else ""
         self.direct = times.copy()  # inf where blocked
         self.verdict: dict[tuple[int, int], bool] = {}
         self._ways: tuple[Array, NDArray[np.integer]] | None = None
@@ -129,23 +130,7 @@ class Roadmap:
 
 # Poses that no collision-free move reaches, told before and after the routing.
 
-SAMPLES = 200  # of a way, in which bodies that come too close are sought
 MOST_NAMED = 3
-
-# The bodies in the way of the straight move between two joint vectors (n,), with or without load.
-BlockersOf = Callable[[Array, Array, bool], Sequence[str]]
-
-
-def blockers_of(rules: Feasibility) -> BlockersOf:
-    """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are met."""
-
-    def met(q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
-        step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
-        poses = rules.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
-        hits = hits_by_pair(rules.kinematics, rules.pairs, poses)
-        return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
-
-    return met
 
 
 class Unreachable(InsufficientDataError):
@@ -154,10 +139,6 @@ class Unreachable(InsufficientDataError):
     def __init__(self, message: str, poses: IntArray) -> None:
         super().__init__(message)
         self.poses = poses
-
-
-def _carrying(roadmap: Roadmap) -> str:
-    return " with the load" if roadmap.loaded else ""
 
 
 # The points of a schedule, its visits, and the moves between them, checked when needed.
@@ -184,13 +165,11 @@ class Moves:
     leave: IntArray
     sides: IntArray
     free: BoolArray
-    blockers: BlockersOf | None = None
 
     @classmethod
     def of(
         cls, q: Array, motion: Motion, checker: PathChecker, forces: Array,
-        limits: tuple[Array, Array] | None, via: Array | None,
-        read: BoolArray | None = None, blockers: BlockersOf | None = None,
+        limits: tuple[Array, Array] | None, via: Array | None, read: BoolArray | None = None,
     ) -> Moves:  # fmt: skip
         n_poses, n = q.shape
         read = np.ones((n_poses, len(forces)), dtype=bool) if read is None else read
@@ -214,8 +193,7 @@ class Moves:
             roadmap.check(move for both in stretches for move in both)
             for v, both in zip(own, stretches, strict=True):
                 free[v] = [roadmap.check([move]) for move in both]
-        here = pose, load, leave, sides, free
-        return cls(points, times, maps, loaded, home, signs, *here, blockers)
+        return cls(points, times, maps, loaded, home, signs, pose, load, leave, sides, free)
 
     @cached_property
     def side(self) -> IntArray:
@@ -311,7 +289,7 @@ class Moves:
             pairs = {(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]}
             roadmap.settle(sorted(pairs))
 
-    # What no move reaches is Unreachable, with what is in the way where `blockers` can tell.
+    # What no move reaches is Unreachable, with what is in the way where the checker can tell.
 
     def check_reach(self) -> None:
         """Can each pose be approached from one side at least, where it has to be, and does a chain
@@ -342,7 +320,7 @@ class Moves:
         for v in np.flatnonzero(here & ~self.free.any(axis=1)):
             pose, (below, above) = int(self.leave[v]), self.sides[v].tolist()
             raise Unreachable(
-                f"{self._name(pose)} cannot be approached{_carrying(roadmap)}, neither from below"
+                f"{self._name(pose)} cannot be approached{roadmap.carrying}, neither from below"
                 f"{self._in_the_way(roadmap, below, pose)} nor from above"
                 f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
                 "[design.motion], or raise clearance_mm in [workspace]",
@@ -357,7 +335,7 @@ class Moves:
         i, j = np.unravel_index(int(np.argmin(between)), between.shape)
         by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
         return Unreachable(
-            f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
+            f"{named}{more} cannot be reached{roadmap.carrying} by collision-free joint moves, "
             f"neither directly nor through home and other poses{by}; give "
             "another home in [design.motion], free the way, or narrow [limits] to exclude such "
             "poses",
@@ -371,9 +349,8 @@ class Moves:
         return f"pose {point + (self.home is None)} (joints {joints})"
 
     def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
-        if self.blockers is None:
-            return ""
-        names = self.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
+        points, loaded = roadmap.points, roadmap.loaded
+        names = roadmap.checker.blockers(points[i], points[j], loaded)
         return f" (in the way: {', '.join(names)})" if names else ""
 
 

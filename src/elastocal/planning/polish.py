@@ -11,7 +11,7 @@ exactly.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice
 
@@ -21,6 +21,7 @@ from scipy.optimize import minimize
 
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.planning.candidates import CHUNK, JointSpace, sobol
+from elastocal.planning.checkpoint import State
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.relaxation import DesignProblem, block_prices
@@ -62,10 +63,13 @@ class Searches:
             self._rows[level] = configuration_rows(arm, info.rows(q[None]), info.columns)
         return self._rows[level]
 
-    def rounds(self, goal: Goal, T: Array, lot: FeasiblePool, most: int, gains: float) -> Rounds:
-        """Where poses come, round after round, from those that are handed in (k, n), which at first
-        are those of the lot: to the end of a search, or as far towards it as rules allow.  As long
-        as there are some that these stop."""
+    def moved(
+        self, goal: Goal, T: Array, lot: FeasiblePool, most: int, gains: float,
+        kept: Callable[[Array], Array],
+    ) -> None:  # fmt: skip
+        """Poses moved, round after round, from those of the lot to the end of a search, or as far
+        towards it as rules allow, as long as there are some that these stop.  Of where a round
+        brought them (k, n), `kept` tells those that the next one begins with."""
         search, q, held = JointSearch(self, T, lot), lot.q, np.zeros(len(lot), dtype=bool)
         found = [self.space.bounds(int(g)) for g in lot.group]
         lower, upper = np.array([low for low, _ in found]), np.array([high for _, high in found])
@@ -79,12 +83,9 @@ class Searches:
                 ok = self.feasible(q[left] + step * (end[left] - q[left]))
                 part[left[ok]] = step
                 left = left[~ok]
-            q, held = (yield q + part[:, None] * (end - q)), part < 1
+            q, held = kept(q + part[:, None] * (end - q)), part < 1
             if not held.any():
                 return
-
-
-Rounds = Generator[Array, Array, None]
 
 
 class JointSearch:
@@ -166,36 +167,24 @@ def polish(
         now, C = smooth.slope(V)
         return float(np.log(now / phi)), -2 / now * B @ (V @ C @ V)
 
-    q, B = plan.q, plan.blocks @ T
+    q, B = plan.q.copy(), plan.blocks @ T
     phi = value(B)
-    rounds = searches.rounds(goal, T, plan, POLISHING, FINE if fine else GAINS)
-    z = next(rounds)
-    while True:
+
+    def kept(z: Array) -> Array:
+        """The poses z all together, or else one by one, where they gain."""
+        nonlocal phi
         moved = searches.setup.information.blocks(z, plan.readings) @ T
-        found = value(moved)
-        if found < phi * (1 - LEAST_GAIN):
-            q, B, phi = z, moved, found
-        else:
-            q, B, phi = _one_by_one(q, B, z, moved, value)
-        try:
-            z = rounds.send(q)
-        except StopIteration:
-            return q
+        for own in (slice(None), *range(len(q))):
+            was = B[own].copy()
+            B[own] = moved[own]
+            if (found := value(B)) < phi * (1 - LEAST_GAIN):
+                q[own], phi = z[own], found
+            else:
+                B[own] = was
+        return q
 
-
-def _one_by_one(
-    q: Array, B: Array, z: Array, moved: Array, value: Callable[[Array], float]
-) -> tuple[Array, Array, float]:
-    q, B, phi = q.copy(), B.copy(), value(B)
-    for k in range(len(q)):
-        was = B[k].copy()
-        B[k] = moved[k]
-        found = value(B)
-        if found < phi * (1 - LEAST_GAIN):
-            q[k], phi = z[k], found
-        else:
-            B[k] = was
-    return q, B, phi
+    searches.moved(goal, T, plan, POLISHING, FINE if fine else GAINS, kept)
+    return q
 
 
 # How much better a plan could be with poses that are not in the pool: an estimate.
@@ -215,24 +204,17 @@ APART = 0.2  # rad or m between starts in at least one joint
 EXCESS = 1e-6  # over the pool's largest d, relative, that counts as one
 
 
-@dataclass(frozen=True)
-class Continuum:
-    """`bound` on Φ from the largest d found on the continuum: an estimate, as a larger d may have
-    been missed.  `found`: feasible poses whose d exceeds all of the pool's, by `searched` new
-    points and `ascents` local searches."""
-
-    bound: float
-    found: FeasiblePool
-    searched: int
-    ascents: int
-
-
 def estimate(
     problem: DesignProblem, tangent: TangentBound, searches: Searches, T: Array,
     pool: FeasiblePool, seed: int = 0, progress: Progress = lambda message: None,
-) -> Continuum:  # fmt: skip
+) -> State:  # fmt: skip
     """The largest d on the continuum per group, for the tangent (Φ, G) of the optimum of the `pool`
-    with its `problem`; every maximum is evaluated exactly and passed by the cell's rules."""
+    with its `problem`; every maximum is evaluated exactly and passed by the cell's rules.
+
+    `bound` on Φ from it: an estimate, as a larger d may have been missed.  `q`, `group` and
+    `readings` of feasible poses whose d exceeds all of the pool's, by `searched` new points and
+    `ascents` local searches.
+    """
 
     def price(lot: FeasiblePool) -> Array:
         return block_prices(lot.blocks @ T, tangent.G)
@@ -256,23 +238,24 @@ def estimate(
         starts.append(both.take(order[distinct(both.q[order], STARTS)]))
     begun = FeasiblePool.join(starts)
     unit = price(begun)
-    rounds = searches.rounds(goal, T, begun, CLIMBING, EXCESS)
-    here = next(rounds)
-    with contextlib.suppress(StopIteration):
-        while True:
-            lots.append(setup.pool(here, begun.group, begun.readings))
-            here = rounds.send(here)
-    every, largest, kept = FeasiblePool.join(lots), np.zeros(len(problem.shares)), []
+
+    def kept(here: Array) -> Array:
+        lots.append(setup.pool(here, begun.group, begun.readings))
+        return here
+
+    searches.moved(goal, T, begun, CLIMBING, EXCESS, kept)
+    every, largest, better = FeasiblePool.join(lots), np.zeros(len(problem.shares)), []
     values = price(every)
     for group in levels:
         top = d[problem.group == group].max()
         own = np.flatnonzero((every.group == group) & (values > top * (1 + EXCESS)))
         own = own[np.argsort(-values[own], kind="stable")]
-        kept.append(own[distinct(every.q[own], len(own))])
+        better.append(own[distinct(every.q[own], len(own))])
         largest[group] = max(top, values[own].max(initial=0.0))
-    reach = float(np.sum(tangent.G * problem.prior)) + float(problem.shares @ largest)
-    found, searched = every.take(np.concatenate(kept)), len(levels) * CHUNK * chunks
-    return Continuum(tangent.value**2 / reach, found, searched, len(begun))
+    bound = tangent.bound(problem.prior, float(problem.shares @ largest))
+    found, searched = every.take(np.concatenate(better)), len(levels) * CHUNK * chunks
+    poses = {"q": found.q, "group": found.group, "readings": found.readings}
+    return poses | {"bound": bound, "searched": searched, "ascents": len(begun)}
 
 
 def _best_feasible(searches: Searches, q: Array, d: Array) -> IntArray:

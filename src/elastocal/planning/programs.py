@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -43,40 +43,32 @@ AXES = 6
 TAKE_OFF = "take the load off"
 
 
-# A move to joints (n,) rad with a note on what is there; a stop until someone has done what an
-# order says; a stop of so many s while the tracker measures what the note says.
-Step = (
-    tuple[Literal["move"], Array, str]
-    | tuple[Literal["load"], str]
-    | tuple[Literal["measure"], float, str]
-)
+# A move to joints (n,) rad with a note on what is there; a stop until someone has done what the
+# note says; a stop of so many s (1,) while the tracker measures what the note says.
+Step = tuple[Literal["move", "load", "measure"], Array, str]
+VIA = "via point, not measured"
 
 
 def steps_of(
     execution: Execution, configurations: Sequence[str], forces: Array | None = None
-) -> Iterator[Step]:
-    loads = ["no load"] if forces is None else [load_name(force) for force in forces]
-    loaded = [False] if forces is None else [bool(np.any(force)) for force in forces]
-    home = execution.motion.home
-    if home is not None:
-        yield "move", home, "home"
+) -> list[Step]:
+    forces = np.zeros((1, 3)) if forces is None else forces
+    home, dwell, nothing = execution.motion.home, execution.motion.dwell, np.zeros(0)
+    steps: list[Step] = [] if home is None else [("move", home, "home")]
     for stop in execution.stops:
-        name = f"configuration {stop.name(configurations)}"
-        steps: list[Step] = [("move", q, "via point, not measured") for q in stop.via]
-        steps.append(("move", stop.q, name))
+        name, load = f"configuration {stop.name(configurations)}", load_name(forces[stop.load])
+        moves: list[Step] = [("move", q, VIA) for q in stop.via] + [("move", stop.q, name)]
         if stop.change_after is not None:
-            hang = f"hang the {loads[stop.load]}" if loaded[stop.load] else TAKE_OFF
-            steps.insert(stop.change_after, ("load", hang))
-        yield from steps
+            hang = f"hang the {load}" if np.any(forces[stop.load]) else TAKE_OFF
+            moves.insert(stop.change_after, ("load", nothing, hang))
         side = "" if stop.approach is None else f", approached from {('below', 'above')[stop.side]}"
         part = ", once more" if stop.part else ""
-        yield "measure", execution.motion.dwell, f"{name}, {loads[stop.load]}{side}{part}"
+        steps += [*moves, ("measure", np.array([dwell]), f"{name}, {load}{side}{part}")]
     if execution.take_off:
-        yield "load", TAKE_OFF
+        steps.append(("load", nothing, TAKE_OFF))
     if home is not None:
-        for q in execution.home_via:
-            yield "move", q, "via point, not measured"
-        yield "move", home, "home"
+        steps += [*(("move", q, VIA) for q in execution.home_via), ("move", home, "home")]
+    return steps
 
 
 def load_name(force: Array) -> str:
@@ -111,18 +103,18 @@ def program_name(text: str, most: int = 24) -> str:
 
 
 def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
-    for k, step in enumerate(steps):
-        if step[0] == "measure":
-            require(0 <= step[1] <= LONGEST_STOP, f"a stop of {step[1]:g} s; give 0 to 86400 s")
-        elif step[0] == "move":
-            beyond = ~((step[1] >= lower - SAME) & (step[1] <= upper + SAME))
-            if beyond.any():
-                j = int(np.argmax(beyond))
-                value, low, high = np.degrees([step[1][j], lower[j], upper[j]])
-                raise InputError(
-                    f"step {k + 1} moves joint {j + 1} to {value:.6g}°, outside its limits "
-                    f"[{low:.6g}, {high:.6g}]°; give poses inside them"
-                )
+    for k, (kind, values, _) in enumerate(steps):
+        if kind == "measure":
+            require(0 <= values[0] <= LONGEST_STOP, f"a stop of {values[0]:g} s; give 0 to 86400 s")
+        elif kind == "move":
+            inside = (values >= lower - SAME) & (values <= upper + SAME)
+            j = int(np.argmin(inside))
+            value, low, high = np.degrees([values[j], lower[j], upper[j]])
+            require(
+                bool(inside[j]),
+                f"step {k + 1} moves joint {j + 1} to {value:.6g}°, outside its limits "
+                f"[{low:.6g}, {high:.6g}]°; give poses inside them",
+            )
 
 
 def limits_text(lower: Array, upper: Array) -> str:
@@ -163,16 +155,16 @@ def program_steps(text: str) -> list[tuple[str, Array]]:
     kinds = _KRL_LINES if krl else _URSCRIPT_LINES
     steps = []
     for number_of, line in enumerate(text.removesuffix("\n").split("\n"), start=1):
-        matches = ((k, re.fullmatch(kinds[k], line, re.ASCII)) for k in kinds)
-        kind, match = next(((k, m) for k, m in matches if m), ("", None))
-        if match is None:
+        found = {k: m for k in kinds if (m := re.fullmatch(kinds[k], line, re.ASCII))}
+        if not found:
             raise ElastocalError(
                 f"the robot program's line {number_of} is none that is written: {printable(line)}; "
                 "do not run it"
             )
+        kind, match = next(iter(found.items()))
         if kind:
-            held = re.sub(r"A[1-6] ", "", match[1]) if kind != "load" else ""
-            values = np.array([float(v) for v in held.split(", ") if v])
+            held = re.findall(rf"(?<!A){_NUMBER}", match[1]) if match.re.groups else ()
+            values = np.array([float(v) for v in held])
             steps.append((kind, np.radians(values) if krl and kind == "move" else values))
     return steps
 
@@ -181,11 +173,9 @@ def check_program(text: str, planned: Sequence[Step]) -> None:
     """Raise ElastocalError unless the program, read back, does what the plan's `steps_of` say:
     the same steps in the same order, every joint within 1e-6 rad, every stop within 1 ms."""
     found = program_steps(text)
-    same = [kind for kind, _ in found] == [step[0] for step in planned]
-    for (kind, values), step in zip(found, planned, strict=False):
-        if kind != "load" and same:
-            off = np.abs(values - np.asarray(step[1], dtype=float))
-            same = bool(np.all(off <= (SAME if kind == "move" else 1e-3)))
+    same = [kind for kind, _ in found] == [kind for kind, _, _ in planned]
+    for (kind, values), (_, wanted, _) in zip(found, planned, strict=False):
+        same = same and bool((np.abs(values - wanted) <= (SAME if kind == "move" else 1e-3)).all())
     if not same:
         raise ElastocalError("the robot program does not do what the plan says; do not run it")
 
@@ -222,7 +212,7 @@ def robot_program(
         np.array([joint.lower for joint in chain.joints]),
         np.array([joint.upper for joint in chain.joints]),
     )
-    steps = list(steps_of(execution, configurations, forces))
+    steps = steps_of(execution, configurations, forces)
     check_driven(steps, lower, upper)
     told = f"elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}"
     text = "\n".join(write(program_name(name), told, limits_text(lower, upper), steps)) + "\n"
@@ -251,15 +241,15 @@ def _krl(module: str, told: str, limits: str, steps: Sequence[Step]) -> list[str
         f"  $ACC_AXIS[AXIS_NO] = {PERCENT}",
         "ENDFOR",
     ]
-    for step in steps:
-        match step:
-            case "move", q, note:
-                angles = ", ".join(f"A{i + 1} {number(v, 6)}" for i, v in enumerate(np.degrees(q)))
-                lines += [f"; {plain(note)}", f"PTP {{{angles}}}"]
-            case "load", order:
-                lines += [f"; {plain(order)}, then start again", "HALT"]
-            case "measure", dwell, note:
-                lines += [f"; measure {plain(note)}", f"WAIT SEC {number(dwell, 3)}"]
+    for kind, values, note in steps:
+        if kind == "move":
+            axes = enumerate(np.degrees(values), 1)
+            angles = ", ".join(f"A{i} {number(v, 6)}" for i, v in axes)
+            lines += [f"; {plain(note)}", f"PTP {{{angles}}}"]
+        elif kind == "load":
+            lines += [f"; {plain(note)}, then start again", "HALT"]
+        else:
+            lines += [f"; measure {plain(note)}", f"WAIT SEC {number(values[0], 3)}"]
     return [*lines, "END"]
 
 
@@ -274,16 +264,15 @@ def _urscript(function: str, told: str, limits: str, steps: Sequence[Step]) -> l
         f"# Inside the limits in degrees: {limits}.",
         f"def {function}():",
     ]
-    for step in steps:
-        match step:
-            case "move", q, note:
-                joints = ", ".join(number(v, 9) for v in q)
-                lines += [f"  # {plain(note)}", f"  movej([{joints}], {MOTION})"]
-            case "load", order:
-                text = plain(order)
-                lines.append(f'  popup("{text}, then continue", title="Load", blocking=True)')
-            case "measure", dwell, note:
-                lines += [f'  textmsg("measure {plain(note)}")', f"  sleep({number(dwell, 3)})"]
+    for kind, values, note in steps:
+        text = plain(note)
+        if kind == "move":
+            joints = ", ".join(number(v, 9) for v in values)
+            lines += [f"  # {text}", f"  movej([{joints}], {MOTION})"]
+        elif kind == "load":
+            lines.append(f'  popup("{text}, then continue", title="Load", blocking=True)')
+        else:
+            lines += [f'  textmsg("measure {text}")', f"  sleep({number(values[0], 3)})"]
     return [*lines, "end", "", f"{function}()"]
 
 

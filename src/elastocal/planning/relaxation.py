@@ -99,6 +99,11 @@ class DesignProblem:
     def value(self, chosen: IntArray) -> float:
         return float(self.criterion.of_information(self.information(chosen)))
 
+    def worth(self, V: Array) -> tuple[float, Array]:
+        """Φ at V (p, p), and the prices d (N,) there."""
+        value, C = self.criterion.slope(V)
+        return value, self.prices(V @ C @ V)
+
     def restricted(self, kept: IntArray) -> DesignProblem:
         return replace(self, blocks=self.blocks[kept], group=self.group[kept])
 
@@ -172,15 +177,11 @@ def check_enough(problem: DesignProblem) -> None:
         )
 
 
-def largest_sum(d: Array, group: IntArray, shares: IntArray) -> float:
-    """max Σ w_i d_i over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l]; d (N,), group (N,)."""
-    levels = np.flatnonzero(shares).tolist()
-    return float(sum(np.sort(d[group == level])[-shares[level] :].sum() for level in levels))
-
-
 def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> float:
-    reach = largest_sum(d, problem.group, problem.shares)
-    return tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
+    """By max Σ w_i d_i over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l], d (N,) the prices."""
+    shares = problem.shares
+    best = (np.sort(d[problem.group == g])[-shares[g] :].sum() for g in np.flatnonzero(shares))
+    return tangent.bound(problem.prior, float(sum(best)))
 
 
 def efficiency(value: float, bound: float) -> float:
@@ -240,14 +241,13 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
     support = best_of(weights, problem.group, sizes)
     w, accuracy = weights[support], 0.05
     for _ in range(MOST_ROUNDS):
-        w, tangent, value = newton(problem, support, w, accuracy)
+        w, tangent, value = newton(problem.restricted(support), w, accuracy)
         d = problem.prices(tangent.G)
         bound = tangent_bound(problem, tangent, d)
         weights = np.zeros(len(d))
         weights[support] = w
-        if best is None:
-            best = Relaxed(weights, value, bound, tangent)
-        elif value < best.value:
+        best = Relaxed(weights, value, bound, tangent) if best is None else best
+        if value < best.value:
             best = replace(best, weights=weights, value=value)
         if bound > best.bound:
             best = replace(best, bound=bound, tangent=tangent)
@@ -273,9 +273,8 @@ def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | 
     shares[np.unique(problem.group[fixed])] = 0
     if not shares.any():
         tangent = problem.criterion.tangent_at(inverse(prior))
-        value = float(problem.criterion.value(inverse(prior)))
         bound = tangent_bound(problem, tangent, problem.prices(tangent.G))
-        return Relaxed(weights, value, bound, tangent)
+        return Relaxed(weights, tangent.value, bound, tangent)
     rest = replace(problem.restricted(free), prior=prior, shares=shares)
     found = relax(rest, gap, None if start is None else start[free])
     weights[free] = found.weights
@@ -287,9 +286,9 @@ def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
     Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379)."""
     even = problem.even()
     w = even if start is None else EVEN * even + (1 - EVEN) * start
-    V = inverse(problem.at(w))
-    _, C = problem.criterion.softened(1.0).slope(V)  # of a kink all sides count
-    return np.asarray(w * np.sqrt(np.maximum(problem.prices(V @ C @ V), 0.0)))
+    soft = problem.judged_by(problem.criterion.softened(1.0))  # of a kink all sides count
+    d = soft.worth(inverse(problem.at(w)))[1]
+    return np.asarray(w * np.sqrt(np.maximum(d, 0.0)))
 
 
 def best_of(score: Array, group: IntArray, counts: IntArray) -> IntArray:
@@ -316,13 +315,12 @@ CENTRED, SETTLED = 0.3, 3e-4
 SHARPEST = 1e6  # order of a power mean beyond which rounding takes it for the maximum
 
 
-def newton(
-    problem: DesignProblem, support: IntArray, w: Array, accuracy: float
-) -> tuple[Array, TangentBound, float]:
-    """Weights (k,) of the `support` with log Φ within `accuracy` of the least, tangent, and Φ."""
-    k, A, group = len(support), problem.matrices(support), problem.group[support]
+def newton(problem: DesignProblem, w: Array, accuracy: float) -> tuple[Array, TangentBound, float]:
+    """Weights (k,) with log Φ within `accuracy` of the least, tangent, and Φ."""
+    k = len(w)
+    A = problem.matrices(np.arange(k))
     flat = A.reshape(k, -1)
-    E = (group == np.flatnonzero(problem.shares)[:, None]).astype(float)
+    E = (problem.group == np.flatnonzero(problem.shares)[:, None]).astype(float)
     w, s, best = _inside(w, E, problem.shares[problem.shares > 0].astype(float)), None, None
     criterion = problem.criterion.softened(4.0)
     centred = SETTLED if problem.criterion.kinked else CENTRED
@@ -338,9 +336,7 @@ def newton(
     for _ in range(MOST_STEPS):
         V, phi, _ = here
         tangent, value = criterion.tangent_at(V), float(problem.criterion.value(V))
-        reach = largest_sum(flat @ tangent.G.ravel(), group, problem.shares)
-        bound = tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
-        gap = float(np.log(value / bound))
+        gap = float(np.log(value / tangent_bound(problem, tangent, flat @ tangent.G.ravel())))
         if best is None or gap < best[0]:
             best = gap, w, tangent, value
         if gap <= accuracy or (s is not None and s * 2 * k < 1e-2 * accuracy):
@@ -421,17 +417,16 @@ def exchange(
     Of a criterion without a bound all are; with `looks`, no more than so many.
     """
     plan, criterion = plan.copy(), problem.criterion
-    V = inverse(problem.information(plan))
-    value, (phi, C) = float(criterion.value(V)), criterion.slope(V)
-    places = list(np.argsort(problem.prices(V @ C @ V)[plan], kind="stable"))
+    value, d = problem.worth(inverse(problem.information(plan)))
+    places = list(np.argsort(d[plan], kind="stable"))
     vain = 0
     while vain < len(plan):
         k = int(places[0])
         places = [*places[1:], k]
         V = inverse(problem.information(np.delete(plan, k)))
         free = np.setdiff1d(np.flatnonzero(problem.group == problem.group[plan[k]]), plan)
-        phi, C = criterion.slope(V)
-        d = problem.prices(V @ C @ V)[free]
+        phi, d = problem.worth(V)
+        d = d[free]
         upper = (1 + d / phi) / phi if criterion.certifiable else np.full(len(d), np.inf)
         order = np.argsort(-d, kind="stable")[:looks]
         rank, upper, size = free[order], upper[order], FIRST
@@ -478,16 +473,15 @@ def random_plan(problem: DesignProblem, rng: np.random.Generator) -> IntArray:
     return np.sort(np.concatenate([rng.choice(own, share, replace=False) for own, share in lots]))
 
 
-def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
+def random_information(problem: DesignProblem, seed: int) -> Array:
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
-    return np.stack([problem.information(random_plan(problem, rng)) for _ in range(n)])
+    return np.stack([problem.information(random_plan(problem, rng)) for _ in range(DRAWN)])
 
 
 def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
     """A plan (n,), sorted, of the problem's shares from one of others: of each group those of the
     plan first, and by price."""
-    V = inverse(problem.information(plan))
-    price = problem.prices(V @ problem.criterion.slope(V)[1] @ V)
+    _, price = problem.worth(inverse(problem.information(plan)))
     price[plan] += price.max()
     return np.sort(best_of(price, problem.group, problem.shares))
 

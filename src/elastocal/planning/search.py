@@ -16,9 +16,9 @@ from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.criteria import inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import Roadmap, Unreachable, blockers_of, travel_times
+from elastocal.planning.moves import Roadmap, Unreachable, travel_times
 from elastocal.planning.plan import Certificate
-from elastocal.planning.polish import Continuum, Searches, estimate, polish
+from elastocal.planning.polish import Searches, estimate, polish
 from elastocal.planning.relaxation import (
     RIDGE,
     DesignProblem,
@@ -55,10 +55,6 @@ class SearchEffort:
     starts: int
     rounds: int
     exchanges: int = 1
-
-    @property
-    def in_pool(self) -> SearchEffort:
-        return SearchEffort(0, 0, max(self.starts, 1))
 
 
 EFFORTS = {
@@ -163,21 +159,19 @@ class Search:
     def _started(self) -> tuple[IntArray, list[float]]:
         """The best of plans begun from exchange, from roundings and random plans in turn, each
         polished, and where these ended."""
-        problem, rng, effort = self.problem, np.random.default_rng(self.seed), self.effort
+        problem, relaxed, effort, seed = self.problem, self.relaxed, self.effort, self.seed
+        rng, least, ends = np.random.default_rng(seed), np.inf, list[float]()
 
         def make() -> State:
-            found = exact_plan(problem, self.relaxed, starts=effort.exchanges, seed=self.seed)
-            return {"chosen": found[0]}
+            return {"chosen": exact_plan(problem, relaxed, starts=effort.exchanges, seed=seed)[0]}
 
-        best, least, ends = self.checkpoint.finished("exchange", make)["chosen"], np.inf, []
-        begins = [best]
-        for k in range(1, effort.starts):
-            new = (
-                random_plan(problem, rng) if k % 2 else rounded(problem, self.relaxed.weights, rng)
-            )
-            begins.append(new)
-        for k, chosen in enumerate(begins[: effort.starts]):
-            end = self.polished(chosen, f"start{k}")
+        best = begun = self.checkpoint.finished("exchange", make)["chosen"]
+        for k in range(effort.starts):
+            if k:
+                begun = (
+                    random_plan(problem, rng) if k % 2 else rounded(problem, relaxed.weights, rng)
+                )
+            end = self.polished(begun, f"start{k}")
             ends.append(self.value(end))
             self.progress(f"start {k + 1} of {effort.starts}: {min(ends):.6g}")
             if ends[-1] < least * (1 - SAME):
@@ -193,11 +187,13 @@ class Search:
 
         q = self.checkpoint.finished(name, make)["q"]
         moved, now = (q != plan.q).any(axis=1), chosen.copy()
-        if moved.any():
-            now[moved] = len(self.pool) + np.arange(moved.sum())
-            more = self.setup.pool(q[moved], plan.group[moved], plan.readings[moved])
-            self.pool = self.pool.joined(more)
+        now[moved] = len(self.pool) + np.arange(moved.sum())
+        self._join(q[moved], plan.group[moved], plan.readings[moved])
         return now
+
+    def _join(self, q: Array, group: IntArray, readings: IntArray) -> None:
+        if len(q):
+            self.pool = self.pool.joined(self.setup.pool(q, group, readings))
 
     def _better(self, best: IntArray, other: IntArray) -> IntArray:
         return other if self.value(other) < self.value(best) * (1 - SAME) else best
@@ -207,28 +203,14 @@ class Search:
         start = np.concatenate([were, np.zeros(len(self.pool) - len(were))])
         self.relaxed = prospects(self.problem, gap, start)
 
-    def _widened(self, k: int) -> Continuum:
+    def _widened(self, k: int) -> State:
         """What the relaxed optimum lacks of the continuum, whose poses join the pool."""
+        asked = self.problem, self.relaxed.tangent, self.searches, self.T, self.pool, self.seed + k
+        found = self.checkpoint.finished(f"continuum{k}", lambda: estimate(*asked, self.progress))
+        self._join(found["q"], found["group"], found["readings"])
+        return found
 
-        def make() -> State:
-            c = estimate(
-                self.problem, self.relaxed.tangent, self.searches, self.T, self.pool,
-                self.seed + k, self.progress,
-            )  # fmt: skip
-            at = {name: getattr(c.found, name) for name in ("q", "group", "readings")}
-            return at | {"figures": [c.bound, c.searched, c.ascents]}
-
-        state = self.checkpoint.finished(f"continuum{k}", make)
-        bound, searched, ascents = state["figures"]
-        more = self.pool.take(np.zeros(0, dtype=np.int64))
-        if len(state["q"]):
-            more = self.setup.pool(state["q"], state["group"], state["readings"])
-        self.pool = self.pool.joined(more)
-        return Continuum(float(bound), more, int(searched), int(ascents))
-
-    def _certificate(
-        self, value: float, ends: list[float], continuum: list[Continuum]
-    ) -> Certificate:
+    def _certificate(self, value: float, ends: list[float], continuum: list[State]) -> Certificate:
         size, starts = len(self.pool), tuple(ends)
         if not self.problem.criterion.certifiable:
             return Certificate(size, None, None, starts=starts)
@@ -243,16 +225,16 @@ class Search:
         for k in range(1 + REFINED):
             continuum = [*continuum, self._widened((k + 1) * ROUND)]
             new = continuum[-1]
-            if new.bound >= NEAR * self.relaxed.bound or not len(new.found) or k == REFINED:
+            if new["bound"] >= NEAR * self.relaxed.bound or not len(new["q"]) or k == REFINED:
                 break
             self._relax()
-        beyond = min(new.bound, bound)
+        beyond = min(float(new["bound"]), bound)
         return replace(
             own,
             bound_continuum=beyond,
             efficiency_continuum=efficiency(value, beyond),
-            searched=sum(c.searched for c in continuum),
-            ascents=sum(c.ascents for c in continuum),
+            searched=int(sum(c["searched"] for c in continuum)),
+            ascents=int(sum(c["ascents"] for c in continuum)),
         )
 
 
@@ -292,6 +274,7 @@ class _Ordering:
     def __init__(self, search: Search, found: Selection, pinned: FeasiblePool | None) -> None:
         self.search, self.found, self.pinned, self.gone = search, found, pinned, 0
         self.paths = _Paths(search.searches.checker)
+        self.loaded = bool(np.any(self.paths.feasibility.cell.design.loads))
         self.hub = found.pool.q[:: max(len(found.pool) // VIA, 1)]
 
     def reachable(self) -> tuple[Selection, Execution]:
@@ -319,7 +302,6 @@ class _Ordering:
             read=readings > 0,
             limits=joint_limits(rules.cell, rules.chain),
             via=self.hub,
-            blockers=blockers_of(rules),
             alias=alias,
             paired=rules.cell.model.observe == "deflection",
             seed=search.seed, progress=search.progress,
@@ -368,8 +350,7 @@ class _Ordering:
         search.progress(f"{self.gone} poses that no free move reaches are replaced by others")
         kept = np.setdiff1d(found.chosen, gone)
         self.hub = self._joined(np.vstack([self.hub, pool.q[kept]]))
-        V = inverse(problem.information(found.chosen))
-        worth = problem.prices(V @ problem.criterion.slope(V)[1] @ V)
+        _, worth = problem.worth(inverse(problem.information(found.chosen)))
         some = [kept]
         for level, share in enumerate(problem.shares):
             own = np.setdiff1d(np.flatnonzero(problem.group == level), found.chosen)
@@ -386,14 +367,10 @@ class _Ordering:
         chosen = left[exchange(part, begun)[0]]
         self.found = found.exchanged(pool, chosen, search.value(chosen))
 
-    @property
-    def _loaded(self) -> bool:
-        return bool(np.any(self.paths.feasibility.cell.design.loads))
-
     def _joined(self, q: Array) -> Array:
         motion = self.paths.feasibility.cell.design.motion
         points = q if motion.home is None else np.vstack([motion.home, q])
-        roadmap = Roadmap(points, travel_times(points, motion.speed), self._loaded, self.paths)
+        roadmap = Roadmap(points, travel_times(points, motion.speed), self.loaded, self.paths)
         parts = roadmap.parts(list(range(len(points))))
         return points[parts[0] if motion.home is None else next(p for p in parts if 0 in p)]
 
@@ -404,7 +381,7 @@ class _Ordering:
         alone = np.arange(len(q))
         for k in range(min(TRIED, len(self.hub))):
             there = self.hub[next_to[alone, k]]
-            alone = alone[~self.paths.paths_free(q[alone], there, self._loaded)]
+            alone = alone[~self.paths.paths_free(q[alone], there, self.loaded)]
         return ~np.isin(np.arange(len(q)), alone)
 
 
@@ -412,7 +389,7 @@ class _Paths:
     """The cell's moves, each checked once however often a plan changes around it."""
 
     def __init__(self, feasibility: Feasibility) -> None:
-        self.feasibility = feasibility
+        self.feasibility, self.blockers = feasibility, feasibility.blockers
         self.known: dict[tuple[object, ...], bool] = {}
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:

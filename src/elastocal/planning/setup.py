@@ -19,7 +19,7 @@ from elastocal.planning.criteria import (
     CriterionInputs,
     ScenarioCriterion,
     criterion_named,
-    triangular,
+    root,
 )
 from elastocal.planning.execution import Execution
 from elastocal.planning.information import (
@@ -113,11 +113,11 @@ class Setup:
     @cached_property
     def target_rows(self) -> Array | None:
         """R (r, p): |R x| is the rms error at the test poses in m, of a criterion that has some."""
-        return None if self.inputs.A is None else _root(self.inputs.A, self.inputs.target_weights())
+        return None if self.inputs.A is None else root(self.inputs.A, self.inputs.target_weights())
 
     @cached_property
     def elsewhere_rows(self) -> Array | None:
-        return None if self.beyond is None else _root(*self.beyond)
+        return None if self.beyond is None else root(*self.beyond)
 
     def pool(self, q: Array, group: IntArray, readings: IntArray | None = None) -> FeasiblePool:
         """Candidates q (N, n) read as `readings` (N, L) say, or in each of the ways in turn."""
@@ -219,11 +219,6 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
         )
     warnings = setup.warnings + told
     return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)
-
-
-def _root(A: Array, weight: Array) -> Array:
-    """R (r, p) with RᵀR = Σ_t w_t A_tᵀ A_t, A (T, r, p)."""
-    return triangular((np.sqrt(weight)[:, None, None] * A).reshape(-1, A.shape[-1]))
 
 
 def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...]:
@@ -338,6 +333,6 @@ def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, kno
     errors: tuple[float | None, float | None] = (None, None)
     with suppress(InsufficientDataError):
         A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
-        R = _root(A, targets.weight)
+        R = root(A, targets.weight)
         errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
     return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))

@@ -27,7 +27,6 @@ from elastocal.cell.work_cell import CarriedBody, HalfSpace, HangingLoad, Solid,
 from elastocal.planning.bodies import Body, coal_shape
 from elastocal.planning.collision import Collisions, MotionBound
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import blockers_of
 
 BALL = Workspace(bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),), clearance=0.05)
 
@@ -122,6 +121,6 @@ def test_nothing_is_too_thin_to_be_met(x, thickness):
 def test_the_bodies_in_the_way_are_named():
     rules = Feasibility(kr270_cell(), KR270_CHAIN)
     q, turn = np.radians([-24.0, -20, 60, 0, 0, 0]), np.array([1.2, 0, 0, 0, 0, 0])
-    met = blockers_of(rules)(q - turn, q + turn, False)
+    met = rules.blockers(q - turn, q + turn, False)
     assert any("table" in pair for pair in met), met
     assert not any("load" in pair for pair in met)

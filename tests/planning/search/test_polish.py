@@ -190,9 +190,9 @@ def test_the_bound_on_the_continuum_is_below_that_on_the_pool() -> None:
     arm, pool, whole, problem, T, _ = posed("clutter")
     relaxed = relax(problem)
     found = estimate(problem, relaxed.tangent, arm.searches, T, arm.pool(pool.q, pool.group))
-    assert 0 < found.bound <= relaxed.bound * (1 + 1e-9)
-    assert len(found.found) and arm.searches.feasible(found.found.q).all()
-    B = found.found.blocks @ T
+    assert 0 < found["bound"] <= relaxed.bound * (1 + 1e-9)
+    assert len(found["q"]) and arm.searches.feasible(found["q"]).all()
+    B = arm.pool(found["q"], found["group"]).blocks @ T
     d = np.einsum("nri,ij,nrj->n", B, relaxed.tangent.G, B)
     assert (d > problem.prices(relaxed.tangent.G).max()).all()
     # Their tangent bounds plans of poses anywhere, as those of a polish.
@@ -200,7 +200,7 @@ def test_the_bound_on_the_continuum_is_below_that_on_the_pool() -> None:
         plan = random_plan(problem, np.random.default_rng(seed))
         q = pool.q[plan]
         end = polish(problem, arm.searches, T, arm.pool(q, pool.group[plan]))
-        assert value_of(arm, whole, end) >= found.bound * (1 - 1e-3)
+        assert value_of(arm, whole, end) >= found["bound"] * (1 - 1e-3)
 
 
 def test_a_plan_of_local_optimum_stays() -> None:
