@@ -24,7 +24,7 @@ from elastocal.planning.candidates import CHUNK, JointSpace, sobol
 from elastocal.planning.checkpoint import State
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.relaxation import DesignProblem, block_prices
+from elastocal.planning.relaxation import DesignProblem
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -217,7 +217,8 @@ def estimate(
     """
 
     def price(lot: FeasiblePool) -> Array:
-        return block_prices(lot.blocks @ T, tangent.G)
+        B = lot.blocks @ T
+        return np.asarray(((B @ tangent.G) * B).sum(axis=(1, 2)))
 
     def goal(B: Array) -> tuple[float, Array]:
         """Uphill in d(q), of each pose in its own unit."""

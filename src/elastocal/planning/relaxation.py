@@ -113,11 +113,6 @@ class DesignProblem:
         return other
 
 
-def block_prices(blocks: Array, G: Array) -> Array:
-    """⟨G, B_iᵀB_i⟩ (N,) of blocks (N, r, p) and G (p, p)."""
-    return np.asarray(((blocks @ G) * blocks).sum(axis=(1, 2)))
-
-
 @lru_cache
 def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
     """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
