@@ -144,7 +144,7 @@ class Choice:
             and before is not None
             and before.relaxed.value <= after.relaxed.value
         ):
-            found, after = replace(found, cell=cell), before
+            found, after = found._replace(cell=cell), before
         assert after is not None
         criterion = after.setup.criterion
         places = np.stack([boxes.places(cell), boxes.places(found.cell)], axis=1)

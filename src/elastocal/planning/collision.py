@@ -104,7 +104,7 @@ class Collisions:
         self._pools = []
         for own in (np.flatnonzero(~hangs), np.flatnonzero(hangs)):
             tested = geometry.copy()
-            for k in own:
+            for k in own.tolist():
                 a, b = (tested.getGeometryId(name) for name in pairs[k].names)
                 tested.addCollisionPair(pin.CollisionPair(a, b))
             self._pools.append((own, pin.GeometryPool(model, tested, 1)))
