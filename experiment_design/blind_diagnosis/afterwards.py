@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from draw import World
-from numpy.typing import NDArray
+from skeleton import Array
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline
@@ -21,8 +21,6 @@ from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
-
-Array = NDArray[np.float64]
 
 
 def read(model: Model, path: Path) -> Measurements:

@@ -7,12 +7,10 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from skeleton import Skeleton, read_skeleton
+from skeleton import Array, Skeleton, read_skeleton
 from world import TrueArm
 
-Array = NDArray[np.float64]
 FOLDER = Path(__file__).resolve().parent / "arms"
 
 # Standard deviations of a specimen about its nominal data: what a first calibration removes.

@@ -14,12 +14,11 @@ import numpy as np
 from arm_data import ARMS, ArmSpec, Specimen, draw_specimen
 from inside import KINDS, ORDERS, draw_effect, possible
 from instrument import Noise, Variant, draw_noise
-from numpy.typing import NDArray
 from outside import OUTSIDE, draw_outside
 from places import Site, log_uniform
+from skeleton import Array
 from world import Effect, Physics, Visits
 
-Array = NDArray[np.float64]
 Plan = Literal["interleaved", "blocks"]
 
 MINUTES_PER_VISIT = 0.6

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from arm_data import ArmSpec
 from mechanics import Spring, Tendon
-from numpy.typing import NDArray
 from places import (
     Places,
     Site,
@@ -29,10 +28,9 @@ from places import (
     sign,
     spread,
 )
-from skeleton import Skeleton, transverse
+from skeleton import Array, Skeleton, transverse
 from world import Effect, Hooks, Motion, Sight, TrueArm, Visits, reweighed
 
-Array = NDArray[np.float64]
 Move = Callable[[Effect, Visits, Motion], None]
 Draw = Callable[[Site, int, float, np.random.Generator], tuple[Values, Values]]
 POSE = ("x", "y", "z", "rx", "ry", "rz")

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from places import log_uniform
+from skeleton import Array
 
-Array = NDArray[np.float64]
 Variant = Literal[
     "as_modelled", "sigma_wrong", "heavy_tails", "outliers", "joint_pattern", "shared_scatter"
 ]

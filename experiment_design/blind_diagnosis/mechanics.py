@@ -21,11 +21,9 @@ from typing import Literal
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from skeleton import Skeleton, transverse
+from skeleton import Array, Skeleton, transverse
 
-Array = NDArray[np.float64]
 GRAVITY = 9.80665  # m/s², along −z
 # Rotor inertia, which statics does not see: coaxial hinges alone have a singular mass matrix.
 ARMATURE = 'armature="1"'

@@ -129,9 +129,8 @@ def _diagnosed(
     world: World, extra: Visits, visible: Path, worker: Worker, rng: np.random.Generator
 ) -> Record | None:
     """The answer to the campaign's own readings and the extra ones in one table, no pose shared."""
-    own = vars(world.visits)
-    later = vars(replace(extra, pose=own["pose"].max() + 1 + extra.pose))
-    both = Visits(**{key: np.concatenate([own[key], later[key]]) for key in own})
+    own = world.visits
+    both = own.then(replace(extra, pose=own.pose.max() + 1 + extra.pose))
     readings = np.concatenate([world.readings(), world.measure(extra, rng)])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -13,11 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from inside import SPREAD, settled, time_constant
 from mechanics import Spring
-from numpy.typing import NDArray
 from places import Site, log_uniform, sign, spread
+from skeleton import Array
 from world import Effect, Hooks, Motion, Sight, TrueArm, Visits
 
-Array = NDArray[np.float64]
 Maker = Callable[[Site, float, np.random.Generator], Effect]
 
 

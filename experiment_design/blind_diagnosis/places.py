@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from arm_data import ArmSpec
-from numpy.typing import NDArray
+from skeleton import Array
 from world import TrueArm
 
-Array = NDArray[np.float64]
 AT_WORK = 0.2  # a joint is at work where its deflection is this share of the largest joint's
 
 

@@ -12,12 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from draw import World
 from mechanics import GRAVITY
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from skeleton import Array
 from whole_draw import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error, last_move, weights
 from world import Effect, TrueArm, Visits
 
-Array = NDArray[np.float64]
 STEP = 1e-5  # m, rad; central differences, each off by 1e-10 of itself
 
 

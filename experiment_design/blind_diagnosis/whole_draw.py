@@ -25,13 +25,9 @@ from arm_data import ARMS, ArmSpec, draw_specimen
 from draw import Plan, Told, World, draw_poses, draw_visits
 from inside import POSE
 from instrument import draw_noise
-from numpy.typing import NDArray
 from places import Values, log_uniform
-from skeleton import Skeleton
+from skeleton import Array, Skeleton
 from world import Effect, Hooks, Motion, Visits
-
-Array = NDArray[np.float64]
-
 
 # How the effects act, several at every joint.  Their names are not those of elastocal, which is
 # asked for sizes and causes here, not for a name.

@@ -18,44 +18,41 @@ import numpy as np
 from arm_data import ANGLE, BASE_ANGLE, BASE_POSITION, COMPLIANCE_SPREAD, LENGTH, MARKER, OFFSET
 from draw import World
 from instrument import polar
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
+from skeleton import Array
 from whole_columns import Scene, components, moments, scene_of
 from whole_draw import CREEP, LAST_MOVE, LINES, RANGES, WEIGHTS, creep
 from world import Effect, Visits
 
-Array = NDArray[np.float64]
 SHOWN = 1e-4  # singular value of unit columns, of the largest
 SMALLEST = 1e-10  # of the creep's largest variance: what is below is left out
 
 
 @dataclass(frozen=True)
 class Block:
-    """Parameters of one kind: columns at the campaign and elsewhere, (n, K, p) each; standard
-    deviation (p,) of the prior, and how far the truth (p,) is from its mean."""
+    """Parameters of one kind: columns (n, K, p); standard deviation (p,) of the prior, and how far
+    the truth (p,) is from its mean."""
 
-    here: Array
-    there: Array
+    columns: Array
     deviation: Array
     away: Array
 
 
 @dataclass(frozen=True)
 class Sights:
-    """A world's campaign and its other poses, each with the columns of the true arm."""
+    """A world's campaign, its first `n` visits, and its other poses, with the columns of the true
+    arm at both."""
 
     world: World
-    here: Visits
-    there: Visits
-    at_here: Scene
-    at_there: Scene
+    n: int
+    visits: Visits
+    scene: Scene
 
     @classmethod
     def of(cls, world: World) -> Sights:
-        there = world.fresh()
-        at_here, at_there = (scene_of(world, v) for v in (world.visits, there))
-        return cls(world, world.visits, there, at_here, at_there)
+        visits = world.visits.then(world.fresh())
+        return cls(world, len(world.visits.q), visits, scene_of(world, visits))
 
 
 def second_moment(bounds: tuple[float, float]) -> float:
@@ -68,10 +65,8 @@ def oracle_errors(sights: Sights) -> tuple[float, float]:
     """Rms length (m) of the oracle's errors at the other poses, and that which its posterior
     covariance lets expect."""
     blocks = [*geometry(sights), *effects(sights)]
-    X, other = (
-        np.concatenate([getattr(b, side) * b.deviation for b in blocks], axis=2)
-        for side in ("here", "there")
-    )
+    X = np.concatenate([b.columns * b.deviation for b in blocks], axis=2)
+    X, other = X[: sights.n], X[sights.n :]
     away = np.concatenate([b.away / b.deviation for b in blocks])
     world = sights.world
     truth = world.noise_free(world.visits)
@@ -98,7 +93,7 @@ def rms_length(error: Array) -> float:
 
 def covariance(sights: Sights, points: Array) -> Array:
     """That of a visit's K coordinates, (n, K, K): the tracker's noise and the joints' scatter."""
-    noise, joint = sights.world.noise, sights.at_here.joint
+    noise, joint = sights.world.noise, sights.scene.joint[: sights.n]
     K = joint.shape[1]
     scatter = joint * noise.repeatability
     V = scatter @ scatter.transpose(0, 2, 1)
@@ -111,55 +106,48 @@ def covariance(sights: Sights, points: Array) -> Array:
 
 def geometry(sights: Sights) -> Iterator[Block]:
     """Base, offsets, links, markers and compliances, about what their owner believes."""
-    world, here, there = sights.world, sights.at_here, sights.at_there
+    world, at = sights.world, sights.scene
     true, spec, believed = world.specimen.true, world.spec, world.specimen
     J = spec.skeleton.n_joints
     yaw = Rotation.from_euler("z", believed.base_yaw_deg, degrees=True)
     turn = (Rotation.from_matrix(true.base_rotation) * yaw.inv()).as_rotvec()
     away = np.concatenate([true.base_position - believed.base_position, turn])
-    yield Block(here.base, there.base, np.repeat([BASE_POSITION, BASE_ANGLE], 3), away)
-    yield Block(here.joint, there.joint, np.full(J, OFFSET), true.offset)
+    yield Block(at.base, np.repeat([BASE_POSITION, BASE_ANGLE], 3), away)
+    yield Block(at.joint, np.full(J, OFFSET), true.offset)
     moved = []
     for j in range(J):
         R = spec.skeleton.rotation[j + 1].T
         turned = Rotation.from_matrix(R @ true.skeleton.rotation[j + 1]).as_rotvec()
         moved += [R @ (true.skeleton.position[j + 1] - spec.skeleton.position[j + 1]), turned]
     sizes = np.tile(np.repeat([LENGTH, ANGLE], 3), J)
-    yield Block(here.links, there.links, sizes, np.concatenate(moved))
+    yield Block(at.links, sizes, np.concatenate(moved))
     off = (true.markers - np.array(spec.markers)).ravel()
-    yield Block(here.markers, there.markers, np.full(len(off), MARKER), off)
+    yield Block(at.markers, np.full(len(off), MARKER), off)
     k = believed.compliance
-    columns = (at.joint * at.load[:, None] for at in (here, there))
-    yield Block(*columns, COMPLIANCE_SPREAD / np.sqrt(3) * k, true.compliance - k)
+    yield Block(
+        at.joint * at.load[:, None], COMPLIANCE_SPREAD / np.sqrt(3) * k, true.compliance - k
+    )
 
 
 def effects(sights: Sights) -> Iterator[Block]:
     """What is wrong beside geometry and compliances, by the laws that it has."""
-    world = sights.world
+    world, v, at = sights.world, sights.visits, sights.scene
     spec, true = world.spec, world.specimen.true
-    sides = ((sights.here, sights.at_here), (sights.there, sights.at_there))
     for e in world.effects:
         if e.name == LINES:
             for line, order in e.settings.items():
-                columns = [
-                    at.joint[:, :, e.index, None]
-                    * np.stack([f(order * v.q[:, e.index]) for f in (np.sin, np.cos)], 1)[:, None]
-                    for v, at in sides
-                ]
+                angle = order * v.q[:, e.index]
+                waves = np.stack([np.sin(angle), np.cos(angle)], axis=1)
+                columns = at.joint[:, :, e.index, None] * waves[:, None]
                 size = spec.gear * line_deviation(line)
-                truth = e.vector(f"{line}_sin", f"{line}_cos")
-                yield Block(*columns, np.full(2, size), truth)
+                yield Block(columns, np.full(2, size), e.vector(f"{line}_sin", f"{line}_cos"))
         elif e.name == LAST_MOVE:
-            columns = [at.joint[:, :, [e.index]] * v.approach[:, None, [e.index]]
-                       for v, at in sides]  # fmt: skip
+            columns = at.joint[:, :, [e.index]] * v.approach[:, None, [e.index]]
             size = spec.gear * np.sqrt(second_moment(RANGES.half_width))
-            yield Block(*columns, np.array([size]), e.vector("half_width"))
+            yield Block(columns, np.array([size]), e.vector("half_width"))
         elif e.name == WEIGHTS:
-            columns = [
-                np.einsum("nkj,j,njp->nkp", at.joint, true.compliance, at.weighing)
-                for _, at in sides
-            ]
-            yield Block(*columns, _moment_deviations(world), moments(e))
+            columns = np.einsum("nkj,j,njp->nkp", at.joint, true.compliance, at.weighing)
+            yield Block(columns, _moment_deviations(world), moments(e))
         elif e.name == CREEP:
             yield _creep(sights, e)
 
@@ -184,19 +172,16 @@ def _moment_deviations(world: World) -> Array:
 
 
 def _creep(sights: Sights, e: Effect) -> Block:
-    """The base's motion at all times of both tables, in the axes of its prior covariance."""
-    time, n = np.concatenate([sights.here.time, sights.there.time]), len(sights.here.time)
+    """The base's motion at all times, in the axes of its prior covariance."""
+    time, base = sights.visits.time, sights.scene.base
     apart = (time[:, None] - time) / e.settings["length_s"]
     value, axes = np.linalg.eigh(np.exp(-0.5 * apart**2))
     kept = value > SMALLEST * value.max()
     basis = axes[:, kept]
     sizes = [np.sqrt(second_moment(b)) for b in (RANGES.shift, RANGES.turn)]
     deviation = np.repeat(sizes, 3)[:, None] * np.sqrt(value[kept])
-    columns = [
-        np.einsum("nkb,np->nkbp", at.base, part).reshape(*at.base.shape[:2], -1)
-        for at, part in ((sights.at_here, basis[:n]), (sights.at_there, basis[n:]))
-    ]
-    return Block(*columns, deviation.ravel(), (creep(e, time).T @ basis).ravel())
+    columns = np.einsum("nkb,np->nkbp", base, basis).reshape(*base.shape[:2], -1)
+    return Block(columns, deviation.ravel(), (creep(e, time).T @ basis).ravel())
 
 
 @dataclass(frozen=True)
@@ -217,13 +202,13 @@ class Gap:
 
 def gap_of(sights: Sights) -> Gap:
     """Each part's motion without what the fitted geometry takes on of it, by least squares."""
-    world, scene = sights.world, sights.at_here
-    parts = components(world, sights.here, scene)
-    moved = np.stack([part.ravel() for part in parts.values()], axis=1)
+    n, scene = sights.n, sights.scene
+    parts = components(sights.world, sights.visits, scene)
+    moved = np.stack([part[:n].ravel() for part in parts.values()], axis=1)
     # The cell's model knows no weights: its compliances answer to the payload.
     *frames, springs = geometry(sights)
-    springs = replace(springs, here=scene.joint * scene.carried[:, None])
-    X = np.concatenate([b.here * b.deviation for b in (*frames, springs)], axis=2)
+    springs = replace(springs, columns=scene.joint * scene.carried[:, None])
+    X = np.concatenate([b.columns[:n] * b.deviation for b in (*frames, springs)], axis=2)
     X = X.reshape(len(moved), -1)
     # Axes that are all but parallel in this one arm show nothing: no fit would follow there.
     X = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)

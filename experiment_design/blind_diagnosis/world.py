@@ -10,9 +10,7 @@ import numpy as np
 from mechanics import ElasticArm, Placement, Rest, Spring, Tendon
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from skeleton import Skeleton
-
-Array = NDArray[np.float64]
+from skeleton import Array, Skeleton
 
 
 @dataclass(frozen=True)
@@ -26,10 +24,9 @@ class Visits:
     approach: Array
     pose: NDArray[np.int64]
 
-    def take(self, rows: NDArray[np.int64]) -> Visits:
-        return Visits(
-            self.q[rows], self.force[rows], self.time[rows], self.approach[rows], self.pose[rows]
-        )
+    def then(self, later: Visits) -> Visits:
+        own, theirs = vars(self), vars(later)
+        return Visits(**{key: np.concatenate([own[key], theirs[key]]) for key in own})
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,10 @@ import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-import numpy as np
 from draw import Recipe, World
-from numpy.typing import NDArray
+from skeleton import Array
 from world import Effect, Visits
 
-Array = NDArray[np.float64]
 FITTED = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
 
 

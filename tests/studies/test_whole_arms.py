@@ -47,12 +47,12 @@ def test_the_arm_moves_as_the_columns_say(sights):
     """All effects together, by MuJoCo and to first order: within a hundredth."""
     world = sights.world
     whole, bare = (w.noise_free(world.visits) for w in (world, replace(world, effects=())))
-    parts = components(world, world.visits, sights.at_here)
+    parts = [part[: sights.n] for part in components(world, sights.visits, sights.scene).values()]
     moved = (whole - bare).reshape(len(whole), -1)
-    assert rms(moved - sum(parts.values())) < 0.01 * rms(moved)
+    assert rms(moved - sum(parts)) < 0.01 * rms(moved)
     (heavy,) = (e for e in world.effects if e.name == WEIGHTS)
-    load = sights.at_here.carried + sights.at_here.weighing @ moments(heavy)
-    assert load == pytest.approx(sights.at_here.load, abs=2e-3 * np.abs(load).max())
+    load = sights.scene.carried + sights.scene.weighing @ moments(heavy)
+    assert load == pytest.approx(sights.scene.load, abs=2e-3 * np.abs(load).max())
 
 
 def test_the_oracle_errs_as_its_covariance_says():
