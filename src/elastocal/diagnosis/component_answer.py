@@ -129,12 +129,14 @@ class SumAnswer:
         return min(self.found.data.blocks.size, 3)
 
     @cached_property
+    def _drawn(self) -> Array:
+        """Posterior draws (p + Σ k, draws) of the fitted columns' coefficients and of these."""
+        return drawn(self.found, self.hidden, self._weighted, self._wide.precision, DRAWS, self.rng)
+
+    @property
     def draws(self) -> Array:
-        """Posterior draws (Σ k, draws) of the components' coefficients."""
-        every = drawn(
-            self.found, self.hidden, self._weighted, self._wide.precision, DRAWS, self.rng
-        )
-        return every[self._own :]
+        """Those (Σ k, draws) of the components."""
+        return self._drawn[self._own :]
 
     @cached_property
     def moved(self) -> Array:
@@ -168,10 +170,9 @@ class SumAnswer:
         return len(self.moved) / self._axes
 
     @cached_property
-    def _poses(self) -> tuple[IntArray, Array, Array]:
-        """Rows that show what new poses may be like, how often each of their configurations is
-        drawn among NEW_POSES (configurations, draws), and what the draws of all components leave
-        of them (rows, draws)."""
+    def _poses(self) -> tuple[IntArray, Array]:
+        """Rows that show what new poses may be like, and how often each of their configurations is
+        drawn among NEW_POSES (configurations, draws)."""
         rows = np.nonzero(self._rows)[0]
         known = np.unique(rows)
         some = known[np.linspace(0, len(known) - 1, min(MOST_POSES, len(known))).astype(int)]
@@ -179,16 +180,16 @@ class SumAnswer:
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
         times = self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
-        return kept, times, self.moved[kept] @ self.draws
+        return kept, times
 
     def _of_new_poses(self, left: Array) -> Array:
         """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
-        kept, drawn, _ = self._poses
+        kept, times = self._poses
         rows = np.nonzero(self._rows)[0][kept]
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         each = np.add.reduceat(left**2, starts, axis=0)
         count = np.diff(np.append(starts, len(rows))) / self._axes
-        return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
+        return np.asarray((times * each).sum(axis=0) / (times * count[:, None]).sum(axis=0))
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
@@ -373,6 +374,11 @@ class SumAnswer:
     # How far the gap falls.
 
     @cached_property
+    def _left(self) -> Array:
+        """What the draws of all components leave of the poses that are kept (rows, draws)."""
+        return np.asarray(self.moved[self._poses[0]] @ self.draws)
+
+    @cached_property
     def _excess(self) -> float:
         """Mean square in m² per reading that the fit itself is uncertain by at poses left out."""
         V = covariance(self.found.data, self.found.noise)
@@ -387,7 +393,8 @@ class SumAnswer:
         estimate of these components, and the error of the whole fit in proportion to their part.
         """
         index = self._index(members)
-        kept, _, whole = self._poses
+        kept, _ = self._poses
+        whole = self._left
         before = self._of_new_poses(whole)
         estimate = self.moved[np.ix_(kept, index)] @ self._fitted.beta[self._own :][index]
         after = self._of_new_poses(whole - estimate[:, None])
@@ -460,7 +467,7 @@ class SumAnswer:
     def unnamed_probability(self) -> float:
         return max(map(self._probability, self._unnamed), default=0.0)
 
-    def location(self, tests: Sequence[StructureTest]) -> Location:
+    def location(self, tests: Sequence[StructureTest]) -> Location | None:
         """Where the largest cause acts, the largest without a name where the verdict is open;
         what each stage contributes, and how surely anything acts at each stage and place."""
         at_stage, at_place = self._by(_stage_of), self._by(lambda c: c.where)
@@ -535,12 +542,16 @@ class SumAnswer:
         }  # fmt: skip
         order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
         for (name, where), members in order:
-            settings = self._settings(members)
-            fall = self._reduction(members)
             probability = max(self._probability(k) for k in members)
-            parameters = tuple(p for k in members for p in self._parameters(k))
             sizes = {key: size for k in members for key, size in self._parameter_sizes(k)}
-            yield FoundEffect(name, where, probability, *fall, parameters, settings, sizes)
+            yield replace(self._found_effect(name, where, members, probability), sizes=sizes)
+
+    def _found_effect(
+        self, name: str, where: str, members: list[int], probability: float
+    ) -> FoundEffect:
+        settings, fall = self._settings(members), self._reduction(members)
+        parameters = tuple(p for k in members for p in self._parameters(k))
+        return FoundEffect(name, where, probability, *fall, parameters, settings)
 
     @cached_property
     def _present(self) -> Array:
@@ -614,21 +625,28 @@ class SumAnswer:
     # The budget, and shapes.
 
     def budget(self, first: Sequence[BudgetStep]) -> tuple[BudgetStep, ...]:
-        """The steps so far, and one for each group of components, the largest first."""
+        """The steps so far, one for each named step, and one with what has no name."""
         steps: list[BudgetStep] = list(first)
         members: list[int] = []
+        for name, own in self._named_steps():
+            members += own
+            steps.append(self._step(name, members))
+        if len(members) < len(self.found.components):
+            everything = list(range(len(self.found.components)))
+            nameless = sorted(self._unnamed, key=lambda k: -float(np.median(self.squares([k]))))
+            places = dict.fromkeys(self.found.components[k].where for k in nameless)
+            name = "unknown:" + "+".join(places) if places else "rest"
+            steps.append(self._step(name, everything))
+        return tuple(steps)
+
+    def _named_steps(self) -> Iterator[tuple[str, list[int]]]:
+        """Each group of components, the largest first."""
         for group in self.groups[:MOST_STEPS]:
-            members += [
+            yield f"{group.name}:{'+'.join(group.places)}", [
                 k for k, c in enumerate(self.found.components)
                 if c.named and c.where in group.places and c.effect.name in group.effects
                 and k not in self._slight
             ]  # fmt: skip
-            steps.append(self._step(f"{group.name}:{'+'.join(group.places)}", members))
-        if len(members) < len(self.found.components):
-            everything = list(range(len(self.found.components)))
-            rest = "unknown:" + "+".join(dict.fromkeys(f.where for f in self.fields))
-            steps.append(self._step(rest if self.fields else "rest", everything))
-        return tuple(steps)
 
     def _step(self, name: str, members: list[int]) -> BudgetStep:
         gone = [k for k in range(len(self.found.components)) if k not in members]

@@ -30,6 +30,7 @@ from elastocal.diagnosis.components import (
     FittedSum,
     Pool,
     Sizes,
+    at_maximum,
     fit_sum,
     log_odds,
     posed,
@@ -598,17 +599,28 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
 
 def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
     """What the forward search found at settings of its own."""
-    found = []
-    for item in chosen.items:
-        h = item.what
-        if isinstance(h, Hypothesis) and len(item.settings):
-            family = family_of(h.effect, dataset.base.model.cell)
-            columns, settings = packed_columns(dataset, item), tuple(settings_of(item).items())
-            grid = dataset.grids[h.key]
-            search = -float(grid.log_prior[grid.nearest(item.settings)])
-            found.append(Component(family, h.effect, h.where, columns, settings=settings,
-                                   hypothesis=h, search=search))  # fmt: skip
-    return found
+    return [_component(dataset, item) for item in chosen.items if item.known and len(item.settings)]
+
+
+def _component(dataset: DiagnosisData, item: Item) -> Component:
+    h, columns = item.what, packed_columns(dataset, item)
+    if not isinstance(h, Hypothesis):
+        return Component("pose", ResidualField(), h.where, columns, follows=h.covariate)
+    family, settings = family_of(h.effect, dataset.base.model.cell), settings_of(item)
+    search = 0.0
+    if settings:
+        grid = dataset.grids[h.key]
+        search = -float(grid.log_prior[grid.nearest(item.settings)])
+    return Component(family, h.effect, h.where, columns, settings=tuple(settings.items()),
+                     hypothesis=h, search=search)  # fmt: skip
+
+
+def sum_of(dataset: DiagnosisData, chosen: ModelSet) -> FittedSum:
+    """The set as a sum under its noise: its items at the sizes that it has, or at typical ones,
+    where these are larger: a tie to less would make what is true smaller than what was found."""
+    sums = posed(dataset.data, [_component(dataset, i) for i in chosen.items], chosen.noise)
+    sizes = np.log(np.maximum(chosen.scales, 1.0))
+    return at_maximum(sums, Sizes(0.0, sizes, np.zeros(len(chosen.items))))
 
 
 def with_own_axes(found: FittedSum) -> FittedSum:

@@ -565,7 +565,7 @@ def fit_sum(
             problem = _under_own_noise(problem, at)
         if not components:
             break
-    return _at_maximum(problem, at)
+    return at_maximum(problem, at)
 
 
 def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
@@ -579,7 +579,7 @@ def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
     return found.scaled(found.climbed(replace(at, factor=0.0), factor_alone=True).factor)
 
 
-def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
+def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     variances = problem.variances(at)
     value = problem.factored(at)[1]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost

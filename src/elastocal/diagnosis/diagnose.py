@@ -35,22 +35,17 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     with_recorded_drivers,
 )
-from elastocal.diagnosis.model_set import settings_of, with_likelier_backlash_model
+from elastocal.diagnosis.model_set import with_likelier_backlash_model
+from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
-from elastocal.diagnosis.shrinkage import (
-    Confirmation,
-    budget,
-    first_steps,
-)
+from elastocal.diagnosis.shrinkage import first_steps
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
-    TOO_NEAR_PROBABILITY,
-    Answer,
+    FewAnswer,
+    beside_unknown,
     candidates,
-    curves_of,
     judge,
-    location,
     structure_tests,
     too_small,
     warnings,
@@ -267,22 +262,23 @@ def _diagnosed(
     whole, nats, fields = _sum_of_all(dataset, found, options, rng, progress)
     progress("confirming")
     tests = structure_tests(found.first)
+    answer: SumAnswer | FewAnswer
     if whole is None:
         found = search.settled(found)
-        judged, answers = _of_few(dataset, found, tests, fields, rng)
+        answer = FewAnswer.of(dataset, found, fields if found.chosen.unknown else (), rng)
     else:
-        judged, answers = judge(found), _of_sum(whole, dataset, found, tests)
-    added = (*answers["effects"], *answers.get("slight", ()))
+        answer = whole
+    answers = _pieces(answer, dataset, found.nothing.noise, tests)
+    added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
     p, nothing = chance_of_noise(found, nats)
     if answers["gap"].open:
         # What is left is no noise, whatever it is.
         nothing = min(nothing, FALSE_SMOOTH)
-    beside = found.chosen if whole is None else whole.found
     return Diagnosis(
         **answers,
-        candidates=candidates(dataset, found, judged),
+        candidates=candidates(dataset, found, judge(found)),
         structure=tests,
         probability_nothing=nothing,
         p_value=p,
@@ -290,7 +286,7 @@ def _diagnosed(
         warnings=(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
-            *warnings(dataset, found, screened, beside.noise),
+            *warnings(dataset, found, screened, answer.found.noise),
         ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
@@ -331,32 +327,11 @@ def _sum_of_all(
     return answer, over, ()
 
 
-def _of_few(
-    dataset: DiagnosisData, found: SelectedEffects, tests: tuple[StructureTest, ...],
-    fields: tuple[FoundEffect, ...], rng: np.random.Generator,
-) -> tuple[Answer, dict[str, Any]]:  # fmt: skip
-    gap, steps = budget(dataset, found, rng)
-    answer = judge(found, gap.open)
-    effects, unknown = _findings(found, answer, gap, rng), answer.unknown
-    return answer, {
-        "verdict": answer.verdict,
-        "gap": gap,
-        "budget": steps,
-        "effects": beside_unknown(effects) if unknown else effects,
-        "fields": fields if unknown else (),
-        "indistinguishable": answer.indistinguishable,
-        "location": location(found, tests),
-        "noise": noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
-        "probability_unknown": max(_unknown(found), gap.open * (1 - FALSE_SMOOTH)),
-        "curves": curves_of(found.dataset, found.chosen),
-    }
-
-
-def _of_sum(
-    answer: SumAnswer, dataset: DiagnosisData, found: SelectedEffects,
-    tests: tuple[StructureTest, ...],
-) -> dict[str, Any]:  # fmt: skip
-    first = first_steps(dataset, found.nothing, None, answer.rng)
+def _pieces(
+    answer: SumAnswer, before: DiagnosisData, noise: NoiseValues, tests: tuple[StructureTest, ...]
+) -> dict[str, Any]:
+    """What an answer fills of a diagnosis; `before` and its `noise` without further effects."""
+    first = first_steps(before, noise, answer.rng)
     steps = answer.budget(first)
     named = [step for step in steps if not step.step.startswith("unknown")]
     floor = answer.supported.noise
@@ -379,21 +354,6 @@ def _of_sum(
         "fields": answer.fields,
         "slight": answer.slight,
     }
-
-
-def beside_unknown(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
-    """Names beside something without a name, which may be part of its imitation."""
-    return tuple(replace(f, probability=min(f.probability, TOO_NEAR_PROBABILITY)) for f in effects)
-
-
-def _unknown(found: SelectedEffects) -> float:
-    """Probability that something without a name is at work, in whichever slot it is likeliest."""
-    shares = []
-    for slot in found.slots:
-        each = slot.probabilities()[0]
-        blocks = [p for item, p in zip(slot.items, each, strict=True) if not item.known]
-        shares.append(min(float(np.sum(blocks)), 1.0))  # a sum of hundreds may exceed it
-    return max(shares)
 
 
 def _searched(
@@ -428,30 +388,3 @@ def _check_enough(table: Measurements) -> None:
             f"{table.source}: {n} configurations are too few to tell a missing effect from noise; "
             f"measure {FEWEST} at least, better 30 or more"
         )
-
-
-def _findings(
-    found: SelectedEffects, answer: Answer, gap: Gap, rng: np.random.Generator
-) -> tuple[FoundEffect, ...]:
-    """The known items with their probabilities, parameters and confirmed shrinkage.
-
-    What is unexplained is no noise, and stays whichever effect joins the model; beside something
-    without a name so does all that the named effects leave at held-out poses above the noise.
-    """
-    chosen = found.chosen
-    known = [k for k, item in enumerate(chosen.items) if item.known]
-    if not known:
-        return ()
-    confirmation = Confirmation.of(found)
-    stays = confirmation.unnamed + gap.unexplained**2
-    if chosen.unknown:
-        stays = max(stays, gap.explained**2 - gap.noise_floor**2)
-    findings = []
-    for k in known:
-        item = chosen.items[k]
-        reduction, ci90, ci95 = confirmation.reduction(k, answer.rivals[k], stays, rng)
-        fitted, settings = confirmation.parameters(k), settings_of(item)
-        findings.append(
-            FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)
-        )
-    return tuple(findings)

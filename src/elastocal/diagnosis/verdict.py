@@ -1,17 +1,23 @@
-"""What scores mean: the answer, where the gap lies, everything that was tried, best first."""
+"""What scores mean: the answer by few causes, where the gap lies, everything that was tried."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import special
 
+from elastocal.diagnosis.component_answer import SumAnswer
+from elastocal.diagnosis.component_search import sum_of
 from elastocal.diagnosis.diagnosis import (
     Candidate,
     Curve,
     EffectAt,
+    FittedParameter,
+    FoundEffect,
     Location,
     StructureTest,
     Untested,
@@ -21,12 +27,15 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import LARGEST_SET, SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
+from elastocal.diagnosis.model_set import Item, ModelSet, distances, fit_extended, settings_of
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, covariance, project
 from elastocal.diagnosis.reading_faults import OutlierScreening
+from elastocal.diagnosis.shrinkage import Shrinkage
+from elastocal.diagnosis.stated_floor import each_left_out
 from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
+from elastocal.units import Array
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -48,10 +57,6 @@ class Answer:
     rivals: tuple[tuple[tuple[Item, float], ...], ...]
 
     @property
-    def unknown(self) -> bool:
-        return self.verdict == "unknown_effect"
-
-    @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         return tuple(
             tuple(EffectAt(*item.key) for item, _ in rivals)
@@ -60,16 +65,16 @@ class Answer:
         )
 
 
-def judge(found: SelectedEffects, unexplained: bool = False) -> Answer:
-    """The verdict on what the search found; `unexplained` where most of the gap is left."""
+def judge(found: SelectedEffects) -> Answer:
+    """The verdict on what the search found."""
     if not found.chosen.items:
-        return Answer("unknown_effect" if unexplained else "nothing_significant", (), ())
+        return Answer("nothing_significant", (), ())
     probability, rivals = [], []
     for k, item in enumerate(found.chosen.items):
         p, others = _of_item(found, k, item)
         probability.append(p)
         rivals.append(others)
-    if found.chosen.unknown or unexplained:
+    if found.chosen.unknown:
         verdict: Verdict = "unknown_effect"
     elif all(len(r) == 1 for r in rivals):
         verdict = "explained"
@@ -141,7 +146,7 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
 
 
-def location(found: SelectedEffects, tests: tuple[StructureTest, ...]) -> Location | None:
+def location(found: SelectedEffects, tests: Sequence[StructureTest]) -> Location | None:
     """Probabilities of stage and place, from all that could stand in the place of the unknown
     effect, or of the first one found."""
     items = found.chosen.items
@@ -195,6 +200,142 @@ def curves_of(dataset: DiagnosisData, chosen: ModelSet) -> tuple[Curve, ...]:
             entry = f"{block.where}{name}"
             out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
     return tuple(out)
+
+
+@dataclass(frozen=True)
+class FewAnswer(SumAnswer):
+    """The pieces of a diagnosis that the few causes fill which the forward search `selected`;
+    `corrections` without a name are those of the sum of all that may act."""
+
+    selected: SelectedEffects
+    corrections: tuple[FoundEffect, ...]
+
+    @classmethod
+    def of(
+        cls, before: DiagnosisData, selected: SelectedEffects,
+        corrections: tuple[FoundEffect, ...], rng: np.random.Generator,
+    ) -> FewAnswer:  # fmt: skip
+        data = selected.dataset
+        return cls(before, data, sum_of(data, selected.chosen), (), rng, selected, corrections)
+
+    @cached_property
+    def judged(self) -> Answer:
+        return judge(self.selected)
+
+    @property
+    def verdict(self) -> Verdict:
+        return self.judged.verdict
+
+    @property
+    def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
+        return self.judged.indistinguishable
+
+    @property
+    def _named(self) -> list[int]:
+        return [k for k, item in enumerate(self.selected.chosen.items) if item.known]
+
+    @property
+    def effects(self) -> tuple[FoundEffect, ...]:
+        items, p = self.selected.chosen.items, self.judged.probability
+        found = tuple(self._found_effect(*items[k].key, [k], p[k]) for k in self._named)
+        return beside_unknown(found) if self.selected.chosen.unknown else found
+
+    @property
+    def fields(self) -> tuple[FoundEffect, ...]:
+        return self.corrections
+
+    @cached_property
+    def _fitted(self) -> Projection:
+        """By the weights of an ordinary calibration, as the steps before."""
+        return project(self.found.data, self.found.noise.of_instrument())
+
+    @cached_property
+    def _refitted(self) -> dict[str, float]:
+        """Values by name of the exact model with all items that have a name, fitted to the
+        readings: where a geometry is sought, its columns are no line to it."""
+        chosen = self.selected.chosen
+        fitted = fit_extended(self.dataset, chosen, [chosen.items[k] for k in self._named])
+        return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
+
+    def _reduction(self, members: Sequence[int]) -> Shrinkage:
+        """Fraction by which the noise-free error of new poses falls by these components.
+
+        A configuration c that is left out of a fit is a new pose for it.  Before, the error there
+        is X_c β̂₋c − W_c θ*, after it W_c (θ̂ − θ*), with the columns W of all that is held to be
+        true.  What is unexplained is no noise, and stays.
+        """
+        before, after = (
+            self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
+            for predicted in self._predicted(members)
+        )
+        return Shrinkage.of(1 - np.sqrt(after / np.maximum(before, 1e-300)))
+
+    @cached_property
+    def _true(self) -> Array:
+        """Readings without noise (rows, draws), θ* drawn, as uncertain of each configuration as
+        where it is left out: what is read there then has the covariance P_cc⁻¹."""
+        kept, _ = self._poses
+        at, configuration = self.at, np.nonzero(self._rows)[0][kept]
+        W = self._wide.X[self._rows][kept]
+        moved = W @ (self._drawn - at.beta[:, None])
+        V = covariance(self.found.data, self.found.noise)
+        uncertain = np.diagonal(np.linalg.inv(at.P) - V, axis1=1, axis2=2)[self._rows][kept]
+        own, left_out = (
+            np.bincount(configuration, each) for each in ((moved**2).mean(axis=1), uncertain)
+        )
+        grown = np.sqrt(np.maximum(left_out / np.maximum(own, 1e-300), 1.0))
+        return np.asarray((W @ at.beta)[:, None] + moved * grown[configuration, None])
+
+    def _predicted(self, members: Sequence[int]) -> tuple[Array, Array]:
+        """Readings (rows,) of configurations that are left out, as predicted without these and with
+        them; where nothing else is missing, as they are fitted, about which θ* scatters."""
+        kept, _ = self._poses
+        missing, r = self._unnamed, self.found.data.r
+        before = r - each_left_out(*self._fitted_without([*members, *missing]))
+        P, u = self._fitted_without(missing)
+        after = r - each_left_out(P if missing else self._fitted.inverse, u)
+        return before[self._rows][kept], after[self._rows][kept]
+
+    def _parameters(self, k: int) -> Iterator[FittedParameter]:
+        """Of the exact fit by the instrument's noise, and one step from there by all the noise."""
+        c, span = self.found.components[k], self.found.spans[k]
+        assert c.hypothesis is not None
+        size = self.dataset.sizes[c.hypothesis.key]
+        step = (self.at.beta - self._fitted.beta)[span] * size
+        std = np.linalg.norm(self.at.beta_deviation[:, span], axis=0) * size
+        for p, more, s in zip(c.hypothesis.parameters, step, std, strict=True):
+            name = f"{c.where}.{p.key}"
+            yield FittedParameter(name, self._refitted[name] + float(more), p.unit, float(s))
+
+    components = groups = slight = ()
+
+    @property
+    def unexplained(self) -> float:
+        return self.supported.unexplained
+
+    @property
+    def unnamed_probability(self) -> float:
+        """In whichever slot it is likeliest."""
+        shares = []
+        for slot in self.selected.slots:
+            each = slot.probabilities()[0]
+            blocks = [p for item, p in zip(slot.items, each, strict=True) if not item.known]
+            shares.append(min(float(np.sum(blocks)), 1.0))  # a sum of hundreds may exceed it
+        return max(shares)
+
+    def location(self, tests: Sequence[StructureTest]) -> Location | None:
+        return location(self.selected, tests)
+
+    def curves(self) -> tuple[Curve, ...]:
+        return curves_of(self.dataset, self.selected.chosen)
+
+    def _named_steps(self) -> Iterator[tuple[str, list[int]]]:
+        return ((self.selected.chosen.items[k].what.label, [k]) for k in self._named)
+
+
+def beside_unknown(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
+    """Names beside something without a name, which may be part of its imitation."""
+    return tuple(replace(f, probability=min(f.probability, TOO_NEAR_PROBABILITY)) for f in effects)
 
 
 # Everything that was tried, best first; what could not be tested; what to beware of.
