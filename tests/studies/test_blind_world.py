@@ -16,6 +16,7 @@ pytest.importorskip("mujoco")
 FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diagnosis"
 sys.path.insert(0, str(FOLDER))
 
+from afterwards import plain_fit, true_reduction
 from arm_data import ARMS
 from draw import ALIKE, CATALOGUE, Recipe, World
 from instrument import OUTLIER_SIZE, REPEATABILITY, VARIANTS, draw_noise
@@ -25,6 +26,7 @@ from world_files import write_table, write_world
 import elastocal as ec
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import read_cell
+from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 
@@ -185,6 +187,23 @@ def test_a_small_effect_is_found_before_a_large_one_that_hides_it(world, tmp_pat
     assert {(e.effect, e.where) for e in found.effects} == {
         (e.name, e.where) for e in drawn.effects
     }
+
+
+def test_the_reduction_told_is_that_at_new_poses(tmp_path):
+    """Of a small effect: the fit's own error at new poses is most of what there is before and
+    after."""
+    drawn = named("catalogue", 20271310, "gear_second_harmonic-60-000").recipe.draw()
+    seen, sealed = tmp_path / "seen", tmp_path / "sealed"
+    write_world(drawn, seen, sealed)
+    why = ec.diagnose(seen / "cell.toml", seen / "data.csv")
+    why.save(tmp_path / "why.json")
+    write_extended_cell(seen / "cell.toml", seen / "found.toml", why.effects, why.model_keys)
+    answer = json.loads((tmp_path / "why.json").read_text(encoding="utf-8"))
+    true = true_reduction(plain_fit(seen), answer, seen / "found.toml", sealed / "fresh.csv")
+    (found,) = why.effects
+    low, high = found.gap_reduction_ci90
+    assert low < true < high and high - low < 0.3
+    assert abs(found.gap_reduction - true) < 0.1
 
 
 def test_the_world_shares_no_code_with_elastocal():
