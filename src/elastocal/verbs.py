@@ -3,8 +3,7 @@
 Each takes the model first (or a cell, or the path of one) and its options as keyword arguments;
 it checks them, makes the option objects that the packages below work with, and calls them.
 
-Signature and docstring are the one place where an option is declared: the command line takes name,
-kind and default from here, and as help the first sentence on it (`elastocal.cli.signatures`).
+Signature and docstring are the one place where an option is declared, for the command line too.
 """
 
 from __future__ import annotations

@@ -295,12 +295,16 @@ def _interpolated(grid: CorrectionGrid, points: Array, correction: Array, where:
 
 # As the command line states and writes them.
 
-GRID_REMEDIES = {
-    "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
-    "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
-    "--rotation or another --near",
-    "no equilibrium": "no static equilibrium under this load: check --load",
-}
+
+def _remedies() -> dict[str, str]:
+    box, near, turned = (option(name) for name in ("box", "near", "rotation"))
+    return {
+        "limit": f"joint limits prevent it: widen [limits], or give a smaller {box} or another "
+        f"{near}",
+        "not reached": f"out of reach, or beside a singular posture: give a smaller {box}, another "
+        f"{turned} or another {near}",
+        "no equilibrium": f"no static equilibrium under this load: check {option('load')}",
+    }
 
 
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
@@ -308,12 +312,14 @@ def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
         return None
     chain = arm.model.chain
     n = chain.n_joints
-    values = numbers("--near", text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
+    values = numbers(option("near"), text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
     values = values / in_file_units(np.ones(n), chain.kinds)
     lower, upper = joint_limits(arm.model.cell, chain)
     if ((values < lower) | (values > upper)).any():
         j = int(np.argmax((values < lower) | (values > upper)))
-        raise InputError(f"--near: joint {j + 1} is beyond its limits; give a posture within them")
+        raise InputError(
+            f"{option('near')}: joint {j + 1} is beyond its limits; give a posture within them"
+        )
     return values
 
 
@@ -322,10 +328,12 @@ def grid_of(
 ) -> CorrectionGrid:
     if box is None:
         return joint_grid(arm, counts)
-    corners = numbers("--box", box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
+    corners = numbers(option("box"), box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
     turned = None
     if rotation is not None:
-        vector = numbers("--rotation", rotation, (3,), "a rotation vector rx,ry,rz in degrees")
+        vector = numbers(
+            option("rotation"), rotation, (3,), "a rotation vector rx,ry,rz in degrees"
+        )
         turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
     return box_grid(corners[:3], corners[3:], counts, turned)
 
@@ -344,9 +352,9 @@ def summary_and_csv(
     plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
     # A grid point has no line in any file of the user's: it is named by where it lies.
     named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
-    what = f"--table: %d of %d grid points ({', '.join(heads)})"
+    what = f"{option('table')}: %d of %d grid points ({', '.join(heads)})"
     if not partial:
-        check_status(what, named, plain, EXACT, GRID_REMEDIES)
+        check_status(what, named, plain, EXACT, _remedies())
     heads += ["dx_mm", "dy_mm", "dz_mm"]
     columns = [found.correction[:, :3] * 1e3]
     if found.oriented:
