@@ -9,12 +9,12 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
 
 HERE = Path(__file__).parent
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
@@ -70,7 +70,8 @@ def _processor() -> str:
 
 @dataclass(frozen=True)
 class Seconds:
-    """Wall and CPU time, the latter of all threads; it hardly depends on what else runs."""
+    """Wall and CPU time, the latter of all threads and of child processes that have ended; it
+    hardly depends on what else runs."""
 
     wall: float
     cpu: float
@@ -78,11 +79,31 @@ class Seconds:
     def __add__(self, other: Seconds) -> Seconds:
         return Seconds(self.wall + other.wall, self.cpu + other.cpu)
 
+    @classmethod
+    def since(cls, wall: float = 0.0, cpu: float = 0.0) -> Seconds:
+        spent = os.times()
+        cpu = time.process_time() + spent.children_user + spent.children_system - cpu
+        return cls(time.perf_counter() - wall, cpu)
+
 
 def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
-    wall, cpu = time.perf_counter(), time.process_time()
+    start = Seconds.since()
     done = work()
-    return done, Seconds(time.perf_counter() - wall, time.process_time() - cpu)
+    return done, Seconds.since(start.wall, start.cpu)
+
+
+class Clock:
+    """`seconds`: wall_NAME and cpu_NAME of every step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        start = Seconds.since()
+        yield
+        took = Seconds.since(start.wall, start.cpu)
+        self.seconds |= {f"wall_{name}": took.wall, f"cpu_{name}": took.cpu}
 
 
 def race(
@@ -113,36 +134,26 @@ def race(
 
 @dataclass(frozen=True)
 class Ran:
-    """One process: seconds, peak resident memory in MB, exit code, what it printed."""
+    """One process: seconds, peak resident memory in MB without that of its children."""
 
     wall: float
     cpu: float
     peak_mb: float
-    code: int
-    out: str
-    errors: str
-
-
-def process(*command: Any, **environment: str) -> Ran:
-    """Run a command to its end; stops the benchmark with its errors where it fails.  Memory is
-    that of the command, not of its children."""
-    # A child starts with its parent's peak as its own (Linux), hence a small one in between.
-    with tempfile.TemporaryDirectory() as folder:
-        facts = Path(folder, "facts.json")
-        done = subprocess.run(
-            [sys.executable, "-S", "-E", str(HERE / "bench_launch.py"), str(facts),
-             *map(str, command)],
-            env=os.environ | ONE_THREAD | environment, capture_output=True, text=True,
-        )  # fmt: skip
-        found = json.loads(facts.read_text())
-    if found["code"]:
-        sys.exit(f"{' '.join(map(str, command))} failed:\n{done.stderr}")
-    return Ran(**found, out=done.stdout, errors=done.stderr)
 
 
 def elastocal(*arguments: Any, **environment: str) -> Ran:
-    """One run of the command line."""
-    return process(sys.executable, "-m", "elastocal", *arguments, **environment)
+    """One run of the command line; stops the benchmark with its errors where it fails."""
+    # A child starts with its parent's peak as its own (Linux), hence a small one in between.
+    small = [sys.executable, "-S", "-E", str(HERE / "bench_launch.py")]
+    command = [sys.executable, "-m", "elastocal", *map(str, arguments)]
+    every = os.environ | ONE_THREAD | environment
+    with tempfile.TemporaryDirectory() as folder:
+        facts = Path(folder, "facts.json")
+        done = subprocess.run([*small, str(facts), *command], env=every, capture_output=True)
+        found = json.loads(facts.read_text())
+    if found.pop("code"):
+        sys.exit(f"{' '.join(command)} failed:\n{done.stderr.decode()}")
+    return Ran(**found)
 
 
 def peer(python: Path, script: str, *arguments: Path | str) -> Any:
@@ -152,4 +163,12 @@ def peer(python: Path, script: str, *arguments: Path | str) -> Any:
     ran = subprocess.run(command, capture_output=True, text=True, env=one)
     if ran.returncode:
         sys.exit(f"{script} failed:\n{ran.stderr}")
+    import numpy as np  # imported later than a peer's own clock starts
+
     return np.load(arguments[-1])
+
+
+def packaged(package: str, ending: str) -> Path:
+    """A file of an installed package by the end of its path."""
+    files = metadata.distribution(package).files or ()
+    return next(Path(str(f.locate())) for f in files if str(f).endswith(ending))

@@ -15,11 +15,10 @@ import os
 import sys
 import tempfile
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 
 import numpy as np
-from bench_tools import ONE_THREAD, Seconds, peer, required, table, timed, where
+from bench_tools import ONE_THREAD, Seconds, packaged, peer, required, table, timed, where
 
 from elastocal.planning.criteria import DeterminantCriterion
 from elastocal.planning.relaxation import DesignProblem, balanced, exact_plan, relax
@@ -29,14 +28,8 @@ POOL, POSES = 1000, 30  # of the UR10
 WORSE = 1e-4  # log det below the convex optimum that is allowed
 FASTER = 20
 STARTS = (1, 10)
+UR10 = "example-robot-data", "ur_description/urdf/ur10_robot.urdf"
 CLOCKS = ("wall, s", "CPU, s")
-
-
-def ur10() -> Path:
-    package = metadata.distribution("example-robot-data")
-    ending = "ur_description/urdf/ur10_robot.urdf"
-    found = next(f for f in package.files or () if str(f).endswith(ending))
-    return Path(str(package.locate_file(found)))
 
 
 def beside_figaroh(python: Path, folder: Path) -> None:
@@ -44,7 +37,7 @@ def beside_figaroh(python: Path, folder: Path) -> None:
     given, out = folder / "ur10_pool.npz", folder / "figaroh.npz"
     q = np.random.default_rng(SEED).uniform(-np.pi, np.pi, (POOL, 6))
     np.savez(given, q=q, poses=POSES, seed=SEED)
-    theirs = peer(python, "figaroh_pool.py", ur10(), given, out)
+    theirs = peer(python, "figaroh_pool.py", packaged(*UR10), given, out)
     R = theirs["regressor"]
     p = R.shape[2]
     columns = np.sqrt((R**2).mean(axis=(0, 1)))

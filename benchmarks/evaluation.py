@@ -12,21 +12,24 @@ from __future__ import annotations
 
 import argparse
 import os
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
 from bench_arms import GEOMETRY, kr270, poses, truth
 from bench_tools import goal, race, table
-from evaluation_rivals import BareC, Mapped, function_of, python_loop
+from numpy.typing import NDArray
 
 from elastocal.model.arm import row_inputs
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 
+Array = NDArray[np.float64]
 ROWS = {"tiny": (300, 2000), "short": (300, 10_000, 100_000), "full": (300, 10_000, 100_000)}
 FEW = (1, 4, 16, 64)
 LOOP, MAP = "CasADi, Python loop", "CasADi, map"
@@ -34,62 +37,102 @@ BARE, REPLAY = "C by CasADi, -O3, bare loop", "elastocal, replay (numpy)"
 SLOW = (LOOP, MAP)
 
 
+def python_loop(f: ca.Function, arrays: Sequence[Array]) -> Array:
+    """One call per row, all numbers written into arrays (n, rows, columns)."""
+    results = [np.empty((len(arrays[0]), *f.size_out(k))) for k in range(f.n_out())]
+    for i in range(len(arrays[0])):
+        found = f.call([a[i] if a.ndim == 2 else a for a in arrays])
+        for result, value in zip(results, found, strict=True):
+            result[i] = value
+    return results[1]
+
+
+def mapped(loop: ca.Function, arrays: Sequence[Array]) -> Array:
+    found = [np.asarray(r) for r in loop.call([a.T if a.ndim == 2 else a for a in arrays])]
+    return found[1].reshape(len(found[1]), len(arrays[0]), -1).transpose(1, 0, 2)
+
+
+class BareC:
+    """C that CasADi generates of its `map`, a loop over one row after the other, compiled whole at
+    -O3; it reads and writes numpy's memory."""
+
+    def __init__(self, loop: ca.Function, shapes: Sequence[tuple[int, ...]]) -> None:
+        here = os.getcwd()
+        with tempfile.TemporaryDirectory() as folder:
+            os.chdir(folder)  # CasADi writes to the current folder only
+            try:
+                loop.generate("bare.c")
+            finally:
+                os.chdir(here)
+            flags = ("-O3", "-shared", "-fPIC", "-w", "bare.c", "-o", "bare.so", "-lm")
+            command = [os.environ.get("CC") or "cc", *flags]
+            subprocess.run(command, cwd=folder, check=True, capture_output=True)
+            compiled = ca.external(loop.name(), str(Path(folder, "bare.so")))
+        self.buffer, self.call = compiled.buffer()
+        self.found = [np.empty(shape) for shape in shapes]
+        for k, found in enumerate(self.found):
+            self.buffer.set_res(k, memoryview(found))
+
+    def __call__(self, arrays: Sequence[Array]) -> Array:
+        given = [np.require(a, requirements="CW") for a in arrays]
+        for k, own in enumerate(given):
+            self.buffer.set_arg(k, memoryview(own))
+        self.call()
+        return self.found[1].transpose(0, 2, 1)
+
+
 class Ways:
-    """Every way to evaluate B, as name → function of (table rows as arrays, n)."""
+    """Every way to evaluate B of n rows, as name → function of the table's rows as arrays."""
 
     def __init__(self, model: Model, n: int) -> None:
         s = model._symbolic
-        self.symbolic, self.x = s, truth(model)
         inputs = [*s.arm.inputs.values(), s.p]
-        outputs = [s.reading, ca.jacobian(s.reading, s.p)]
-        self.f = function_of(inputs, outputs)
-        replay, mapped = BatchFunction(inputs, outputs, "numpy"), Mapped(self.f, n)
-        bare = BareC(self.f)
-        self.run: dict[str, Callable] = {
-            LOOP: lambda a, n: python_loop(self.f, a, n)[1],
-            MAP: lambda a, n: mapped(a, n)[1],
-            BARE: lambda a, n: bare(a, n)[1],
-            REPLAY: lambda a, n: replay(*a)[1],
+        outputs = [ca.densify(o) for o in (s.reading, ca.jacobian(s.reading, s.p))]
+        self.f = ca.Function("tape", inputs, outputs, {"cse": True})
+        self.arrays = [*row_inputs(s.arm, poses(model, n)), truth(model)]
+        shared = [k for k, a in enumerate(self.arrays) if a.ndim == 1]
+        loop = self.f.map("loop", "serial", n, shared, [])
+        bare = BareC(loop, [(n, *o.shape[::-1]) for o in outputs])
+        replay = BatchFunction(inputs, outputs, "numpy")
+        self.run: dict[str, Callable[[], Array]] = {
+            LOOP: partial(python_loop, self.f, self.arrays),
+            MAP: partial(mapped, loop, self.arrays),
+            BARE: partial(bare, self.arrays),
+            REPLAY: lambda: replay(*self.arrays)[1],
         }
 
-    def arrays(self, model: Model, n: int) -> list[np.ndarray]:
-        return [*row_inputs(self.symbolic.arm, poses(model, n)), self.x]
 
-
-def agreement(ways: Ways, model: Model) -> None:
+def agreement(model: Model) -> None:
     """Stops the benchmark where a way's B is not the replay's: it would measure something else."""
-    arrays = ways.arrays(model, 97)
-    expected = ways.run[REPLAY](arrays, 97)
+    ways = Ways(model, 97)
+    expected = ways.run[REPLAY]()
     size = np.abs(expected).max(axis=(0, 1))
     for name, way in ways.run.items():
-        off = float((np.abs(way(arrays, 97) - expected).max(axis=(0, 1)) / size).max())
+        off = float((np.abs(way() - expected).max(axis=(0, 1)) / size).max())
         if not off <= 1e-12:
             sys.exit(f"{name}: B differs by {off:.1e}")
 
 
 def timed(model: Model, rows: int, size: str) -> dict[str, tuple[float, float]]:
     """CPU and wall µs per row of every way at `rows` rows."""
-    ways = Ways(model, rows)
-    arrays = ways.arrays(model, rows)
-    slow = SLOW if rows <= 10_000 or size == "full" else ()
-    quick = [name for name in ways.run if name not in SLOW]
-    took = race({name: lambda w=ways.run[name]: w(arrays, rows) for name in slow}, 1, 1.0)
-    took |= race({name: lambda w=ways.run[name]: w(arrays, rows) for name in quick}, 3, 2.0)
+    run = Ways(model, rows).run
+    slow = {name: run.pop(name) for name in SLOW}
+    took = race(slow, 1, 1.0) if rows <= 10_000 or size == "full" else {}
+    took |= race(run, 3, 2.0)
     return {name: (t.cpu / rows * 1e6, t.wall / rows * 1e6) for name, t in took.items()}
 
 
 def few_rows(model: Model) -> None:
     """A call for so few rows that numpy's calls are most of it."""
-    ways = Ways(model, 97)
-    tape = BatchFunction(ways.f.sx_in(), ways.f(*ways.f.sx_in()))
-    rows = []
+    ways, rows = Ways(model, max(FEW)), []
+    given = ways.f.sx_in()
+    auto, numpy = (BatchFunction(given, ways.f(*given), by) for by in (None, "numpy"))
     for n in FEW:
-        arrays = ways.arrays(model, n)
-        took = race({"auto": lambda a=arrays: tape(*a),
-                     REPLAY: lambda a=arrays, n=n: ways.run[REPLAY](a, n)}, 5, 0.3)  # fmt: skip
-        auto, numpy = took["auto"].wall * 1e3, took[REPLAY].wall * 1e3
-        rows.append([n, tape.report.backend, auto, numpy, numpy / auto])
-    columns = ["rows", "evaluated by", "wall, ms", "numpy, wall, ms", "numpy over it"]
+        some = [a[:n] if a.ndim == 2 else a for a in ways.arrays]
+        took = race({"auto": partial(auto, *some), "numpy": partial(numpy, *some)}, 5, 0.3)
+        ms = [took[by].wall * 1e3 for by in ("auto", "numpy")]
+        rows.append([n, *ms, ms[1] / ms[0]])
+    columns = ["rows", "wall, ms", "numpy, wall, ms", "numpy over it"]
     table("A call for few rows, prediction and B, `--backend auto`", columns, rows)
 
 
@@ -100,7 +143,7 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as name:
         model = kr270(Path(name), GEOMETRY)
-    agreement(Ways(model, 97), model)
+    agreement(model)
     micro = {rows: timed(model, rows, size) for rows in ROWS[size]}
     columns = ["way", *[f"{rows} rows" for rows in ROWS[size]]]
     for k, clock in enumerate(("CPU", "wall")):

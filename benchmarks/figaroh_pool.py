@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from bench_tools import Clock
 from figaroh.calibration.calibration_tools import (
     calculate_base_kinematics_regressor,
     measurement_jacobian,
@@ -28,7 +29,7 @@ from figaroh.calibration.calibration_tools import (
 from figaroh.calibration.parameter import add_base_name, add_pee_name
 from figaroh.optimal.base_optimal_calibration import BaseOptimalCalibration, Detmax, SOCPOptimizer
 from figaroh.tools.load_robot import load_robot
-from fits_clock import Clock
+from fits_figaroh import task_file
 
 MARKER_M = "0.1 0.05 0.1"  # off the last axis, so that the marker sees all that a position can
 
@@ -81,22 +82,8 @@ def prepared(urdf: Path, q: np.ndarray, folder: Path) -> UnknownFrames:
     names = [str(name) for name in loaded.model.names][1:]
     pool = {"calibration_joint_names": names, "calibration_joint_configurations": q.tolist()}
     (folder / "pool.yaml").write_text(yaml.safe_dump(pool))
-    task: dict[str, Any] = {
-        "type": "kinematic_calibration",
-        "kinematics": {"base_frame": "universe", "tool_frame": "marker"},
-        "parameters": {"calibration_level": "full_params"},
-        "measurements": {"markers": [{"measurable_dof": [True] * 3 + [False] * 3}]},
-        "data": {
-            "number_of_samples": len(q),
-            "sample_configurations_file": str(folder / "pool.yaml"),
-        },
-    }
-    config = {
-        "robot": {"name": "ur10", "properties": {"joints": {"active_joints": names}}},
-        "tasks": {"calibration": task},
-    }
-    (folder / "config.yaml").write_text(yaml.safe_dump(config))
-    return UnknownFrames(loaded, str(folder / "config.yaml"))
+    data = {"sample_configurations_file": str(folder / "pool.yaml")}
+    return UnknownFrames(loaded, task_file(folder, loaded, "marker", len(q), data))
 
 
 def main(urdf: Path, pool: Path, out: Path) -> None:

@@ -1,27 +1,20 @@
-"""pybotics' side of fits_peers.py: one calibration, timed.
+"""pybotics' side of fits_peers.py, in the peers' environment; imports nothing of elastocal.
 
-    PEERS_PYTHON benchmarks/fits_pybotics.py components FOLDER OUT.npz
-
-x, y and z of each reading's error are handed to scipy's least_squares with its defaults.  Runs in
-the peers' environment, imports nothing of elastocal.
+x, y and z of each reading's error are handed to scipy's least_squares with its defaults.
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
-from fits_clock import Clock
-
-clock = Clock()
-with clock.step("import"):
-    import numpy as np
-    from pybotics.geometry import vector_2_matrix
-    from pybotics.optimization import OptimizationHandler
-    from pybotics.robot import Robot
-    from pybotics.tool import Tool
-    from scipy.optimize import least_squares
+import numpy as np
+from bench_tools import Clock
+from pybotics.geometry import vector_2_matrix
+from pybotics.optimization import OptimizationHandler
+from pybotics.robot import Robot
+from pybotics.tool import Tool
+from scipy.optimize import least_squares
 
 # What is estimated of α, a, θ, d of each link, chosen by hand: pybotics has no choice of its own.
 # The base takes up all of link 1, the tool θ and d of the last link; axes 2, 3 and 4 are parallel
@@ -38,7 +31,7 @@ def positions(robot: Robot, qs: Any) -> Any:
     return np.array([robot.fk(q)[:3, 3] for q in qs])
 
 
-def main(folder: Path, out: Path) -> None:
+def fit(how: str, folder: Path, clock: Clock) -> tuple[Any, int]:
     given = np.load(folder / "given.npz")
     with clock.step("read"):
         # The start of base and tool comes from whoever measures: 10 mm and half a degree off.
@@ -60,11 +53,4 @@ def main(folder: Path, out: Path) -> None:
             args=(handler, given["q"], given["points"]),
         )
     handler.apply_optimization_vector(found.x)
-    np.savez(
-        out, predicted=positions(handler.robot, given["fresh_q"]), parameters=len(found.x),
-        evaluations=found.nfev, status=found.status, **clock.seconds,
-    )  # fmt: skip
-
-
-if __name__ == "__main__":
-    main(*map(Path, sys.argv[2:]))
+    return positions(handler.robot, given["fresh_q"]), len(found.x)

@@ -13,12 +13,12 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from importlib import metadata
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_tools import HERE, elastocal, goal, number, table
+from bench_tools import HERE, elastocal, goal, number, packaged, table
 
 KR270 = HERE.parent / "experiment_design" / "kr270_plan"
 ARMS = {
@@ -78,39 +78,40 @@ CELLS: dict[str, tuple[str, str, int, tuple[str, ...]]] = {
     "UR10, limits, 10 poses": ("UR10", LIMITS, 10, ()),
     "UR10, limits, D": ("UR10", LIMITS, 20, ("--criterion", "D")),
 }
-EFFICIENCY, QUICKER, BETTER = 0.99, 1.0, 0.02  # goals
+HEADS = ("ρ₀ µm", "CPU s", "of pool", "of continuum")
+QUICKER, BETTER = 1.0, 0.02  # goals
 EFFECTS = 'effects = ["base_frame", "joint_offset", "link_geometry", '
 FEWER = 'effects = ["base_frame", '
 MORE = f'{EFFECTS}"gear_eccentricity", "gear_second_harmonic", '
 
 
-def cell_file(folder: Path, arm: str, rules: str) -> Path:
-    path = folder / f"{arm or 'KR270'}{len(rules)}.toml"
-    if not arm:
+def planned(
+    folder: Path, title: str, effort: str, *options: Any, poses: int = 0, effects: str = EFFECTS,
+    **environment: str,
+) -> dict:  # fmt: skip
+    """What plan.json says of a plan in one of CELLS, and the CPU s of its command."""
+    arm, rules, usual, more = CELLS[title]
+    cell, out = folder / "cell.toml", folder / "plan.csv"
+    if arm:
+        package, ending, flange = ARMS[arm]
+        compliance = [3e-5, 3e-5, 5e-5, 5e-5, 1e-4, 1e-4, 1e-4]
+        text = CELL.format(
+            urdf=packaged(package, ending), flange=f'flange = "{flange}"' if flange else "",
+            compliance=compliance[: 7 if arm in ("Panda", "iiwa14") else 6], rules=rules,
+        ).replace(EFFECTS, effects)  # fmt: skip
+        more = ("--poses", poses or usual, *more)
+    else:
         text = (KR270 / "joint_limits.toml").read_text().replace("candidates = 20000", "")
         text = text.replace('"../../', f'"{HERE.parent}/')
-        path.write_text(text.replace('"test_poses.csv"', f'"{KR270 / "test_poses.csv"}"'))
-        return path
-    package, ending, flange = ARMS[arm]
-    files = metadata.distribution(package).files or ()
-    urdf = next(Path(str(f.locate())) for f in files if str(f).endswith(ending))
-    joints = 7 if arm in ("Panda", "iiwa14") else 6
-    compliance = [3e-5, 3e-5, 5e-5, 5e-5, 1e-4, 1e-4, 1e-4][:joints]
-    flange = f'flange = "{flange}"' if flange else ""
-    path.write_text(CELL.format(urdf=urdf, flange=flange, compliance=compliance, rules=rules))
-    return path
-
-
-def planned(cell: Path, poses: int, effort: str, *options: Any, **environment: str) -> dict:
-    """What plan.json says of a plan, and the CPU s of its command."""
-    out = cell.with_name("plan.csv")
-    at = () if cell.stem.startswith("KR270") else ("--poses", poses)
-    ran = elastocal("design", cell, *at, "-o", out, "--effort", effort, "-q",
-                    *options, **environment)  # fmt: skip
+        text = text.replace('"test_poses.csv"', f'"{KR270 / "test_poses.csv"}"')
+    cell.write_text(text)
+    given = ("design", cell, "-o", out, "--effort", effort, "-q", *more, *options)
+    ran = elastocal(*given, **environment)
     return json.loads(out.with_suffix(".json").read_text()) | {"cpu": ran.cpu}
 
 
 def figures(plan: dict) -> list[Any]:
+    """As HEADS."""
     c = plan["certificate"]
     return [f"{plan['value']:.4g}", plan["cpu"], c["efficiency_pool"], c["efficiency_continuum"]]
 
@@ -123,52 +124,49 @@ def main() -> None:
     parser.add_argument("--growth", action="store_true")
     parser.add_argument("--rounding", action="store_true")
     chosen = parser.parse_args()
-    beside: dict[str, str] = {"PYTHONPATH": str(chosen.beside)} if chosen.beside else {}
-    lower, ratios, shares = [], [], []
     with tempfile.TemporaryDirectory() as name:
         if chosen.rounding:
-            arm, rules, poses, more = CELLS[chosen.only[0]]
-            cell = cell_file(Path(name), arm, rules)
-            plans = {n: planned(cell, n, "normal", *more) for n in (poses, 3 * poses)}
-            heads = ["poses", "parameters", "ρ₀ µm", "CPU s", "of pool", "of continuum"]
-            rows = [[n, len(plan["predicted"]), *figures(plan)] for n, plan in plans.items()]
-            return table(f"Whole poses or weights: {chosen.only[0]}, normal", heads, rows)
-        heads = ["cell", *(f"{e}: {what}" for e in chosen.efforts for what in
-                           ("ρ₀ µm", "CPU s", "of pool", "of continuum"))]  # fmt: skip
-        rows = []
-        for title in chosen.only:
-            arm, rules, poses, more = CELLS[title]
-            cell = cell_file(Path(name), arm, rules)
-            found = {e: planned(cell, poses, e, *more) for e in chosen.efforts}
-            rows.append([title, *(f for plan in found.values() for f in figures(plan))])
-            if "normal" in found and poses >= 20:
-                shares.append(found["normal"]["certificate"]["efficiency_continuum"])
-            if beside and "quick" in found:
-                old = planned(cell, poses, "quick", *more, **beside)
-                rows[-1] += [f"{old['value']:.4g}", old["cpu"]]
-                ratios.append(found["quick"]["cpu"] / old["cpu"])
-                lower.append(1 - found["quick"]["value"] / old["value"])
-            print("  ".join(map(number, rows[-1])), flush=True)
-        table("Plans", heads + ["beside: ρ₀ µm", "CPU s"] * bool(beside), rows)
-        if shares:
-            goal("efficiency on the continuum, normal", min(shares), EFFICIENCY, least=True)
-        if ratios:
-            goal("quick: CPU, of that beside", float(np.median(ratios)), QUICKER)
-            goal("quick: lower ρ₀, median", float(np.median(lower)), BETTER, least=True)
+            return rounding(Path(name), chosen.only[0])
+        compared(Path(name), chosen.only, chosen.efforts, chosen.beside)
         if chosen.growth:
-            cell = cell_file(Path(name), "UR10", LIMITS)
-            sizes = [("poses", n, ()) for n in (10, 20, 40, 80)]
-            sizes += [("candidates", n, ("--candidates", n)) for n in (1000, 5000, 20_000)]
-            rows = [
-                [of, n, *figures(planned(cell, n if of == "poses" else 20, "quick", *more))]
-                for of, n, more in sizes
-            ]
-            for effects in (FEWER, EFFECTS, MORE):
-                other = cell.with_name("effects.toml")
-                other.write_text(cell.read_text().replace(EFFECTS, effects))
-                plan = planned(other, 20, "quick")
-                rows.append(["parameters", len(plan["predicted"]), *figures(plan)])
-            table("Growth, UR10, quick", ("of", "number", *heads[1:5]), rows)
+            growth(Path(name))
+
+
+def rounding(folder: Path, title: str) -> None:
+    usual, rows = CELLS[title][2], []
+    for poses in (usual, 3 * usual):
+        plan = planned(folder, title, "normal", poses=poses)
+        rows.append([poses, len(plan["predicted"]), *figures(plan)])
+    table(f"Whole poses or weights: {title}, normal", ["poses", "parameters", *HEADS], rows)
+
+
+def compared(folder: Path, titles: list[str], efforts: list[str], source: Path | None) -> None:
+    lower, ratios, rows = [], [], []
+    for title in titles:
+        found = {e: planned(folder, title, e) for e in efforts}
+        rows.append([title, *(f for plan in found.values() for f in figures(plan))])
+        if source and "quick" in found:
+            old = planned(folder, title, "quick", PYTHONPATH=str(source))
+            rows[-1] += figures(old)[:2]
+            ratios.append(found["quick"]["cpu"] / old["cpu"])
+            lower.append(1 - found["quick"]["value"] / old["value"])
+        print("  ".join(map(number, rows[-1])), flush=True)
+    heads = ["cell", *(f"{e}: {head}" for e in efforts for head in HEADS)]
+    table("Plans", heads + ["beside: ρ₀ µm", "CPU s"] * bool(source), rows)
+    if ratios:
+        goal("quick: CPU, of that beside", float(np.median(ratios)), QUICKER)
+        goal("quick: lower ρ₀, median", float(np.median(lower)), BETTER, least=True)
+
+
+def growth(folder: Path) -> None:
+    quick = partial(planned, folder, "UR10, limits", "quick")
+    rows = [["poses", n, *figures(quick(poses=n))] for n in (10, 20, 40, 80)]
+    for n in (1000, 5000, 20_000):
+        rows.append(["candidates", n, *figures(quick("--candidates", n))])
+    for effects in (FEWER, EFFECTS, MORE):
+        plan = quick(effects=effects)
+        rows.append(["parameters", len(plan["predicted"]), *figures(plan)])
+    table("Growth, UR10, quick", ("of", "number", *(f"quick: {head}" for head in HEADS)), rows)
 
 
 if __name__ == "__main__":

@@ -43,8 +43,6 @@ ARMS = {
 }  # fmt: skip
 POSES, FITTED = 40, 32
 PASSES = 1.3
-FORMATS = ("urdf", "mjcf", "dh", "mdh")
-ENDINGS = {"urdf": ".urdf", "mjcf": ".xml", "dh": ".csv", "mdh": ".csv"}
 
 
 def packaged() -> Iterator[tuple[str, Path]]:
@@ -60,7 +58,7 @@ def packaged() -> Iterator[tuple[str, Path]]:
 
 @dataclass(frozen=True)
 class Trip:
-    """Errors in m, 3-D rms at the poses left out; `loss` of each format as `export` states it."""
+    """Errors in m, 3-D rms at the poses left out; `losses` of each format as `export` states it."""
 
     name: str
     joints: int
@@ -74,6 +72,15 @@ class Trip:
     def passes(self, form: str) -> bool:
         """Whether a file's error is what noise and stated loss let expect."""
         return self.errors[form] <= PASSES * float(np.hypot(self.noise, self.losses[form]))
+
+    def row(self) -> str:
+        """A line of the table: µm; in bold what is beyond noise and stated loss."""
+        cells = [self.name, f"{self.joints}", f"{self.length:.2f}"]
+        cells += [f"{self.nominal * 1e6:.0f}", f"{self.fitted * 1e6:.0f}"]
+        for form in FORMATS:
+            told = f"{self.errors[form] * 1e6:.0f} ({self.losses[form] * 1e6:.0f})"
+            cells.append(told if self.passes(form) else f"**{told}**")
+        return f"| {' | '.join(cells)} |"
 
 
 def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
@@ -89,17 +96,16 @@ def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
     fitted = data.take(np.flatnonzero(data.configuration < FITTED))
     left = data.take(np.flatnonzero(data.configuration >= FITTED))
     fit = ec.identify(model, fitted, test=left)
-    errors, losses = {}, {}
-    for form in FORMATS:
+    back, errors, losses = Back(fit, fitted, folder), {}, {}
+    for form, (ending, read) in FORMATS.items():
         # A rigid file says nothing of the load, which its stated loss is without.
         acting = force if form == "mjcf" else np.zeros(3)
-        wish = wish_of(folder / f"out{ENDINGS[form]}", form, acting, True, form == "urdf",
+        wish = wish_of(folder / f"out{ending}", form, acting, True, form == "urdf",
                        None, None, 500, seed)  # fmt: skip
         done = export(fit.arm, wish)
-        rows = left if form == "mjcf" else left.take(np.flatnonzero(~left.force.any(axis=1)))
-        found = READERS[form](done.text, fit, fitted, rows, folder)
-        assert rows.position is not None
-        errors[form] = _rms(found - rows.position)
+        rows = left if form == "mjcf" else unloaded(left)
+        apart = read(back, done.text, rows) - rows.position
+        errors[form] = float(np.sqrt((apart**2).sum(axis=1).mean()))
         losses[form] = done.cost.total.marker_max
     noise = model.cell.tracker.noise.sigma  # type: ignore[union-attr]
     return Trip(
@@ -108,77 +114,68 @@ def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
     )  # fmt: skip
 
 
-def _rms(apart: Array) -> float:
-    return float(np.sqrt((apart**2).sum(axis=1).mean()))
+def unloaded(rows: Measurements) -> Measurements:
+    return rows.take(np.flatnonzero(~rows.force.any(axis=1)))
 
 
-def _urdf(
-    text: str, fit: ec.Calibration, known: Measurements, rows: Measurements, folder: Path
-) -> Array:  # fmt: skip
-    """Markers of the rows in the tracker's frame: frames of the file, in pinocchio."""
-    names = [joint.name for joint in fit.model.chain.joints]
-    found = np.empty((len(rows), 3))
-    for k, marker in enumerate(rows.marker_names):
-        of_it = rows.marker == k
-        T = urdf_flanges(
-            text, names, "elastocal_tracker", f"elastocal_marker_{marker}", rows.q[of_it]
-        )
-        found[of_it] = T[:, :3, 3]
-    return found
+@dataclass(frozen=True)
+class Back:
+    """Other programs read the files of a fit and predict markers (n, 3) in the tracker's frame."""
+
+    fit: ec.Calibration
+    fitted: Measurements
+    folder: Path
+
+    def urdf(self, text: str, rows: Measurements) -> Array:
+        """Frames of the file, in pinocchio."""
+        names = [joint.name for joint in self.fit.model.chain.joints]
+        found = np.empty((len(rows), 3))
+        for k, marker in enumerate(rows.marker_names):
+            of_it, frame = rows.marker == k, f"elastocal_marker_{marker}"
+            T = urdf_flanges(text, names, "elastocal_tracker", frame, rows.q[of_it])
+            found[of_it] = T[:, :3, 3]
+        return found
+
+    def mjcf(self, text: str, rows: Measurements) -> Array:
+        """In MuJoCo, at rest under each row's force; the world is the robot's base."""
+        arm = MujocoRest(text)
+        _, T = self.parameters()
+        markers = [f"marker_{rows.marker_names[k]}" for k in rows.marker]
+        each = zip(rows.q, rows.force, markers, strict=True)
+        sites = np.array([arm.sites(q, force, [marker])[0] for q, force, marker in each])
+        return sites @ T[:3, :3].T + T[:3, 3]
+
+    def dh(self, text: str, rows: Measurements) -> Array:
+        """By elastocal's reader.  The table has no base: it is placed by the rows fitted."""
+        path = self.folder / "read.csv"
+        path.write_text(text, encoding="utf-8")
+        chain = read_dh(path, "standard" if "standard convention" in text else "modified")
+        markers, _ = self.parameters()
+
+        def points(table: Measurements) -> Array:
+            T = nominal_flanges(chain, table.q)
+            own = np.array([markers[table.marker_names[k]] for k in table.marker])
+            return np.asarray((T[:, :3, :3] @ own[..., None])[..., 0] + T[:, :3, 3])
+
+        known = unloaded(self.fitted)
+        found, seen = points(known), np.asarray(known.position)
+        R, _ = Rotation.align_vectors(seen - seen.mean(axis=0), found - found.mean(axis=0))
+        return np.asarray(R.apply(points(rows) - found.mean(axis=0)) + seen.mean(axis=0))
+
+    def parameters(self) -> tuple[dict[str, Array], Array]:
+        """Markers (3,) in the flange frame and T_tracker_base (4, 4) of the exported parameters."""
+        out = self.folder / "out.yaml"
+        wish = wish_of(out, "yaml", np.zeros(3), True, False, None, None, 2, 0)
+        geometry = yaml.safe_load(export(self.fit.arm, wish).text)["geometry"]
+        base, T = geometry["tracker_to_base"], np.eye(4)
+        T[:3, :3], T[:3, 3] = rotation_from_rpy(base["rpy_rad"]), base["xyz_m"]
+        return {name: np.array(at["xyz_m"]) for name, at in geometry["markers"].items()}, T
 
 
-def _mjcf(
-    text: str, fit: ec.Calibration, known: Measurements, rows: Measurements, folder: Path
-) -> Array:  # fmt: skip
-    """The same in MuJoCo, at rest under each row's force; the world is the robot's base."""
-    arm = MujocoRest(text)
-    _, T = _parameters(fit, folder)
-    found = []
-    for q, force, marker in zip(rows.q, rows.force, rows.marker, strict=True):
-        site = arm.sites(q, force, [f"marker_{rows.marker_names[marker]}"])[0]
-        found.append(T[:3, :3] @ site + T[:3, 3])
-    return np.array(found)
-
-
-def _dh(
-    text: str, fit: ec.Calibration, known: Measurements, rows: Measurements, folder: Path
-) -> Array:  # fmt: skip
-    """The same by elastocal's reader.  The table has no base: it is placed by the rows fitted."""
-    path = folder / "read.csv"
-    path.write_text(text, encoding="utf-8")
-    chain = read_dh(path, "standard" if "standard convention" in text else "modified")
-    markers, _ = _parameters(fit, folder)
-
-    def points(table: Measurements) -> Array:
-        T = nominal_flanges(chain, table.q)
-        own = np.array([markers[table.marker_names[k]] for k in table.marker])
-        return np.asarray((T[:, :3, :3] @ own[..., None])[..., 0] + T[:, :3, 3])
-
-    unloaded = known.take(np.flatnonzero(~known.force.any(axis=1)))
-    assert unloaded.position is not None
-    found, seen = points(unloaded), unloaded.position
-    R, _ = Rotation.align_vectors(seen - seen.mean(axis=0), found - found.mean(axis=0))
-    return np.asarray(R.apply(points(rows) - found.mean(axis=0)) + seen.mean(axis=0))
-
-
-def _parameters(fit: ec.Calibration, folder: Path) -> tuple[dict[str, Array], Array]:
-    """Markers (3,) in the flange frame and T_tracker_base (4, 4) of the exported parameters."""
-    wish = wish_of(folder / "out.yaml", "yaml", np.zeros(3), True, False, None, None, 2, 0)
-    geometry = yaml.safe_load(export(fit.arm, wish).text)["geometry"]
-    base, T = geometry["tracker_to_base"], np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_from_rpy(base["rpy_rad"]), base["xyz_m"]
-    return {name: np.array(at["xyz_m"]) for name, at in geometry["markers"].items()}, T
-
-
-READERS = {"urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh}
-
-
-def row(t: Trip) -> str:
-    """A line of the table: µm; in bold what is beyond noise and stated loss."""
-    cells = [f"{t.errors[form] * 1e6:.0f} ({t.losses[form] * 1e6:.0f})" for form in FORMATS]
-    marked = [c if t.passes(f) else f"**{c}**" for c, f in zip(cells, FORMATS, strict=True)]
-    known = [str(t.joints), f"{t.length:.2f}", f"{t.nominal * 1e6:.0f}", f"{t.fitted * 1e6:.0f}"]
-    return f"| {' | '.join([t.name, *known, *marked])} |"
+FORMATS = {
+    "urdf": (".urdf", Back.urdf), "mjcf": (".xml", Back.mjcf), "dh": (".csv", Back.dh),
+    "mdh": (".csv", Back.dh),
+}  # fmt: skip
 
 
 HEAD = """\
@@ -207,7 +204,7 @@ def page(trips: list[Trip], refused: dict[str, str]) -> str:
     if refused:
         told += f" Not arms of 4 to 9 joints: {len(refused)} other robots (legs, drones, hands)."
     noise = trips[0].noise * 1e6 if trips else 0.0
-    return HEAD.format(noise=noise) + "\n".join(map(row, trips)) + "\n" + told + "\n"
+    return HEAD.format(noise=noise) + "\n".join(t.row() for t in trips) + "\n" + told + "\n"
 
 
 def main() -> None:
@@ -227,7 +224,7 @@ def main() -> None:
                 refused[name] = str(error)
                 print(f"{name}: {error}", flush=True)
                 continue
-        print(row(trips[-1]), flush=True)
+        print(trips[-1].row(), flush=True)
     if asked.output is not None:
         asked.output.write_text(page(trips, refused), encoding="utf-8")
 

@@ -21,9 +21,7 @@ TITLES = {
     "costs": "What the commands cost",
     "fits": "Whole fits beside their peers",
 }
-KEPT, RESULT = HERE / "parts", HERE / "result.md"
-PAGE = HERE.parent / "docs" / "performance.md"
-BEGIN, END = "<!-- numbers: written by benchmarks/run.py -->", "<!-- end of numbers -->"
+KEPT = HERE / "parts"
 PEERS = "ELASTOCAL_PEERS_PYTHON"
 
 
@@ -32,14 +30,14 @@ def run_part(name: str, size: str, beside: Path | None) -> bool:
     if name == "fits" and PEERS not in os.environ:
         print(f"fits: skipped, {PEERS} does not name the peers' Python (README.md)")
         return True
-    script = "fits_peers.py" if name == "fits" else f"{name}.py"
-    options = ["--quick"] * (size != "full") if name == "fits" else ["--size", size]
-    options += ["--beside", str(beside)] if beside and name == "costs" else []
-    print(f"--- {name}, {where()}", flush=True)
+    command = [sys.executable, str(HERE / f"{name}.py"), "--size", size]
+    if name == "fits":
+        command = [sys.executable, str(HERE / "fits_peers.py"), *["--quick"] * (size != "full")]
+    elif name == "costs" and beside:
+        command += ["--beside", str(beside)]
     ran = where()
-    command = [sys.executable, str(HERE / script), *options]
-    one = os.environ | ONE_THREAD
-    done = subprocess.run(command, env=one, stdout=subprocess.PIPE, text=True)
+    print(f"--- {name}, {ran}", flush=True)
+    done = subprocess.run(command, env=os.environ | ONE_THREAD, stdout=subprocess.PIPE, text=True)
     print(done.stdout)
     if done.returncode == 0 and size != "tiny":
         KEPT.joinpath(f"{name}.md").write_text(f"{ran}; {size} sizes.\n\n{done.stdout.strip()}\n")
@@ -57,17 +55,6 @@ def goals(parts: dict[str, str]) -> list[str]:
     return lines
 
 
-def page(parts: dict[str, str]) -> None:
-    """The table of goals in docs/performance.md, between its two marks."""
-    before, begin, rest = PAGE.read_text(encoding="utf-8").partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        sys.exit(f"{PAGE.name} has lost its marks; left as it is")
-    ran = [f"{TITLES[name]}: {text.splitlines()[0]}" for name, text in parts.items()]
-    lines = [BEGIN, "", *goals(parts), "", *ran, "", END]
-    PAGE.write_text(before + "\n".join(lines) + after, encoding="utf-8")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--full", action="store_true", help="the largest sizes too")
@@ -83,8 +70,7 @@ def main() -> None:
         lines = ["# Benchmarks: result", "", "Written by `make bench`; how: README.md.", ""]
         lines += goals(parts)
         lines += [f"\n## {TITLES[name]}\n\n{text.strip()}" for name, text in parts.items()]
-        RESULT.write_text("\n".join(lines) + "\n", encoding="utf-8")
-        page(parts)
+        (HERE / "result.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
     for line in goals(parts):
         if "not met" in line:
             print(line)
