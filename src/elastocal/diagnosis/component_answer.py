@@ -379,12 +379,11 @@ class SumAnswer:
         return np.asarray(self.moved[self._poses[0]] @ self.draws)
 
     @cached_property
-    def _excess(self) -> float:
-        """Mean square in m² per reading that the fit itself is uncertain by at poses left out."""
+    def _uncertain(self) -> Array:
+        """Variance (rows,) in m² that the fit itself is uncertain by at poses left out."""
         V = covariance(self.found.data, self.found.noise)
         uncertain = np.linalg.inv(self.at.P) - V
-        each = np.diagonal(uncertain, axis1=1, axis2=2)[self._rows]
-        return float(each.sum() / (len(each) / self._axes))
+        return np.asarray(np.diagonal(uncertain, axis1=1, axis2=2)[self._rows])
 
     def _reduction(self, members: Sequence[int]) -> Shrinkage:
         """Fraction by which the noise-free error of new poses falls by these components.
@@ -400,7 +399,7 @@ class SumAnswer:
         after = self._of_new_poses(whole - estimate[:, None])
         part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
         # Draws about the mean already hold the error at the poses measured; at others it is more.
-        after = after + min(part, 1.0) * self._excess
+        after = after + min(part, 1.0) * float(self._uncertain.sum()) / self._readings
         return Shrinkage.of(1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
     # Names.

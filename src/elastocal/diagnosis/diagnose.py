@@ -262,12 +262,9 @@ def _diagnosed(
     whole, nats, fields = _sum_of_all(dataset, found, options, rng, progress)
     progress("confirming")
     tests = structure_tests(found.first)
-    answer: SumAnswer | FewAnswer
-    if whole is None:
-        found = search.settled(found)
-        answer = FewAnswer.of(dataset, found, fields if found.chosen.unknown else (), rng)
-    else:
-        answer = whole
+    found = found if whole else search.settled(found)
+    judged, fields = judge(found), fields if found.chosen.unknown else ()
+    answer = whole or FewAnswer.of(dataset, found, judged, fields, rng)
     answers = _pieces(answer, dataset, found.nothing.noise, tests)
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
@@ -278,7 +275,7 @@ def _diagnosed(
         nothing = min(nothing, FALSE_SMOOTH)
     return Diagnosis(
         **answers,
-        candidates=candidates(dataset, found, judge(found)),
+        candidates=candidates(dataset, found, judged),
         structure=tests,
         probability_nothing=nothing,
         p_value=p,

@@ -28,7 +28,7 @@ from elastocal.diagnosis.effect_search import LARGEST_SET, SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, fit_extended, settings_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, covariance, project
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.reading_faults import OutlierScreening
 from elastocal.diagnosis.shrinkage import Shrinkage
 from elastocal.diagnosis.stated_floor import each_left_out
@@ -208,19 +208,17 @@ class FewAnswer(SumAnswer):
     `corrections` without a name are those of the sum of all that may act."""
 
     selected: SelectedEffects
+    judged: Answer
     corrections: tuple[FoundEffect, ...]
 
     @classmethod
     def of(
-        cls, before: DiagnosisData, selected: SelectedEffects,
+        cls, before: DiagnosisData, selected: SelectedEffects, judged: Answer,
         corrections: tuple[FoundEffect, ...], rng: np.random.Generator,
     ) -> FewAnswer:  # fmt: skip
         data = selected.dataset
-        return cls(before, data, sum_of(data, selected.chosen), (), rng, selected, corrections)
-
-    @cached_property
-    def judged(self) -> Answer:
-        return judge(self.selected)
+        found = sum_of(data, selected.chosen)
+        return cls(before, data, found, (), rng, selected, judged, corrections)
 
     @property
     def verdict(self) -> Verdict:
@@ -278,10 +276,9 @@ class FewAnswer(SumAnswer):
         at, configuration = self.at, np.nonzero(self._rows)[0][kept]
         W = self._wide.X[self._rows][kept]
         moved = W @ (self._drawn - at.beta[:, None])
-        V = covariance(self.found.data, self.found.noise)
-        uncertain = np.diagonal(np.linalg.inv(at.P) - V, axis1=1, axis2=2)[self._rows][kept]
         own, left_out = (
-            np.bincount(configuration, each) for each in ((moved**2).mean(axis=1), uncertain)
+            np.bincount(configuration, each)
+            for each in ((moved**2).mean(axis=1), self._uncertain[kept])
         )
         grown = np.sqrt(np.maximum(left_out / np.maximum(own, 1e-300), 1.0))
         return np.asarray((W @ at.beta)[:, None] + moved * grown[configuration, None])
