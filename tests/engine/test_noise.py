@@ -128,7 +128,7 @@ def test_readings_are_judged_as_if_each_were_deleted(own, shared):
     found = estimate_noise(r.take(good), own + shared)
     t = prediction_errors(found, r, good, own_noise(found.fit, r)[0])
     fit = found.fit
-    parts = own_parts(own, r, fit.structure.names) + [
+    parts = own_parts(own, r, fit.noisy.structure.names) + [
         shared_part(d.name, r) for d in fit.noisy.deviations
     ]
     V = sum(v * part for v, part in zip(fit.theta, parts, strict=True))
