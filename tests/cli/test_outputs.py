@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import ctypes
 import os
-import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from fuzz import campaign
-from fuzz.campaign import COMMANDS
+from fuzz.campaign import ALL, COMMANDS
 from typer.testing import CliRunner
 
 from elastocal.cli.main import app
 
-WRITING = [c for c in COMMANDS if c.outputs and not any(
-    other.verb == c.verb for other in COMMANDS[: COMMANDS.index(c)]
-)]  # fmt: skip
+WRITING = {c.verb: c for c in reversed(COMMANDS) if c.outputs}
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
 
 
@@ -30,13 +27,12 @@ def inputs(tmp_path_factory) -> Path:
 
 
 @pytest.mark.parametrize("how", ["itself", "another way", "symbolic link", "named by the cell"])
-@pytest.mark.parametrize("command", WRITING, ids=lambda c: c.verb)
-def test_no_output_goes_over_an_input(inputs, monkeypatch, tmp_path, command, how):
-    words = shlex.split(command.line)
-    read = [word for word in words if (inputs / word).is_file()]
-    target = inputs / (read[-1] if how != "named by the cell" else command.named[0]) \
-        if command.named or how != "named by the cell" else None  # fmt: skip
-    if target is None:
+@pytest.mark.parametrize("verb", WRITING)
+def test_no_output_goes_over_an_input(inputs, monkeypatch, tmp_path, verb, how):
+    words, read = WRITING[verb].words, WRITING[verb].inputs(inputs)
+    given = [path for path in read if path.name in words]
+    target = read[-1] if how == "named by the cell" else given[-1]
+    if how == "named by the cell" and target in given:
         pytest.skip("reads no other file")
     content = target.read_bytes()
     place = {"itself": target.name, "another way": f"study/../{target.name}"}.get(how)
@@ -47,19 +43,17 @@ def test_no_output_goes_over_an_input(inputs, monkeypatch, tmp_path, command, ho
     words[option] = place or target.name
     monkeypatch.chdir(inputs)
     before = sorted(os.listdir(inputs))
-    done = CliRunner().invoke(app, [command.verb, *words])
+    done = CliRunner().invoke(app, [verb, *words])
     assert done.exit_code == 2 and target.read_bytes() == content
     assert sorted(os.listdir(inputs)) == before
 
 
 # Of every verb each option that names a file to write, once: verb, words, where the name stands.
-NAMES = ("-o", "--report", "--certificate", "--residuals", "--truth", "--plan", "--cell-out",
-         "--table", "--joint-correction", "--picture", "--program")  # fmt: skip
 EVERY = {
-    (command.verb, option): (words := shlex.split(command.line), words.index(option) + 1)
-    for command in COMMANDS if command.verb not in ("study", "demo")
-    for option in NAMES if option in shlex.split(command.line)
-}  # fmt: skip
+    (command.verb, option): (command.words, command.words.index(option) + 1)
+    for command in ALL
+    for option, _ in command.outputs
+}
 
 
 @pytest.mark.parametrize("spoil", [lambda path: path.with_suffix(".bak"), lambda path: "no" / path])

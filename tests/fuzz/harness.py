@@ -1,7 +1,7 @@
-"""One spoilt case in a process of its own, and what must hold however it ends.
+"""A command in a process of its own, and what must hold however it ends.
 
-A prepared parent, which has loaded the package and what it needs, forks a child for each case: a
-case then costs what the command costs, not what loading it costs.  A case follows from its seed.
+A prepared parent, which has loaded the package and what it needs, forks a child for each command:
+it then costs what the command costs, not what loading it costs.
 """
 
 from __future__ import annotations
@@ -10,36 +10,26 @@ import csv
 import importlib
 import io
 import json
+import multiprocessing
 import os
 import pkgutil
 import re
 import resource
 import shlex
-import shutil
 import signal
 import sys
-import time
+import tomllib
 import traceback
 import unicodedata
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
-from itertools import pairwise
+from dataclasses import dataclass
 from pathlib import Path
-from random import Random
-
-from fuzz.campaign import COMMANDS, Command
-from fuzz.grammar import grown
-from fuzz.mutations import spoil, spoil_arguments
 
 SECONDS = 30  # of processor time
-WALL = 120.0  # s; beyond it a case hangs, also where other programs have the processor
-GROWN = 0.4  # share of cases that are made by the grammar, not spoilt
-MEMORY = 1_000_000_000  # bytes resident, what is loaded included
-OLD = b"what was there before\n"
-# What goes beside an output replaces only what elastocal wrote.
-OLD_BESIDE = b'{"schema": "elastocal/plan/1"}\n'
+WALL = 120.0  # s; beyond it a command hangs, also where other programs have the processor
+MEMORY = 1_000_000_000  # bytes beside what is loaded
 DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069\u2028\u2029"
 # Folders that a run which fails may leave: tasks that were done, an example half copied.
 KEPT = {"study": ("results", "results.md"), "demo": ("demo_out",)}
@@ -47,40 +37,23 @@ KEPT = {"study": ("results", "results.md"), "demo": ("demo_out",)}
 NAMED = re.compile(
     r"argument|--?\w|\bjoint\d|\bmarker\b|\[[\w.]+\]|`\w+`|\bkey\b|\bcolumn\b|'[^']+'"
 )
+# What goes beside an output replaces only what elastocal wrote.
+OLD, OLD_BESIDE = b"what was there before\n", b'{"schema": "elastocal/plan/1"}\n'
 
 
-@dataclass
-class Case:
-    """What was run and how it ended."""
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended; a negative code is the signal that ended it."""
 
-    seed: int
-    command: Command
     words: list[str]
-    done: str
-    folder: Path
-    code: int = 0
-    stdout: str = ""
-    stderr: str = ""
-    seconds: float = 0.0  # of processor time
-    took: float = 0.0  # s by the clock
-    resident: int = 0
-    complaints: list[str] = field(default_factory=list)
-    then: list[tuple[Command, list[str]]] = field(default_factory=list)  # verbs that follow
-
-    @property
-    def line(self) -> str:
-        return shlex.join(["elastocal", self.command.verb, *self.words])
+    code: int
+    stdout: str
+    stderr: str
 
     def told(self) -> str:
-        """A finding as it is reported: what broke, and how to see it again."""
-        message = (self.stderr or self.stdout).strip()
-        short = message if len(message) < 3000 else f"{message[:1000]}\n…\n{message[-2000:]}"
-        return (
-            f"--- case {self.seed}: {'; '.join(self.complaints)}\n"
-            f"    {self.line[:400]!r}\n    {self.done[:400]}\n"
-            f"    exit {self.code}, {self.seconds:.1f} s, {self.resident / 1e6:.0f} MB\n"
-            f"    again: python tests/fuzz/run.py --case {self.seed}\n{short}\n"
-        )
+        shown = (self.stderr or self.stdout).strip()
+        shown = shown if len(shown) < 3000 else f"{shown[:1000]}\n…\n{shown[-2000:]}"
+        return f"    {shlex.join(self.words)[:400]!r}\n    exit {self.code}\n{shown}\n"
 
 
 def load_everything() -> None:
@@ -91,97 +64,50 @@ def load_everything() -> None:
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
     for name in ("cvxpy", "clarabel", "matplotlib.pyplot", "plotly.graph_objects", "pandas",
-                 "scipy.optimize", "scipy.stats", "pinocchio", "pyvrp", "rich.progress",
-                 "rich.table", "mujoco", "pyarrow.parquet"):  # fmt: skip
+                 "scipy.optimize", "scipy.stats", "pinocchio", "rich.progress", "rich.table",
+                 "mujoco", "pyarrow.parquet"):  # fmt: skip
         with suppress(ImportError):  # an optional one; commands say so themselves
             importlib.import_module(name)
 
 
-def make(seed: int, base: Path, folder: Path, verbs: tuple[str, ...] = ()) -> Case:
-    """The spoilt case of a seed in `folder`, which must not exist; `base` is the campaign."""
-    rng = Random(seed)
-    if not verbs and rng.random() < GROWN:
-        work = folder / "a" / "b" / "c"
-        (command, words), *then = grown(work, rng)
-        return Case(seed, command, words, f"grown: {chained(then)}", work, then=then)
-    command = rng.choice([c for c in COMMANDS if not verbs or c.verb in verbs])
-    # What `..` names stays within the case.
-    work = folder / "a" / "b" / "c"
-    shutil.copytree(base, work)
-    words = shlex.split(command.line)
-    files = [work / name for name in (*words, *command.named) if (work / name).is_file()]
-    done = []
-    if files and rng.random() < 0.75:
-        done.append(spoil(rng.choice(files), rng))
-    if not done or rng.random() < 0.05:
-        words, how = spoil_arguments(words, rng)
-        done.append(how)
-    if rng.random() < 0.5:
-        for name in command.outputs:
-            (work / name).write_bytes(old(command, name))
-    return Case(seed, command, words, "; ".join(done), work)
-
-
-def run(case: Case) -> Case:
-    """Run the case in a child; what broke is in its `complaints`."""
-    before = seen(case.folder)
-    execute(case)
-    case.complaints = list(_complaints(case, before))
-    if case.then and case.code == 0 and not case.complaints:
-        (command, words), *then = case.then
-        return run(Case(case.seed, command, words, case.done, case.folder, then=then))
-    return case
-
-
-def chained(verbs: list[tuple[Command, list[str]]]) -> str:
-    return " > ".join(command.verb for command, _ in verbs)
-
-
-def execute(
-    case: Case,
-    prepare: Callable[[], object] = lambda: None,
-    longest: float = WALL,
-    interrupt: float | None = None,
-) -> Case:
-    """Run the case in a child, which calls `prepare` first and is killed after `longest` s.
-
-    After `interrupt` s somebody presses Ctrl-C.
-    """
-    out, err = case.folder.parent / "stdout", case.folder.parent / "stderr"
-    begun = time.monotonic()
+def run(words: list[str], folder: Path, prepare: Callable[[], object] = lambda: None) -> Ended:
+    """The command in a child that calls `prepare` first; its outputs go beside `folder`."""
+    out, err = folder.with_name("stdout"), folder.with_name("stderr")
     sys.stdout.flush(), sys.stderr.flush()
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # until the command begins
-    child = os.fork()
-    if child == 0:
-        be_child(case, out, err, prepare)
+    context = multiprocessing.get_context("fork")
+    child = context.Process(target=be_child, args=(words, folder, out, err, prepare))
+    child.start()
     signal.signal(signal.SIGINT, before)
-    pressed = None if interrupt is None else begun + interrupt
-    status, usage = waited(child, begun + longest, pressed)
-    case.took = time.monotonic() - begun
-    case.seconds = usage.ru_utime + usage.ru_stime
-    case.resident = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    case.code = os.waitstatus_to_exitcode(status)
-    case.stdout = out.read_text(encoding="utf-8", errors="surrogateescape")
-    case.stderr = err.read_text(encoding="utf-8", errors="surrogateescape")
-    return case
+    child.join(WALL)
+    child.kill()
+    child.join()
+    with suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)  # processes that it started
+    told = (path.read_text(encoding="utf-8", errors="surrogateescape") for path in (out, err))
+    return Ended(["elastocal", *words], child.exitcode, *told)
 
 
-def be_child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) -> None:
-    """In the child: the command as a shell would start it; never returns."""
+def be_child(
+    words: list[str], folder: Path, out: Path, err: Path, prepare: Callable[[], object]
+) -> None:
+    """The command as a shell would start it; never returns."""
     code = 1
     try:
-        os.chdir(case.folder)
-        apart(out, err)
+        os.setsid()
+        os.chdir(folder)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        for number, path in ((1, out), (2, err)):
+            os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
         sys.stderr = open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False)  # noqa: SIM115
         pages = int(Path("/proc/self/statm").read_text().split()[0])
-        room = pages * os.sysconf("SC_PAGE_SIZE") + 2 * MEMORY
+        room = pages * os.sysconf("SC_PAGE_SIZE") + MEMORY
         resource.setrlimit(resource.RLIMIT_AS, (room, room))
         resource.setrlimit(resource.RLIMIT_CPU, (SECONDS, SECONDS + 5))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         prepare()
-        sys.argv = ["elastocal", case.command.verb, *case.words]
+        sys.argv = ["elastocal", *words]
         from elastocal.__main__ import main
 
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -201,39 +127,10 @@ def be_child(case: Case, out: Path, err: Path, prepare: Callable[[], object]) ->
             os._exit(code)
 
 
-def apart(out: Path, err: Path) -> None:
-    """In a child: a group of processes of its own, and what it tells in files of its own."""
-    os.setsid()
-    for number, path in ((1, out), (2, err)):
-        os.dup2(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), number)
-
-
-def waited(
-    child: int, deadline: float, interrupt: float | None = None
-) -> tuple[int, resource.struct_rusage]:
-    pause = 0.002
-    while True:
-        done, status, usage = os.wait4(child, os.WNOHANG)
-        if done:
-            break
-        if interrupt is not None and time.monotonic() > interrupt:
-            os.kill(child, signal.SIGINT)
-            interrupt = None
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            _, status, usage = os.wait4(child, 0)
-            break
-        time.sleep(pause)
-        pause = min(2 * pause, 0.05)
-    with suppress(ProcessLookupError, PermissionError):
-        os.killpg(child, signal.SIGKILL)  # processes that it started
-    return status, usage
-
-
-def old(command: Command, name: str) -> bytes:
-    """What stands under the name of an output before the command runs."""
-    beside = name.endswith(".json") and f"{name[:-5]}.csv" in command.outputs
-    return OLD_BESIDE if beside else OLD
+def put_old(outputs: Iterable[str], folder: Path) -> None:
+    """An old file under every output's name."""
+    for name in outputs:
+        (folder / name).write_bytes(OLD_BESIDE if name.endswith(".json") else OLD)
 
 
 def seen(folder: Path) -> dict[str, bytes | None]:
@@ -247,71 +144,48 @@ def seen(folder: Path) -> dict[str, bytes | None]:
     return found
 
 
-def _complaints(case: Case, before: dict[str, bytes | None]) -> Iterator[str]:
-    told = case.stdout + case.stderr
-    if case.code == -signal.SIGXCPU or case.seconds > SECONDS:
+def complaints(ended: Ended, before: dict[str, bytes | None], folder: Path) -> Iterator[str]:
+    """What a command did that none may do, whatever it was given."""
+    told, verb = ended.stdout + ended.stderr, ended.words[1]
+    if ended.code == -signal.SIGXCPU:
         yield f"more than {SECONDS} s of processor time"
-    elif case.code == -signal.SIGKILL:
+    elif ended.code == -signal.SIGKILL:
         yield f"hangs: more than {WALL:.0f} s"
-    elif case.code not in (0, 1, 2):
-        yield f"exit code {case.code}"
-    if case.resident > MEMORY:
-        yield "more than 1 GB"
-    if "Traceback" in told:
-        yield "traceback"
-    if found := re.search(r"\b[A-Z]\w+Warning\b|Exception ignored", case.stderr):
-        yield f"raw warning {found[0]}"
+    elif ended.code not in (0, 1, 2):
+        yield f"exit code {ended.code}"
+    if found := re.search(r"Traceback|\b[A-Z]\w+Warning\b|Exception ignored", ended.stderr):
+        yield f"raw {found[0]}"
     odd = {c for c in told if unicodedata.category(c) in ("Cc", "Cs") or c in DIRECTIONS} - {"\n"}
     if odd:
         yield f"raw characters {sorted(map(ascii, odd))}"
-    after = seen(case.folder)
-    new = {name for name in after if name not in before or after[name] != before[name]}
-    if case.code != 0:
-        kept = KEPT.get(case.command.verb, ())
-        left = [name for name in sorted(new) if not name.startswith(kept)] if kept else sorted(new)
-        if left and not (case.command.verb in KEPT and "-o" in case.line):
-            yield f"left behind {left}"
-        yield from _message_complaints(case)
-    lost = [name for name in before if name not in after]
-    if lost:
+    after = seen(folder)
+    new = sorted(name for name in after if name not in before or after[name] != before[name])
+    if lost := [name for name in before if name not in after]:
         yield f"removed {lost}"
     if any(name.endswith(".tmp") for name in after):
         yield "a temporary file is left"
-    if case.code == 0:
-        # With -o and --report exchanged a name does not say what is in the file.
-        meant = {b for a, b in pairwise(shlex.split(case.command.line)) if (a, b) in pairs(case)}
-        for name in sorted(new):
-            content = after[name]
-            if content is not None and name in meant and (problem := malformed(name, content)):
+    if ended.code == 0:
+        for name in new:
+            if problem := malformed(name, after[name] or b""):
                 yield f"{name}: {problem}"
-        if _as_json(case) and (problem := malformed("x.json", case.stdout.encode())):
+        if "--json" in ended.words and (problem := malformed("x.json", ended.stdout.encode())):
             yield f"stdout: {problem}"
-
-
-def _message_complaints(case: Case) -> Iterator[str]:
-    messages = re.findall(r"(?m)^(?:elastocal: |Error: )", case.stderr)
-    if case.command.verb == "study" and not messages and "failed" in case.stdout:
+        return
+    kept = KEPT.get(verb, ())
+    left = [name for name in new if not kept or not name.startswith(kept)]
+    if left and not (kept and "-o" in ended.words):
+        yield f"left behind {left}"
+    messages = re.findall(r"(?m)^(?:elastocal: |Error: )(.*(?:\n.*)*)", ended.stderr)
+    if verb == "study" and not messages and "failed" in ended.stdout:
         return  # the tasks' own errors, listed
-    if len(messages) != 1:
+    if len(re.findall(r"(?m)^(?:elastocal: |Error: )", ended.stderr)) != 1:
         yield f"{len(messages)} messages"
         return
-    message = case.stderr[case.stderr.index(messages[0]) + len(messages[0]) :]
-    words = (*case.words, *case.command.line.split(), *case.command.named)
-    names = {Path(word).name or "." for word in words}
-    names |= {name[:60] for name in names}  # as much of it as a message shows
+    files = {Path(word).name or "." for word in (*ended.words, *before)}
+    names = files | {name[:60] for name in files}  # as much of it as a message shows
     shown = {name for name in names if name.isprintable()} | {repr(name)[1:-1] for name in names}
-    if not (any(name in message for name in shown) or NAMED.search(message)):
+    if not (any(name in messages[0] for name in shown) or NAMED.search(messages[0])):
         yield "names no culprit"
-
-
-def pairs(case: Case) -> set[tuple[str, str]]:
-    return set(pairwise(case.words))
-
-
-def _as_json(case: Case) -> bool:
-    """Is --json an option there, not the value of another one?"""
-    before = [above for above, word in pairs(case) if word == "--json"]
-    return any(not above.startswith("-") or above == "-q" for above in before)
 
 
 def malformed(name: str, content: bytes) -> str | None:
@@ -319,15 +193,10 @@ def malformed(name: str, content: bytes) -> str | None:
     ending = name.rpartition(".")[2].lower()
     try:
         text = content.decode("utf-8")
-    except UnicodeDecodeError:
-        return None if ending in ("parquet", "png", "npz") else "not UTF-8"
-    if ending in ("json", "csv", "toml", "html", "src", "script", "urdf", "xml") and any(
-        unicodedata.category(c) == "Cc" and c not in "\n\t" for c in text
-    ):
-        return "control characters"
-    try:
+        if any(unicodedata.category(c) == "Cc" and c not in "\n\t" for c in text):
+            return "control characters"
         if ending == "json":
-            json.loads(text, parse_constant=_no_json, object_pairs_hook=_once)
+            json.loads(text, parse_constant=no_json, object_pairs_hook=once)
         elif ending == "csv":
             rows = [row for row in csv.reader(io.StringIO(text)) if row]
             if len({len(row) for row in rows if not row[0].startswith("#")}) > 1:
@@ -335,17 +204,19 @@ def malformed(name: str, content: bytes) -> str | None:
         elif ending in ("urdf", "xml", "svg"):
             ElementTree.fromstring(text)
         elif ending == "toml":
-            importlib.import_module("tomllib").loads(text)
+            tomllib.loads(text)
+    except UnicodeDecodeError:
+        return None if ending in ("parquet", "png", "npz") else "not UTF-8"
     except (ValueError, ElementTree.ParseError, RecursionError) as error:
         return f"malformed ({error})"
     return None
 
 
-def _no_json(word: str) -> None:
+def no_json(word: str) -> None:
     raise ValueError(f"{word} is no JSON")
 
 
-def _once(pairs: list[tuple[str, object]]) -> dict[str, object]:
+def once(pairs: list[tuple[str, object]]) -> dict[str, object]:
     if len(dict(pairs)) < len(pairs):
         raise ValueError("a key twice")
     return dict(pairs)

@@ -15,17 +15,23 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
+from random import Random
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).parents[1])]
 
-from fuzz import campaign, harness, kills  # noqa: E402
+from fuzz import campaign, harness, kills, mutations  # noqa: E402
+
+from elastocal.cli.app import VERBS  # noqa: E402
 
 BEGIN, END = "<!-- cases: written by tests/fuzz/run.py -->", "<!-- end of cases -->"
+COLUMNS = ("exit 0", "exit 1", "exit 2", *kills.HARMS)
+Done = tuple[str, str, str]  # verb, column of the table, what broke
 
 
 def main() -> int:
@@ -35,82 +41,98 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="number of the first case")
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
-    parser.add_argument("--harmed", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
     parser.add_argument("--interrupts", type=int, default=0, help="Ctrl-C in each so many times")
     parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
     parser.add_argument("--write", type=Path, help="page whose table this run replaces")
-    parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
+    parser.add_argument("--case", type=int, help="run one case and show it")
     asked = parser.parse_args()
-    folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
-    base = folder / "campaign"
-    base.mkdir()
-    campaign.write(base)
+    folder, begun = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-")), time.monotonic()
+    (folder / "campaign").mkdir()
+    campaign.write(folder / "campaign")
     harness.load_everything()
     if asked.case is not None:
-        case = harness.run(harness.make(asked.case, base, folder / "case", tuple(asked.verb)))
-        print(f"cd {case.folder}\n{case.told()}\nstdout:\n{case.stdout[-3000:]}")
-        return int(bool(case.complaints))
-    told, broken = everything(asked, base, folder)
-    shutil.rmtree(folder, ignore_errors=True)
+        asked.seed, asked.cases = asked.case, 1
+    until = begun + asked.seconds
+    times = dict(zip(kills.HARMS, (asked.kills, asked.full, asked.interrupts), strict=True))
+    count, broken = Counter[tuple[str, str]](), 0
+    with ProcessPoolExecutor(asked.jobs, multiprocessing.get_context("fork")) as pool:
+        spoilt = partial(case, folder, asked.verb, until, asked.case is not None)
+        harm = partial(harms, folder, asked.seed, times, until)
+        verbs = [v for v in kills.KILLED if not asked.verb or v in asked.verb]
+        for work in (pool.map(spoilt, range(asked.seed, asked.seed + asked.cases)),
+                     pool.map(harm, verbs if any(times.values()) else ())):  # fmt: skip
+            for verb, column, told in (each for found in work for each in found):
+                count[verb, column] += 1
+                broken += bool(told)
+                print(told, end="", flush=True)
+    shutil.rmtree(folder)
+    cases = sum(n for (_, column), n in count.items() if column not in kills.HARMS)
+    run = f"{cases} cases from {asked.seed} on, {count.total() - cases} kills, interrupts and full "
+    run += f"disks, with Python {platform.python_version()}: {broken} with a finding; "
+    run += f"{time.monotonic() - begun:.0f} s in all."
+    told = f"{table(count)}\n\n{run}"
     print(told)
     if asked.write is not None:
-        page = asked.write.read_text(encoding="utf-8")
-        before, rest = page.split(f"{BEGIN}\n")
-        _, after = rest.split(END)
-        asked.write.write_text(f"{before}{BEGIN}\n\n{told}\n\n{END}{after}", encoding="utf-8")
+        before, rest = asked.write.read_text(encoding="utf-8").split(f"{BEGIN}\n")
+        page = f"{before}{BEGIN}\n\n{told}\n\n{END}{rest.split(END)[1]}"
+        asked.write.write_text(page, encoding="utf-8")
     return int(broken > 0)
 
 
-def everything(asked: argparse.Namespace, base: Path, folder: Path) -> tuple[str, int]:
-    """Cases and harms, whose findings are printed as they come: the table of how they ended with a
-    sentence on the run (Markdown), and how many broke something."""
-    begun = time.monotonic()
-    until = begun + asked.seconds
-    count, broken, done, slowest, largest = Counter[tuple[str, str]](), 0, 0, 0.0, 0
-    with ProcessPoolExecutor(asked.jobs, multiprocessing.get_context("fork")) as pool:
-        spoilt = partial(one, base, folder, tuple(asked.verb), until)
-        for case in pool.map(spoilt, range(asked.seed, asked.seed + asked.cases)):
-            if case is None:
-                continue
-            count[case.command.verb, f"exit {case.code}"] += 1
-            done, slowest = done + 1, max(slowest, case.seconds)
-            largest = max(largest, case.resident)
-            if case.complaints:
-                broken += 1
-                print(case.told(), flush=True)
-        times = dict(zip(kills.HARMS, (asked.kills, asked.full, asked.interrupts), strict=True))
-        harm = partial(kills.do_harm, base, folder, asked.seed, times, until)
-        verbs = asked.harmed or asked.verb or kills.KILLED
-        for found, tried in pool.map(harm, verbs if any(times.values()) else ()):
-            print("\n".join(found), end="", flush=True)
-            count, broken = count + tried, broken + len(found)
-    told = [f"{done} cases from {asked.seed} on"] * bool(done)
-    if others := count.total() - done:
-        told.append(f"{others} kills, interrupts and full disks (seed {asked.seed})")
-    run = f"{', '.join(told)}, with Python {platform.python_version()}: {broken} with a finding; "
-    run += f"{time.monotonic() - begun:.0f} s in all."
-    if done:
-        run += f" Slowest case {slowest:.1f} s of processor time, largest {largest / 1e6:.0f} MB."
-    return f"{table(count)}\n\n{run}", broken
-
-
-def one(
-    base: Path, folder: Path, verbs: tuple[str, ...], until: float, seed: int
-) -> harness.Case | None:
+def case(folder: Path, verbs: list[str], until: float, show: bool, seed: int) -> list[Done]:
+    """The spoilt command of a seed, in a copy of the campaign."""
     if time.monotonic() > until:
-        return None
-    case = harness.run(harness.make(seed, base, folder / str(seed), verbs))
-    shutil.rmtree(folder / str(seed), ignore_errors=True)
-    return case
+        return []
+    rng, place = Random(seed), folder / str(seed)
+    work = place / "a" / "b" / "c"  # what `..` names stays within the case
+    shutil.copytree(folder / "campaign", work)
+    verb = rng.choice(verbs or sorted(VERBS))
+    command = rng.choice([c for c in campaign.COMMANDS if c.verb == verb])
+    words, inputs = command.words, command.inputs(work)
+    done = mutations.spoil(rng.choice(inputs), rng) if inputs and rng.random() < 0.75 else ""
+    if not done or rng.random() < 0.05:
+        words = mutations.spoil_arguments(words, rng)
+    if rng.random() < 0.5:
+        harness.put_old((name for _, name in command.outputs), work)
+    before = harness.seen(work)
+    ended = harness.run([verb, *words], work)
+    found = "; ".join(harness.complaints(ended, before, work))
+    shutil.rmtree(place)
+    told = f"--- case {seed}: {found}\n    {done}\n{ended.told()}"
+    return [(verb, f"exit {ended.code}", told if found or show else "")]
+
+
+def harms(folder: Path, seed: int, times: dict[str, int], until: float, verb: str) -> list[Done]:
+    """Do to a verb what `times` says so many times: a few to its first command, many to all."""
+    each = sorted((k / many, harm, k) for harm, many in times.items() for k in range(many))
+    commands = [c for c in campaign.COMMANDS if c.verb == verb][: 1 + len(each) // 20]
+    victims = [kills.Victim(c, folder / "campaign", folder / f"{verb}{i}")
+               for i, c in enumerate(commands)]  # fmt: skip
+    return [
+        (verb, harm, told)
+        for i, (_, harm, k) in enumerate(each)
+        for told in harmed(
+            victims[i % len(victims)], harm, Random(f"{seed} {verb} {harm} {k}"), until
+        )
+    ]
+
+
+def harmed(victim: kills.Victim, harm: str, rng: Random, until: float) -> Iterator[str]:
+    for _ in range(20):  # one that ends before it is killed does not count
+        if time.monotonic() > until:
+            return
+        where, found, met = victim.harmed(harm, rng)
+        if found or met:
+            yield f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n" if found else ""
+            return
 
 
 def table(count: Counter[tuple[str, str]]) -> str:
     """One row per verb (Markdown)."""
-    columns = ("exit 0", "exit 1", "exit 2", *kills.HARMS)
-    rows = ["| verb | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    rows = ["| verb | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
     for verb in sorted({verb for verb, _ in count}):
-        numbers = (count[verb, column] for column in columns)
+        numbers = (count[verb, column] for column in COLUMNS)
         rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
     return "\n".join(rows)
 

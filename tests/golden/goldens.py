@@ -176,8 +176,8 @@ GOLDENS: dict[str, Golden] = {
         "import --show-preset kuka",
     )),
     "init": Golden(CAMPAIGN, (
-        "init arm.urdf -o urdf.toml",
-        "init arm.csv -o dh.toml",
+        "init arm.urdf -o first.toml",
+        "init arm.csv -o standard.toml",
         "init arm.csv -o modified.toml --convention modified",
     )),
     "effects": Golden(CAMPAIGN, ("effects", "effects placed.toml --json")),

@@ -2,104 +2,63 @@
 
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from support.calibration import GEOMETRY, measured
-from support.parts import CASES, SIGMA, arm, faulty_of, solved
+from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values
+from support.cells import random_poses
 
-from elastocal.identification import outliers, solve
-from elastocal.identification import weighted_problem as chunked
-from elastocal.identification import weighted_problem as partition
-from elastocal.identification.outliers import describe
+import elastocal as ec
+from elastocal.identification import outliers, solve, weighted_problem
 from elastocal.identification.residuals import held_out_by_parts
-from elastocal.identification.solve import residual_sigma
 from elastocal.identification.weighted_problem import Weights
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 
-UNIT = Weights("none", None, False, "")
+CAMPAIGN = Path(__file__).parents[1] / "golden" / "inputs" / "campaign"
 
 
-@pytest.fixture
-def in_parts(monkeypatch):
-    """Called, makes every table large, its parts tiny, and samples smaller than the table."""
-
-    def switch(numbers=1500, sample=60):
-        monkeypatch.setattr(partition, "LARGE", 0)
-        monkeypatch.setattr(partition, "PART", numbers)
-        monkeypatch.setattr(solve, "SAMPLE", sample)
-        monkeypatch.setattr(solve, "MANY", sample)
-        monkeypatch.setattr(outliers, "SAMPLE", sample)
-
-    return switch
+def identified(model: ec.Model, table: ec.Measurements) -> ec.Calibration:
+    return ec.identify(model, table, method="wls", outliers="drop")
 
 
-# --- identification -------------------------------------------------------------------------
-
-
-def covariance_of(solution):
-    n_kept = len(solution.reduction.kept)
-    return residual_sigma(solution.fit, n_kept) ** 2 * solution.fit.cofactor()
-
-
-def assert_same_estimates(parts, whole):
-    """Both stop where a step no longer lowers the cost: 1e-4 of a standard deviation is what the
-    placing of base and markers leaves open; the fit itself agrees far closer."""
-    kept = whole.reduction.kept
-    assert np.array_equal(parts.reduction.kept, kept)
-    assert parts.fit.converged and whole.fit.converged
-    covariance = covariance_of(whole)
-    std = np.sqrt(np.diag(covariance))
-    assert (np.abs(parts.fit.x - whole.fit.x)[kept] < 1e-4 * std).all()
-    np.testing.assert_allclose(covariance_of(parts) / np.outer(std, std),
-                               covariance / np.outer(std, std), atol=1e-6)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "case",
-    [pytest.param(c, marks=pytest.mark.long if "distances" in c.__name__ else ()) for c in CASES],
-    ids=lambda case: case.__name__,
-)
-def test_in_parts_equals_whole(case, in_parts):
-    model, table = case()
-    whole = solved(model, table)
-    accused = faulty_of(whole)[0]
-    in_parts(len(whole.heldout) * len(model.parameters) // 6)
-    parts = solved(model, table)
-    assert len(parts.problem.parts.spans) > 5
-    assert_same_estimates(parts, whole)
-    scale = np.abs(whole.fit.residual).max()
-    np.testing.assert_allclose(parts.fit.residual, whole.fit.residual, atol=1e-5 * scale)
-    np.testing.assert_allclose(parts.heldout, whole.heldout, atol=1e-5 * scale)
+@pytest.mark.parametrize("cell, data", [("placed", "placed"), ("deflecting", "data")])
+def test_in_parts_equals_whole(cell, data, monkeypatch):
+    """Positions, and deflections that share unloaded readings, with two readings off by 3 mm."""
+    model = ec.Model(CAMPAIGN / f"{cell}.toml")
+    table = model.read(CAMPAIGN / f"{data}.csv")
+    position = table.position.copy()
+    position[[5, 18]] += [[3e-3, 0, 0], [0, -3e-3, 0]]
+    table = replace(table, position=position)
+    whole = identified(model, table)
+    monkeypatch.setattr(weighted_problem, "LARGE", 0)
+    monkeypatch.setattr(weighted_problem, "PART", len(whole.residual) * len(model.names) // 6)
+    for module, name in ((solve, "SAMPLE"), (solve, "MANY"), (outliers, "SAMPLE")):
+        monkeypatch.setattr(module, name, 25)
+    parts = identified(model, table)
+    assert [o.line for o in parts.excluded] == [o.line for o in whole.excluded]
+    assert len(whole.excluded) == 2
+    assert parts.determined == whole.determined and parts.dof == whole.dof
+    # Both stop where a step no longer lowers the cost, which leaves the placing open to 1e-4.
+    std = np.sqrt(np.diag(whole.covariance))
+    kept = [whole.model.names.index(name) for name in whole.determined]
+    assert (np.abs(parts.x - whole.x)[kept] < 1e-4 * std).all()
+    np.testing.assert_allclose(parts.covariance / np.outer(std, std),
+                               whole.covariance / np.outer(std, std), atol=1e-6)  # fmt: skip
+    scale = np.abs(whole.residual).max()
+    np.testing.assert_allclose(parts.residual, whole.residual, atol=1e-5 * scale)
+    np.testing.assert_allclose(parts.held_out, whole.held_out, atol=1e-5 * scale)
     assert parts.nominal_rms == pytest.approx(whole.nominal_rms, rel=1e-6)
-    assert np.array_equal(faulty_of(parts)[0], accused)
-
-
-def test_faulty_readings_are_found_in_parts_too(in_parts):
-    """A tenth of the readings off by 1 to 100 mm, as many in the sample as elsewhere."""
-    model, plan, truth, rng = arm(GEOMETRY, 8, 120)
-    table = measured(model, plan, truth, SIGMA, rng)
-    bad = np.sort(rng.permutation(120)[:12])
-    table.position[bad] += rng.choice([-1, 1], (12, 3)) * rng.uniform(1e-3, 0.1, (12, 3))
-    solution = solved(model, table)
-    expected = faulty_of(solution)
-    in_parts(3000, 70)
-    found = faulty_of(solved(model, table))
-    assert np.flatnonzero(expected[0]).tolist() == np.flatnonzero(found[0]).tolist() == bad.tolist()
-    one, other = (describe(solution, fitted, faulty) for faulty, fitted in (found, expected))
-    np.testing.assert_allclose([o.ratio for o in one], [o.ratio for o in other], rtol=0.01)
-    np.testing.assert_allclose([o.residual for o in one], [o.residual for o in other], rtol=0.01)
-
-
-# --- passes ---------------------------------------------------------------------------------
 
 
 def peak_of_a_pass(model, truth, observed):
     """Largest memory traced in a pass that evaluates and in one that leaves out, in bytes."""
-    parts = partition.partition(observed, UNIT, len(model.parameters))
+    unit = Weights("none", None, False, "")
+    parts = weighted_problem.partition(observed, unit, len(model.parameters))
     columns, kept = np.arange(len(model.parameters)), np.arange(6)
     tracemalloc.start()
-    r_factor = chunked.evaluate(model, parts, truth, columns).r_factor.of_columns(kept)
+    r_factor = weighted_problem.evaluate(model, parts, truth, columns).r_factor.of_columns(kept)
     held_out_by_parts(model, parts, truth, kept, r_factor.half)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
@@ -109,13 +68,13 @@ def peak_of_a_pass(model, truth, observed):
 def test_a_longer_table_takes_no_more_than_its_residual(monkeypatch):
     """Parts of 4 MB: B of the longer table is 97 MB, and both tables need the same few parts.
     What grows with the table is one residual (8 bytes a row), and the list of its parts."""
-    monkeypatch.setattr(partition, "PART", 2**19)
-    model, plan, truth, _ = arm(GEOMETRY, 9, 500)
+    monkeypatch.setattr(weighted_problem, "PART", 2**19)
+    model, rng = Model.assembled(planar_chain(4), cell_of(GEOMETRY)), np.random.default_rng(9)
+    plan, truth = table_at(random_poses(model.chain, 500, 9)), true_values(model, rng)
     peaks, rows = [], []
     for n in (50_000, 150_000):
         many = plan.take(np.arange(n) % 500)
         observed = observe(replace(many, configuration=np.arange(n)), "position")
-        assert partition.is_large(observed, len(model.parameters))
         peaks.append(peak_of_a_pass(model, truth, observed))
         rows.append(len(observed.value))
     assert peaks[1] < 8 * rows[1] * len(model.parameters) / 2

@@ -1,15 +1,11 @@
 """Squares under bounds, equalities and matrices: optimality, closed forms, a whole arm."""
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import optimize, sparse
-from support.calibration import measured, with_values
-from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.constrained import Minimum, minimise
@@ -20,12 +16,7 @@ from elastocal.identification.knowledge import (
     LinearEquality,
     SemidefiniteMatrix,
     System,
-    physical_constraints,
 )
-from elastocal.identification.least_squares import KnownFit, PriorRows, Problem, fit, profile_end
-from elastocal.identification.weighted_problem import Weights
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import observe
 
 NONE = Constraints()
 
@@ -65,7 +56,6 @@ NAMES = tuple("abcdef")
 # Parameters of the sizes that an arm has: compliances of 1e-7 beside lengths of 1e-3.
 SIZES = np.array([1e-7, 3e-7, 1e-6, 1e-3, 1e-3, 2e-4])
 NON_NEGATIVE = Constraints(tuple(Bounds(name, lower=0.0) for name in NAMES))
-FULL = (("a", "d", "e"), ("d", "b", "f"), ("e", "f", "c"))
 
 
 def problem(seed: int, rows: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -145,79 +135,6 @@ def test_what_nothing_determines_is_named_and_an_equality_can_determine_it():
     equal = LinearEquality({"a": 1.0, "b": -1.0})
     found = solve(B, y, NAMES, Constraints(equalities=(equal,))).x
     assert found[0] == pytest.approx(found[1], rel=1e-12)
-
-
-def test_a_semidefinite_fit_is_the_best_factor():
-    # Random truth is indefinite: the constraint binds, with a null space of one or two.
-    B, y = problem(0)
-    rows = tuple(tuple({n: 1 / SIZES[NAMES.index(n)]} for n in row) for row in FULL)
-    found = solve(B, y, NAMES, Constraints(matrices=(SemidefiniteMatrix("K", rows),)))
-    at = dict(zip(NAMES, found.x / SIZES, strict=True))
-    values = np.linalg.eigvalsh([[at[n] for n in row] for row in FULL])
-    assert values[0] > -1e-8 * max(values[-1], 1)
-    assert [a.kind for a in found.active] == ["semidefinite"] and found.active[0].multiplier > 0
-
-    def residual(factor):
-        L = np.zeros((3, 3))
-        L[np.tril_indices(3)] = factor
-        M = L @ L.T
-        z = np.array([M[0, 0], M[1, 1], M[2, 2], M[0, 1], M[0, 2], M[1, 2]])
-        return B @ (SIZES * z) - y
-
-    fits = [
-        optimize.least_squares(
-            residual, np.random.default_rng(k).normal(size=6), xtol=1e-15, ftol=1e-15, gtol=1e-15
-        )
-        for k in range(3)
-    ]
-    best = 2 * min(f.cost for f in fits)
-    assert best * (1 - 1e-6) <= found.objective <= best * (1 + 1e-9)
-
-
-# A whole arm: the KR 270 at the poses of Table 2, nonlinear equilibrium.
-
-SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
-BEARING_X = "joint2.off_axis_compliance_x"
-
-
-@lru_cache
-def negative_bearing() -> tuple:
-    """Readings of the arm with stiff bearings, start at nominal: a problem whose unconstrained
-    estimate of BEARING_X is negative."""
-    cell = kr270_cell(("joint_compliance", "off_axis_compliance:joint2"), observe="deflection")
-    model, rng = Model(cell), np.random.default_rng(0)
-    truth = with_values(model, {"joint3.compliance": 5e-7})
-    table = measured(model, table_of(TABLE_2, SLANTED, both=True), truth, SIGMA / 2**0.5, rng)
-    observed = observe(table, "deflection")
-    whiten = sparse.csr_array(sparse.eye_array(len(observed.value)) / SIGMA)
-    sizes = model.sizes(model.regressor(table, model.nominal, None, observed).B)
-    columns = np.arange(len(model.names))
-    stated = Problem(model, observed, Weights("axis", whiten, True, ""), model.nominal, columns)
-    found = stated, columns, model.nominal, sizes
-    assert fit(*found).x[model.names.index(BEARING_X)] < 0
-    return found
-
-
-def fitted(constraints: Constraints) -> KnownFit:
-    problem, columns, x, sizes = negative_bearing()
-    known = PriorRows.stated(problem.model.names, columns, x, constraints, None, 1.0)
-    return KnownFit(fit(problem, columns, x, sizes, known=known), known, 1.0)
-
-
-@pytest.mark.parametrize("name", [BEARING_X, "joint3.compliance"])
-def test_ends_of_a_profile_are_where_the_objective_has_risen_as_far_as_allowed(name):
-    model = negative_bearing()[0].model
-    physics, i = physical_constraints(model), model.names.index(name)
-    found = fitted(physics)
-    for side in (-1, 1):
-        end = profile_end(found, i, 3.84, side)
-        if name == BEARING_X and side < 0:
-            assert end == 0
-            continue
-        assert side * (end - found.fit.x[i]) > 0
-        at_end = Constraints((Bounds(name, end, end),))
-        rise = fitted(physics + at_end).objective - found.objective
-        assert rise == pytest.approx(3.84, abs=1e-5)
 
 
 def test_an_impossible_covariance_of_a_prior_is_refused():

@@ -4,16 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy import linalg, stats
-from support.calibration import PLACED, cell_of, measured, planar_chain, table_at, true_values
-from support.cells import random_poses
+from scipy import linalg
+from support.calibration import table_at
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
 from elastocal.identification.weighted_problem import weights_for
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))
@@ -76,20 +72,6 @@ def test_whitens_positions_and_deflections(case, kind):
     assert_whitens(weights, mix @ reading_covariance(table, tracker) @ mix.T)
 
 
-def test_deflections_that_share_an_unloaded_reading_are_correlated():
-    """Three loads against one unloaded reading: Σ = σ² (I + 1 1ᵀ), whitened together."""
-    table = some_table(n=4, states=4)
-    observed = observe(table, "deflection")
-    weights = weights_for(observed, AXIS)
-    covariance = np.kron(np.kron(np.eye(4), np.eye(3) + np.ones((3, 3))),
-                         np.diag(AXIS.noise.sigma**2))  # fmt: skip
-    assert_whitens(weights, covariance)
-    # and not across configurations
-    W = weights.whiten.toarray().reshape(4, 9, 4, 9)
-    for c in range(4):
-        assert not W[c][:, np.arange(4) != c].any()
-
-
 def test_whitens_poses_and_distances():
     rng = np.random.default_rng(2)
     table = some_table(n=5)
@@ -120,16 +102,3 @@ def test_distances_and_poses_need_their_own_sigma():
         weights_for(observe(table, "distance"), AXIS, "axis")
     with pytest.raises(InputError, match=r"poses need \[tracker\] rotation_urad"):
         weights_for(observe(table, "pose"), AXIS, "axis")
-
-
-def test_unit_weights_do_not_make_the_stated_noise_forgotten():
-    """20, 20 and 50 µm are stated, 50 µm are true: s² · dof is χ²(dof)."""
-    tracker = Tracker(noise=CartesianNoise(np.array([2e-5, 2e-5, 5e-5])))
-    model = Model.assembled(planar_chain(), cell_of(PLACED, tracker=tracker))
-    rng = np.random.default_rng(7)
-    plan = table_at(random_poses(model.chain, 30, 7))
-    table = measured(model, plan, true_values(model, rng), 5e-5, rng)
-    unit = identify(model, table, Options(weights="none"))
-    assert unit.noise.ratio_to_stated == pytest.approx(np.sqrt((6.25 + 6.25 + 1) / 3), rel=0.2)
-    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], unit.dof)
-    assert low < (unit.noise.sigma / 50e-6) ** 2 * unit.dof < high

@@ -11,12 +11,9 @@ import statsmodels.api as sm
 from scipy import integrate, stats
 from support.calibration import binomial_band
 
-from elastocal.identification.faulty_readings import outlier_report
 from elastocal.identification.outliers import (
-    FALSE_ALARM,
     HUBER,
     L1,
-    FitToGood,
     covariance_of,
     huber,
     majority,
@@ -122,18 +119,6 @@ def covers(found, arm, cluster=None):
     return int(((low < arm.x) & (arm.x < high)).sum())
 
 
-def test_intervals_hold_the_truth(arm):
-    """Of the sum of lengths, whose ψ jumps, beside blunders: 95 % of 20 tables × 9 parameters.
-
-    Parameters of a table are nearly independent, and the band of 99.9 % is that of a third as many.
-    """
-    rng = np.random.default_rng(0)
-    tables = (arm.observed(arm.errors(rng, 0.05, 100, 1000)[0]) for _ in range(20))
-    held = sum(covers(huber(arm.B, y, 3, L1), arm) for y in tables)
-    low, high = binomial_band(20 * 9 // 3, 0.95)
-    assert low <= held / 3 <= high
-
-
 def test_intervals_hold_the_truth_where_readings_of_a_configuration_err_alike(arm):
     """A deviation as large as the noise, in 15 clusters; intervals of independent readings do
     not."""
@@ -166,68 +151,3 @@ def test_blunders_that_agree_on_another_answer_at_leverage_points(arm):
     assert not good[bad].any() and good.mean() > 0.65
     assert np.abs((x - arm.x) / std).max() < 4.5 * np.sqrt(1 / 0.7)
     assert variance == pytest.approx(1.0, abs=0.2)
-
-
-WIDE = 1e3  # deviation that the weak prior gives each parameter
-
-
-def agreeing(B, y, tests, seed=0):
-    """Readings that the fit to the others does not contradict: the majority, and from there until
-    the set stands.  `tests` is what their p-values share."""
-    good = majority(B, y, seed)[0]
-    for _ in range(30):
-        fit = FitToGood(B * WIDE, y, good, 1.0)
-        better = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / tests
-        if 2 * better.sum() <= len(better) or np.array_equal(better, good):
-            break
-        good = better
-    return good
-
-
-def report(arm, noise, seed=0):
-    """Lines 2 to 271, in the order of configuration, marker, repeat."""
-    B, y = arm.B.reshape(270, 3, -1), arm.observed(noise).reshape(270, 3)
-    good = agreeing(B, y, 4 * 270, seed)
-    residual = y - B @ np.linalg.lstsq(B[good].reshape(-1, 9), y[good].ravel())[0]
-    marker = np.array(["M1", "M2", "M3"])[arm.marker]
-    lines = np.arange(270) + 2
-    return outlier_report(B * WIDE, residual, residual, good, lines, marker, arm.configuration)
-
-
-def clean(arm, seed=0):
-    return arm.errors(np.random.default_rng(seed))[0]
-
-
-def test_clean_tables_hardly_ever_raise_an_alarm(arm):
-    """At 1 % per table more than 4 alarms in 30 tables have a probability below 1e-4."""
-    alarms = sum(bool(report(arm, clean(arm, 1000 + k), seed=k).findings) for k in range(30))
-    assert alarms <= stats.binom.isf(1e-4, 30, FALSE_ALARM)
-
-
-def test_a_displaced_marker_is_one_finding_though_none_of_its_readings_is_beyond_the_noise(arm):
-    """Its 90 readings are not listed one by one, nor the configurations that it was seen in."""
-    noise = clean(arm)
-    noise[arm.marker == 1] += [0.0, 0.8, 0.0]
-    (finding,) = report(arm, noise).findings
-    assert (finding.level, finding.name, finding.pattern) == ("marker", "M2", "common")
-    assert len(finding.readings) == 90
-    assert finding.error == pytest.approx(0.8, abs=0.7) and finding.beyond < 9
-
-
-def test_several_faults_are_told_apart(arm):
-    noise = clean(arm)
-    noise[arm.marker == 1] += [0.0, 2.0, 0.0]
-    noise[arm.configuration == 3] += [0.0, 0.0, 15.0]
-    noise[250] += 30.0
-    found = {(f.level, f.name) for f in report(arm, noise).findings}
-    assert found == {("marker", "M2"), ("configuration", "3"), ("reading", "252")}
-
-
-def test_scattered_blunders_make_no_bad_marker_configuration_or_block(arm):
-    """30 % at random: all of them found, one by one, and at most one good reading accused."""
-    noise, bad = arm.errors(np.random.default_rng(0), 0.3, 100, 1000)
-    result = report(arm, noise)
-    assert {f.level for f in result.findings} == {"reading"}
-    accused = {f.readings[0] for f in result.findings}
-    assert set(bad) <= accused and len(accused) <= len(bad) + 1
-    assert not result.good[bad].any()

@@ -8,11 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from identification.test_far_values import cell, poses
-from support.parts import deflections
 
 import elastocal as ec
-from elastocal.identification.mistakes import refuse_nonsense
-from elastocal.model.observations import observe
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +74,10 @@ def test_the_cell_of_another_robot_is_named_before_a_scale(made):
 
 
 def test_deflections_are_small_but_their_positions_tell_swapped_columns() -> None:
-    model, table = deflections()
-    observed = observe(table, "deflection")
-    none_left = np.zeros(observed.value.size)
-    refuse_nonsense(model, observed, model.nominal, none_left, table)
-    mirrored = replace(table, position=np.asarray(table.position)[:, [0, 2, 1]])
+    campaign = Path(__file__).parents[1] / "golden" / "inputs" / "campaign"
+    model = ec.Model(campaign / "deflecting.toml")
+    table = model.read(campaign / "data.csv")
+    mirrored = replace(table, position=table.position[:, [0, 2, 1]])
     mended = "no deflections of this arm.*the readings fit the nominal arm only to .* they would"
     with pytest.raises(ec.InsufficientDataError, match=mended):
-        refuse_nonsense(model, observed, model.nominal, none_left, mirrored)
+        ec.identify(model, mirrored)
