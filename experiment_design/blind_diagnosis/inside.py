@@ -31,9 +31,16 @@ from places import (
 from skeleton import Array, Skeleton, transverse
 from world import Effect, Hooks, Motion, Sight, TrueArm, Visits, reweighed
 
-Move = Callable[[Effect, Visits, Motion], None]
 Draw = Callable[[Site, int, float, np.random.Generator], tuple[Values, Values]]
 POSE = ("x", "y", "z", "rx", "ry", "rz")
+WRIST = ("coupling_a", "coupling_b", "coupling_c")
+OFF_AXIS, TILT = (
+    (f"{kind}_compliance_x", f"{kind}_compliance_y") for kind in ("off_axis", "tilt")
+)  # fmt: skip
+BENDING = ("bending_y", "bending_z", "torsion")
+HOOK, MOMENT, SLIP = (
+    tuple(f"{what}_{k}" for k in "xyz") for what in ("load_point", "moment", "slip")
+)  # fmt: skip
 
 SPREAD = (0.6, 1.7)
 TIME_CONSTANT = (900.0, 5400.0)  # s, log-uniform
@@ -53,6 +60,10 @@ class Kind:
     hooks: Hooks
 
 
+def _keys(prefix: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}_{k}" for k in POSE)
+
+
 def settled(visits: Visits, effect: Effect) -> Array:
     """1 − exp(−t/τ) (n,)."""
     return -np.expm1(-visits.time / effect.settings["time_constant_s"])
@@ -63,45 +74,24 @@ def after(visits: Visits, effect: Effect, key: str) -> Array:
     return (visits.time >= effect.settings[key]).astype(float)
 
 
-def _harmonic(order: float, prefix: str) -> Move:
-    def move(e: Effect, v: Visits, m: Motion) -> None:
+def _harmonic(order: float, prefix: str) -> Hooks:
+    def drive(e: Effect, v: Visits) -> Array:
         angle = e.settings.get("ripple_order", order) * v.q[:, e.index]
         a, b = e.vector(f"{prefix}_sin", f"{prefix}_cos")
-        m.drive[:, e.index] += a * np.sin(angle) + b * np.cos(angle)
+        return a * np.sin(angle) + b * np.cos(angle)
 
-    return move
-
-
-def _encoder_scale(e: Effect, v: Visits, m: Motion) -> None:
-    m.drive[:, e.index] += e.values["encoder_scale"] * v.q[:, e.index]
+    return Hooks(drive=drive)
 
 
 def _wrist_coupling(e: Effect, v: Visits, m: Motion) -> None:
-    a, b, c = e.vector("coupling_a", "coupling_b", "coupling_c")
+    a, b, c = e.vector(*WRIST)
     m.drive[:, -2] += a * v.q[:, -3]
     m.drive[:, -1] += b * v.q[:, -3] + c * v.q[:, -2]
 
 
-def _joint_drift(e: Effect, v: Visits, m: Motion) -> None:
-    m.drive[:, e.index] += e.values["drift"] * settled(v, e)
-
-
-def _encoder_jump(e: Effect, v: Visits, m: Motion) -> None:
-    m.drive[:, e.index] += e.values["jump"] * after(v, e, "jump_time_s")
-
-
-def _base_drift(e: Effect, v: Visits, m: Motion) -> None:
-    m.base += np.outer(settled(v, e), e.vector(*[f"drift_{k}" for k in POSE]))
-
-
-def _frame_jump(e: Effect, v: Visits, m: Motion) -> None:
-    m.base += np.outer(after(v, e, "jump_time_s"), e.vector(*[f"jump_{k}" for k in POSE]))
-
-
 def _marker_slip(e: Effect, v: Visits, m: Motion) -> None:
     k = int(e.where.removeprefix("marker:M")) - 1
-    slip = e.vector("slip_x", "slip_y", "slip_z")
-    m.markers[:, k] += np.outer(after(v, e, "slip_time_s"), slip)
+    m.markers[:, k] += np.outer(after(v, e, "slip_time_s"), e.vector(*SLIP))
 
 
 def _thermal_expansion(e: Effect, v: Visits, m: Motion) -> None:
@@ -114,19 +104,19 @@ def _thermal_expansion(e: Effect, v: Visits, m: Motion) -> None:
 
 def _payload_error(e: Effect, v: Visits, m: Motion) -> None:
     m.force *= 1 + e.values["payload_scale"]
-    m.hook += e.vector("load_point_x", "load_point_y", "load_point_z")
+    m.hook += e.vector(*HOOK)
 
 
 def _link_mass_error(e: Effect, skeleton: Skeleton) -> Skeleton:
     j = e.index
     mass = skeleton.mass[j] + e.values["mass_error"]
-    moment = skeleton.mass[j] * skeleton.com[j] + e.vector("moment_x", "moment_y", "moment_z")
+    moment = skeleton.mass[j] * skeleton.com[j] + e.vector(*MOMENT)
     return reweighed(skeleton, j, mass, moment / mass)
 
 
 def _off_axis(e: Effect, arm: TrueArm) -> list[Spring]:
     axes = transverse(arm.skeleton.axis[e.index])
-    k = e.vector("off_axis_compliance_x", "off_axis_compliance_y")
+    k = e.vector(*OFF_AXIS)
     return [Spring(e.index + 1, a, c) for a, c in zip(axes, k, strict=True)]
 
 
@@ -135,32 +125,23 @@ def _link_bending(e: Effect, arm: TrueArm) -> list[Spring]:
     j = e.index
     along = arm.skeleton.rotation[j + 1].T @ arm.skeleton.link_vector(j)
     axes = (*transverse(along), along / np.linalg.norm(along))
-    k = e.vector("bending_y", "bending_z", "torsion")
+    k = e.vector(*BENDING)
     return [Spring(j + 2, a, c) for a, c in zip(axes, k, strict=True)]
 
 
 def _pedestal(e: Effect, arm: TrueArm) -> list[Spring]:
-    k = e.vector("tilt_compliance_x", "tilt_compliance_y")
+    k = e.vector(*TILT)
     return [Spring(0, a, c) for a, c in zip(np.eye(3)[:2], k, strict=True)]
 
 
 def _compensator(e: Effect) -> Tendon:
-    v = e.values
-    anchor = (v["compensator_anchor_x"], v["compensator_anchor_y"])
-    return Tendon(
-        e.index, v["compensator_stiffness"], anchor, v["compensator_arm"],
-        v["compensator_free_length"],
-    )  # fmt: skip
+    stiffness, x, y, arm, free = (e.values[f"compensator_{k}"] for k in ("stiffness", *COMPENSATOR))
+    return Tendon(e.index, stiffness, (x, y), arm, free)
 
 
-def _wind_up(e: Effect, v: Visits, load: Array, free: Array) -> None:
-    j = e.index
-    size = e.values["hysteresis"] + e.values["hysteresis_per_torque"] * np.abs(load[:, j])
-    free[:, j] += v.approach[:, j] * size
-
-
-def _hardening(e: Effect, v: Visits, load: Array, free: Array) -> None:
-    free[:, e.index] += e.values["hardening"] * load[:, e.index] ** 3
+def _wind_up(e: Effect, v: Visits, load: Array) -> Array:
+    size = e.values["hysteresis"] + e.values["hysteresis_per_torque"] * np.abs(load[:, e.index])
+    return v.approach[:, e.index] * size
 
 
 def _instrument(e: Effect, arm: TrueArm, v: Visits, sight: Sight) -> None:
@@ -207,8 +188,7 @@ def time_constant(rng: np.random.Generator) -> Values:
     return {"time_constant_s": log_uniform(TIME_CONSTANT, rng)}
 
 
-def _pair(prefix: str, size: float) -> Draw:
-    keys = (f"{prefix}_sin", f"{prefix}_cos")
+def _of_gear(keys: tuple[str, ...], size: float) -> Draw:
     return lambda site, j, f, rng: (spread(keys, f * site.spec.gear * size, rng), {})
 
 
@@ -249,7 +229,7 @@ def _balance(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Va
 
 
 def _payload(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Values, Values]:
-    hook = spread(("load_point_x", "load_point_y", "load_point_z"), f * 0.010, rng)
+    hook = spread(HOOK, f * 0.010, rng)
     return {"payload_scale": sign(rng) * f * 0.02} | hook, {}
 
 
@@ -258,19 +238,14 @@ def _mass(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Value
     extra = sign(rng) * 0.1 * f * mass
     shift = np.array(list(spread(("x", "y", "z"), f * 0.02, rng).values()))
     moment = (mass + extra) * (com + shift) - mass * com
-    keys = ("moment_x", "moment_y", "moment_z")
-    return {"mass_error": float(extra)} | dict(zip(keys, moment.tolist(), strict=True)), {}
+    return {"mass_error": float(extra)} | dict(zip(MOMENT, moment.tolist(), strict=True)), {}
 
 
 def _pose(prefix: str, shift: float, turn: float) -> Draw:
-    keys = tuple(f"{prefix}_{k}" for k in POSE)
+    keys = _keys(prefix)
     return lambda site, j, f, rng: (
         spread(keys[:3], f * shift, rng) | spread(keys[3:], f * turn, rng), {}
     )  # fmt: skip
-
-
-def _wrist(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Values, Values]:
-    return spread(("coupling_a", "coupling_b", "coupling_c"), f * site.spec.gear * 2e-4, rng), {}
 
 
 def _distortion(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Values, Values]:
@@ -287,52 +262,50 @@ def _soft(*keys: str) -> Draw:
 
 def _tilting(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Values, Values]:
     size = 0.075 * f * float(site.arm.compliance[:2].mean())
-    return positive(("tilt_compliance_x", "tilt_compliance_y"), size, rng), {}
+    return positive(TILT, size, rng), {}
 
 
-def _fixed(keys: tuple[str, ...], size: float) -> Draw:
-    return lambda site, j, f, rng: (spread(keys, f * size, rng), {})
+def _timed(draw: Draw, change: str = "") -> Draw:
+    """The values of a draw, and drawn after them when it changes, or how slowly it settles."""
 
+    def drawn(site: Site, j: int, f: float, rng: np.random.Generator) -> tuple[Values, Values]:
+        values, _ = draw(site, j, f, rng)
+        if not change:
+            return values, time_constant(rng)
+        return values, {change: float(rng.uniform(*CHANGE) * site.duration)}
 
-def _with(draw: Draw, more: Callable[[Site, np.random.Generator], Values]) -> Draw:
-    """The values of a draw, and settings drawn after them."""
-    return lambda site, j, f, rng: (draw(site, j, f, rng)[0], more(site, rng))
-
-
-def _changes(key: str) -> Callable[[Site, np.random.Generator], Values]:
-    return lambda site, rng: {key: float(rng.uniform(*CHANGE) * site.duration)}
-
-
-def _settles(site: Site, rng: np.random.Generator) -> Values:
-    return time_constant(rng)
+    return drawn
 
 
 _EVERY = at("joint", lambda s: s.joints)
 _AT_WORK = at("joint", lambda s: s.at_work)
 KINDS: dict[str, Kind] = {
-    "encoder_scale": Kind(_EVERY, _signed("encoder_scale", 1e-4), Hooks(move=_encoder_scale)),
+    "encoder_scale": Kind(
+        _EVERY,
+        _signed("encoder_scale", 1e-4),
+        Hooks(drive=lambda e, v: e.values["encoder_scale"] * v.q[:, e.index]),
+    ),
     "gear_eccentricity": Kind(
-        _EVERY, _pair("eccentricity", 1e-4), Hooks(move=_harmonic(1.0, "eccentricity"))
+        _EVERY, _of_gear(("eccentricity_sin", "eccentricity_cos"), 1e-4),
+        _harmonic(1.0, "eccentricity"),
     ),
     "gear_second_harmonic": Kind(
-        _EVERY, _pair("harmonic2", 5e-5), Hooks(move=_harmonic(2.0, "harmonic2"))
+        _EVERY, _of_gear(("harmonic2_sin", "harmonic2_cos"), 5e-5), _harmonic(2.0, "harmonic2")
     ),
-    "gear_ripple": Kind(_EVERY, _ripple, Hooks(move=_harmonic(np.nan, "ripple"))),
-    "wrist_coupling": Kind(only("wrist"), _wrist, Hooks(move=_wrist_coupling)),
+    "gear_ripple": Kind(_EVERY, _ripple, _harmonic(np.nan, "ripple")),
+    "wrist_coupling": Kind(only("wrist"), _of_gear(WRIST, 2e-4), Hooks(move=_wrist_coupling)),
     "backlash": Kind(
         _AT_WORK,
         lambda s, j, f, g: ({"backlash": f * s.spec.gear * 2e-4}, {}),
         Hooks(play=lambda e: {e.index: e.values["backlash"]}),
     ),
     "hysteresis": Kind(_EVERY, _hysteresis, Hooks(slack=_wind_up)),
-    "joint_hardening": Kind(_AT_WORK, _harder, Hooks(slack=_hardening)),
-    "off_axis_compliance": Kind(
-        _EVERY, _soft("off_axis_compliance_x", "off_axis_compliance_y"), Hooks(springs=_off_axis)
+    "joint_hardening": Kind(
+        _AT_WORK, _harder, Hooks(slack=lambda e, v, t: e.values["hardening"] * t[:, e.index] ** 3)
     ),
+    "off_axis_compliance": Kind(_EVERY, _soft(*OFF_AXIS), Hooks(springs=_off_axis)),
     "link_bending": Kind(
-        at("link", lambda s: s.long_links),
-        _soft("bending_y", "bending_z", "torsion"),
-        Hooks(springs=_link_bending),
+        at("link", lambda s: s.long_links), _soft(*BENDING), Hooks(springs=_link_bending)
     ),
     "base_compliance": Kind(only("base"), _tilting, Hooks(springs=_pedestal)),
     "gravity_compensator": Kind(compensators, _balance, Hooks(tendon=_compensator)),
@@ -346,21 +319,24 @@ KINDS: dict[str, Kind] = {
         Hooks(move=_thermal_expansion),
     ),
     "base_drift": Kind(
-        only("base"), _with(_pose("drift", 5e-5, 5e-5), _settles), Hooks(move=_base_drift)
+        only("base"), _timed(_pose("drift", 5e-5, 5e-5)),
+        Hooks(base=lambda e, v: np.outer(settled(v, e), e.vector(*_keys("drift")))),
     ),
-    "joint_drift": Kind(_EVERY, _with(_signed("drift", 1e-4), _settles), Hooks(move=_joint_drift)),
+    "joint_drift": Kind(
+        _EVERY, _timed(_signed("drift", 1e-4)),
+        Hooks(drive=lambda e, v: e.values["drift"] * settled(v, e)),
+    ),
     "encoder_jump": Kind(
-        _EVERY, _with(_signed("jump", 1e-4), _changes("jump_time_s")), Hooks(move=_encoder_jump)
+        _EVERY, _timed(_signed("jump", 1e-4), "jump_time_s"),
+        Hooks(drive=lambda e, v: e.values["jump"] * after(v, e, "jump_time_s")),
     ),
     "frame_jump": Kind(
-        only("tracker"),
-        _with(_pose("jump", 1e-4, 5e-5), _changes("jump_time_s")),
-        Hooks(move=_frame_jump),
+        only("tracker"), _timed(_pose("jump", 1e-4, 5e-5), "jump_time_s"),
+        Hooks(base=lambda e, v: np.outer(after(v, e, "jump_time_s"), e.vector(*_keys("jump")))),
     ),
     "marker_slip": Kind(
-        markers,
-        _with(_fixed(("slip_x", "slip_y", "slip_z"), 1.5e-4), _changes("slip_time_s")),
+        markers, _timed(lambda s, j, f, g: (spread(SLIP, f * 1.5e-4, g), {}), "slip_time_s"),
         Hooks(move=_marker_slip),
     ),
     "tracker_distortion": Kind(only("tracker"), _distortion, Hooks(see=_instrument)),
-}
+}  # fmt: skip

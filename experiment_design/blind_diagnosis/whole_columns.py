@@ -100,12 +100,8 @@ def components(world: World, visits: Visits, scene: Scene) -> dict[tuple[str, st
     out = {}
     for e in world.effects:
         if e.name in (LINES, LAST_MOVE):
-            lines = e.name == LINES
-            angle = gear_error(e, visits.q[:, e.index]) if lines else (
-                last_move(e, visits.approach[:, e.index])
-            )  # fmt: skip
-            moved = scene.joint[:, :, e.index] * angle[:, None]
-            out["angle" if lines else "move", e.where] = moved
+            family, error = ("angle", gear_error) if e.name == LINES else ("move", last_move)
+            out[family, e.where] = scene.joint[:, :, e.index] * error(e, visits)[:, None]
         elif e.name == WEIGHTS:
             sag = world.specimen.true.compliance * (scene.weighing @ moments(e))
             for j, angle in enumerate(sag.T):

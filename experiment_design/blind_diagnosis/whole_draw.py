@@ -27,16 +27,17 @@ from inside import POSE
 from instrument import draw_noise
 from places import Values, log_uniform
 from skeleton import Array, Skeleton
-from world import Effect, Hooks, Motion, Visits
+from world import Effect, Hooks, Visits
 
 # How the effects act, several at every joint.  Their names are not those of elastocal, which is
 # asked for sizes and causes here, not for a name.
 LINES, WEIGHTS, LAST_MOVE, CREEP = "gear_lines", "unknown_weights", "last_move", "slow_creep"
 
 
-def gear_error(e: Effect, q: Array) -> Array:
-    """Error (n,) rad of a gear at its joint's angle q (n,): lines of any order, each
+def gear_error(e: Effect, v: Visits) -> Array:
+    """Error (n,) rad of a gear at its joint's angle q: lines of any order, each
     a sin(order q) + b cos(order q)."""
+    q = v.q[:, e.index]
     error = np.zeros(len(q))
     for line, order in e.settings.items():
         a, b = e.vector(f"{line}_sin", f"{line}_cos")
@@ -44,9 +45,9 @@ def gear_error(e: Effect, q: Array) -> Array:
     return error
 
 
-def last_move(e: Effect, approach: Array) -> Array:
+def last_move(e: Effect, v: Visits) -> Array:
     """Where a joint stops (n,) rad: beyond its target, or before it, by the side it came from."""
-    return e.values["half_width"] * approach
+    return e.values["half_width"] * v.approach[:, e.index]
 
 
 def creep(e: Effect, time: Array) -> Array:
@@ -61,29 +62,12 @@ def creep(e: Effect, time: Array) -> Array:
     return moved
 
 
-def _gear_moves(e: Effect, v: Visits, m: Motion) -> None:
-    m.drive[:, e.index] += gear_error(e, v.q[:, e.index])
-
-
-def _last_moves(e: Effect, v: Visits, m: Motion) -> None:
-    m.drive[:, e.index] += last_move(e, v.approach[:, e.index])
-
-
-def _creep_moves(e: Effect, v: Visits, m: Motion) -> None:
-    m.base += creep(e, v.time)
-
-
 def weights(e: Effect) -> tuple[Array, Array]:
     """Masses (J,) kg of the links and their centres (J, 3) m in the joints' frames."""
     J = len(e.values) // 4
     masses = e.vector(*[f"mass{j + 1}" for j in range(J)])
     centres = [e.vector(*[f"com{j + 1}_{axis}" for axis in "xyz"]) for j in range(J)]
     return masses, np.array(centres)
-
-
-def _weigh(e: Effect, skeleton: Skeleton) -> Skeleton:
-    masses, centres = weights(e)
-    return replace(skeleton, mass=masses, com=centres)
 
 
 @dataclass(frozen=True)
@@ -179,12 +163,12 @@ def _gear(spec: ArmSpec, j: int, rng: np.random.Generator) -> Effect:
             settings[f"line{multiple}"] = multiple * first
             values |= _line(f"line{multiple}", amplitude, rng)
         amplitude *= rng.uniform(*RANGES.next_line)
-    return Effect(LINES, f"joint{j + 1}", values, settings, hooks=Hooks(move=_gear_moves))
+    return Effect(LINES, f"joint{j + 1}", values, settings, hooks=Hooks(drive=gear_error))
 
 
 def _last_move(spec: ArmSpec, j: int, rng: np.random.Generator) -> Effect:
     half = {"half_width": spec.gear * log_uniform(RANGES.half_width, rng)}
-    return Effect(LAST_MOVE, f"joint{j + 1}", half, hooks=Hooks(move=_last_moves))
+    return Effect(LAST_MOVE, f"joint{j + 1}", half, hooks=Hooks(drive=last_move))
 
 
 def _weights(spec: ArmSpec, rng: np.random.Generator) -> Effect:
@@ -193,7 +177,12 @@ def _weights(spec: ArmSpec, rng: np.random.Generator) -> Effect:
         moved = centre + rng.normal(0.0, RANGES.centre * spec.reach, 3)
         values[f"mass{j + 1}"] = float(mass) * log_uniform(RANGES.mass, rng)
         values |= {f"com{j + 1}_{axis}": float(c) for axis, c in zip("xyz", moved, strict=True)}
-    return Effect(WEIGHTS, "all", values, hooks=Hooks(weigh=_weigh))
+
+    def weigh(e: Effect, skeleton: Skeleton) -> Skeleton:
+        masses, centres = weights(e)
+        return replace(skeleton, mass=masses, com=centres)
+
+    return Effect(WEIGHTS, "all", values, hooks=Hooks(weigh=weigh))
 
 
 def _creep(rng: np.random.Generator) -> Effect:
@@ -207,4 +196,4 @@ def _creep(rng: np.random.Generator) -> Effect:
             values |= {f"{axis}_{name}{k}": float(a) for k, a in enumerate(drawn)}
     settings = {f"frequency{k}": float(w) for k, w in enumerate(frequencies)}
     settings["length_s"] = length
-    return Effect(CREEP, "base", values, settings, hooks=Hooks(move=_creep_moves))
+    return Effect(CREEP, "base", values, settings, hooks=Hooks(base=lambda e, v: creep(e, v.time)))

@@ -73,15 +73,18 @@ class Sight:
 class Hooks:
     """How one kind of effect acts; each part is optional.
 
-    move: rigid changes before loading.  springs: more elastic freedom.  tendon: a spring across a
-    joint.  slack: adds to θ_free (n, H) of springs at load τ (n, H).  play: spring → dead zone.
-    weigh: changes the arm's masses.  see: changes what is reported.
+    drive: what its joint's drive errs by, (n,) rad.  base: what the base moves by, (n, 6).  move:
+    other rigid changes before loading.  springs: more elastic freedom.  tendon: a spring across a
+    joint.  slack: what it adds to θ_free (n,) of its joint's spring at load τ (n, H).  play: spring
+    → dead zone.  weigh: changes the arm's masses.  see: changes what is reported.
     """
 
+    drive: Callable[[Effect, Visits], Array] | None = None
+    base: Callable[[Effect, Visits], Array] | None = None
     move: Callable[[Effect, Visits, Motion], None] | None = None
     springs: Callable[[Effect, TrueArm], list[Spring]] | None = None
     tendon: Callable[[Effect], Tendon] | None = None
-    slack: Callable[[Effect, Visits, Array, Array], None] | None = None
+    slack: Callable[[Effect, Visits, Array], Array] | None = None
     play: Callable[[Effect], dict[int, float]] | None = None
     weigh: Callable[[Effect, Skeleton], Skeleton] | None = None
     see: Callable[[Effect, TrueArm, Visits, Sight], None] | None = None
@@ -151,7 +154,7 @@ class Physics:
             free = np.zeros_like(load)
             for effect in self.effects:
                 if effect.hooks.slack:
-                    effect.hooks.slack(effect, visits, load, free)
+                    free[:, effect.index] += effect.hooks.slack(effect, visits, load)
             return free
 
         play: dict[int, float] = {}
@@ -181,8 +184,13 @@ class Physics:
             np.tile(self.arm.hook, (n, 1)),
         )  # fmt: skip
         for effect in self.effects:
-            if effect.hooks.move:
-                effect.hooks.move(effect, visits, motion)
+            hooks = effect.hooks
+            if hooks.drive:
+                motion.drive[:, effect.index] += hooks.drive(effect, visits)
+            if hooks.base:
+                motion.base += hooks.base(effect, visits)
+            if hooks.move:
+                hooks.move(effect, visits, motion)
         return motion
 
     def _placement(self, motion: Motion) -> Placement:
