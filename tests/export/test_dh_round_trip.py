@@ -15,7 +15,7 @@ from support.cells import nominal_flanges
 from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, write_result
 from support.robots import packaged_urdf, random_chain_urdf
 
-from elastocal.export.rigid_files import NEARLY_PARALLEL, split
+from elastocal.export.rigid_files import NEARLY_PARALLEL, split, transform
 from elastocal.model.dh import read_dh
 
 CONVENTIONS = {"dh": "standard", "mdh": "modified"}
@@ -92,13 +92,13 @@ def test_a_link_is_its_row_and_a_remainder_about_the_next_axis(
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), shift
     row, rest = split(T)
-    assert np.abs(row.transform() @ rest - T).max() < 1e-12
+    assert np.abs(transform(row) @ rest - T).max() < 1e-12
     away = rest.copy()
     away[:2, :2], away[2, 3] = np.eye(2), 0.0
     tilted = np.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
-    if not tilted and row.a == 0.0:  # a common normal below 1e-12 m counts as none
+    if not tilted and row[2] == 0.0:  # a common normal below 1e-12 m counts as none
         assert np.abs(away[:2, 3]).max() < 1e-12
         away[:2, 3] = 0.0
     # The foot of nearly parallel lines' common normal carries rounding over their angle.
     assert np.abs(away - np.eye(4)).max() < (1e-12 if tilted else 1e-13)
-    assert tilted == (row.beta == 0.0) or row.beta == 0.0
+    assert tilted == (row[4] == 0.0) or row[4] == 0.0

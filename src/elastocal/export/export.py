@@ -525,8 +525,8 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
         f"{_note(calibrated, kept)}; {convention} convention: {rigid_files.FORMULA[convention]}",
         f"rounding of this table: {apart * 1e6:.2g} um at the flange",
     ]
-    if any(row.beta for _, _, row in lines):
-        four = [(name, joint, replace(row, beta=0.0)) for name, joint, row in lines]
+    if any(row[4] for _, _, row in lines):
+        four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
         beta = checked(rigid_files.dh_csv(four), largest=np.inf)
         comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
     text = rigid_files.dh_csv(lines, comments)

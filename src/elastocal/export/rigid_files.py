@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -256,8 +255,6 @@ def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Ar
     return np.array(found)
 
 
-# The calibrated arm as a Denavit–Hartenberg table, standard or modified.
-
 # A link between two joint axes as Denavit–Hartenberg parameters.
 #
 # Every rigid transform between two frames whose z are joint axes is
@@ -273,70 +270,61 @@ def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Ar
 # smallest error, a/α away; Hayati's parameter keeps it in place.
 NEARLY_PARALLEL = 0.02
 ARE_ANGLES = np.array([1, 0, 0, 1, 1])
+NO_ROW = np.zeros(5)  # a row is θ, d, a, α and Hayati's β, in rad and m
 
 
-@dataclass(frozen=True)
-class DhRow:
-    """θ, d, a, α and Hayati's β of one row, in rad and m."""
-
-    theta: float = 0.0
-    d: float = 0.0
-    a: float = 0.0
-    alpha: float = 0.0
-    beta: float = 0.0
-
-    def trailing(self) -> Array:
-        """Tx(a) Rx(α) Ry(β) (4, 4)."""
-        return dh.shift(dh.X, self.a) @ dh.turn(dh.X, self.alpha) @ dh.turn(dh.Y, self.beta)
-
-    def transform(self) -> Array:
-        return dh.turn(dh.Z, self.theta) @ dh.shift(dh.Z, self.d) @ self.trailing()
-
-    def near(self, other: DhRow, tolerance: float = 1e-12) -> DhRow:
-        """This row with the other's number wherever the two agree to rounding."""
-        mine, theirs = np.array(astuple(self)), np.array(astuple(other))
-        return DhRow(*np.where(np.abs(mine - theirs) < tolerance, theirs, mine).tolist())
-
-    def turned_as(self, other: DhRow) -> DhRow:
-        mine, theirs = np.array(astuple(self)), np.array(astuple(other))
-        turns = np.round((theirs - mine) / (2 * np.pi)) * ARE_ANGLES
-        return DhRow(*(mine + 2 * np.pi * turns).tolist())
+def trailing(row: Array) -> Array:
+    """Tx(a) Rx(α) Ry(β) (4, 4)."""
+    _, _, a, alpha, beta = row.tolist()
+    return dh.shift(dh.X, a) @ dh.turn(dh.X, alpha) @ dh.turn(dh.Y, beta)
 
 
-def split(T: Array, near: DhRow | None = None, height: float = 0.0) -> tuple[DhRow, Array]:
+def transform(row: Array) -> Array:
+    return dh.turn(dh.Z, float(row[0])) @ dh.shift(dh.Z, float(row[1])) @ trailing(row)
+
+
+def turned_as(row: Array, other: Array) -> Array:
+    return row + 2 * np.pi * np.round((other - row) / (2 * np.pi)) * ARE_ANGLES
+
+
+def near(row: Array, other: Array, tolerance: float = 1e-12) -> Array:
+    """The row with the other's number wherever the two agree to rounding."""
+    return np.where(np.abs(row - other) < tolerance, other, row)
+
+
+def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Array, Array]:
     """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.
 
-    (θ, a, α) and (θ ± π, −a, −α) say the same: taken is the one closer to `near`, else the one
-    with the smaller θ.  Turns of `near` beyond π are kept.  Of nearly parallel axes d is that of
-    `near`, else `height`.
+    (θ, a, α) and (θ ± π, −a, −α) say the same: taken is the one closer to `like`, else the one
+    with the smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of
+    `like`, else `height`.
     """
     skew = math.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
-    height = height if near is None else near.d
-    alike = 0.0 if near is None else near.theta
+    alike, height = (0.0, height) if like is None else like[:2].tolist()
     ways = [_skew(T, s) if skew else _parallel(T, s, height, alike) for s in (1.0, -1.0)]
 
-    def away(row: DhRow) -> float:
-        if near is None:
-            return abs(row.theta) - 1e-9 * row.a
-        turn = [1 - math.cos(x - y) for x, y in ((row.theta, near.theta), (row.alpha, near.alpha))]
-        return sum(turn) + abs(row.a - near.a)
+    def away(row: Array) -> float:
+        if like is None:
+            return float(abs(row[0]) - 1e-9 * row[2])
+        turns = 1 - np.cos(row[[0, 3]] - like[[0, 3]])
+        return float(turns.sum() + abs(row[2] - like[2]))
 
     row = min(ways, key=away)
-    row = row if near is None else row.turned_as(near)
-    return row, np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
+    row = row if like is None else turned_as(row, like)
+    return row, np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)
 
 
-def _skew(T: Array, sign: float) -> DhRow:
+def _skew(T: Array, sign: float) -> Array:
     z, p = T[:3, 2], T[:3, 3]
     theta = math.atan2(sign * z[0], -sign * z[1])
     x = np.array([math.cos(theta), math.sin(theta), 0.0])
     alpha = math.atan2(sign * math.hypot(z[0], z[1]), z[2])
     # p = d·z₀ + a·x + h·z: the common normal meets both axes.
     d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
-    return DhRow(theta, float(d), float(a), alpha)
+    return np.array([theta, d, a, alpha, 0.0])
 
 
-def _parallel(T: Array, sign: float, d: float, alike: float) -> DhRow:
+def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
     z, p = T[:3, 2], T[:3, 3]
     foot = p - (p[2] - d) / z[2] * z  # where the second axis passes through the height d
     a = sign * math.hypot(foot[0], foot[1])
@@ -348,7 +336,7 @@ def _parallel(T: Array, sign: float, d: float, alike: float) -> DhRow:
     u = (c * z[0] + s * z[1], -s * z[0] + c * z[1], z[2])
     alpha = math.atan2(-u[1], u[2])
     beta = math.atan2(u[0], math.hypot(u[1], u[2]))
-    return DhRow(theta, d, a, alpha, beta)
+    return np.array([theta, d, a, alpha, beta])
 
 
 # The calibrated arm as a Denavit–Hartenberg table, standard or modified.
@@ -370,7 +358,7 @@ ZERO = 1e-14  # m or rad; rounding of a product of rotations
 
 
 # One row of the table: its name, its joint, None for a fixed one, and its numbers.
-Line = tuple[str, Joint | None, DhRow]
+Line = tuple[str, Joint | None, Array]
 
 
 def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> list[Line]:
@@ -378,20 +366,19 @@ def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> lis
     nominal = pieces.chain
     like = _nominal_rows(robot, nominal, convention)
     ideal = [
-        row if own is None else row.near(own)
+        row if own is None else near(row, own)
         for row, own in zip(_decompose(nominal, like)[0], like, strict=True)
     ]
     rows, F = _decompose(pieces.calibrated_chain(), ideal, keep_last=True)
     end, last = split(F)
-    rest = DhRow(theta=math.atan2(last[1, 0], last[0, 0]), d=float(last[2, 3]))
-    rows = [*(row.near(old) for row, old in zip(rows, ideal, strict=True)), end, rest]
+    rest = np.array([math.atan2(last[1, 0], last[0, 0]), last[2, 3], 0.0, 0.0, 0.0])
+    every = np.array([*(near(row, old) for row, old in zip(rows, ideal, strict=True)), end, rest])
     if convention == "modified":
-        pairs = zip(rows, [DhRow(), *rows[:-1]], strict=True)
-        rows = [replace(before, theta=row.theta, d=row.d) for row, before in pairs]
-    rows = [row.near(DhRow(), ZERO) for row in rows]
+        every[:, 2:] = np.vstack([NO_ROW, every[:-1]])[:, 2:]
+    every = near(every, NO_ROW, ZERO)
     names = ["base", *(joint.name for joint in nominal.joints), "flange1", "flange2"]
-    lines = zip(names, [None, *nominal.joints, None, None], rows, strict=True)
-    return [line for line in lines if line[1] is not None or line[2] != DhRow()]
+    lines = zip(names, [None, *nominal.joints, None, None], every, strict=True)
+    return [line for line in lines if line[1] is not None or line[2].any()]
 
 
 FORMULA = {
@@ -408,7 +395,7 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     """
     found = []
     for name, joint, row in lines:
-        numbers = zip(HEADER[2:], astuple(row), strict=True)
+        numbers = zip(HEADER[2:], row.tolist(), strict=True)
         cells = {header: repr(value + 0.0) for header, value in numbers}
         if joint is not None:
             ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
@@ -417,14 +404,14 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
         found.append(cells | dict(zip(HEADER[:2], (name, kind), strict=True)))
     bounded = {name for cells in found for name in cells}
     limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
-    with_beta = any(row.beta for _, _, row in lines)
+    with_beta = any(row[4] for _, _, row in lines)
     header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
     return csv_text(header, ([cells.get(name, "") for name in header] for cells in found), comments)
 
 
 def _decompose(
-    chain: Chain, like: Sequence[DhRow | None], keep_last: bool = False
-) -> tuple[list[DhRow], Array]:
+    chain: Chain, like: Sequence[Array | None], keep_last: bool = False
+) -> tuple[list[Array], Array]:
     """Rows 0 … n of a chain and its flange in the last row's frame, near the rows `like`.
 
     `keep_last`: the last row changes in θ and d alone, the rest is the flange's.  Its z is often
@@ -436,39 +423,38 @@ def _decompose(
         turned[-1][:3, :3] = np.column_stack([*transverse_axes(joint.axis), joint.axis])
     ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
     starts = [np.eye(4), *turned]
-    rows: list[DhRow] = []
+    rows: list[Array] = []
     carried: Array = np.eye(4)
     for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
         last = i == chain.n_joints
         T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
-        near = like[i]
-        if last and keep_last and near is not None:
+        old = like[i]
+        if last and keep_last and old is not None:
             # The turn about and the shift along the axis that bring it closest to T.
-            R = T[:3, :3] @ near.trailing()[:3, :3].T
+            R = T[:3, :3] @ trailing(old)[:3, :3].T
             theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
-            row = replace(near, theta=theta, d=float(T[2, 3])).turned_as(near)
-            carried = np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
+            row = turned_as(np.array([theta, T[2, 3], *old[2:]]), old)
+            carried = np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)
         else:
-            row, carried = split(T, near, height=float(T[2, 3]) if last else 0.0)
+            row, carried = split(T, old, height=float(T[2, 3]) if last else 0.0)
         rows.append(row)
     return rows, carried
 
 
-def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> Sequence[DhRow | None]:
+def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> Sequence[Array | None]:
     """What the user's own table says of links 0 … n; None where it is in another convention."""
-    nothing: list[DhRow | None] = [None] * (chain.n_joints + 1)
+    unknown = [None] * (chain.n_joints + 1)
     if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in UR_ENDINGS:
-        return nothing
+        return unknown
     table = dh.read_dh_table(robot.dh)
     n = len(table.row)
     # Rows without a joint, joints against z and frames slid along their axes are not rows of ours.
     if n != chain.n_joints or chain.notes or any(joint.axis[2] < 0 for joint in chain.joints):
-        return nothing
+        return unknown
     stems = ("theta0", "d", "a", "alpha", "beta")
     keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
-    numbers = np.nan_to_num([[dh.dh_number(table, i, *key) for key in keys] for i in range(n)])
-    own = [DhRow(), *(DhRow(*row) for row in numbers.tolist())]
-    if convention == "standard":
-        return own
-    pairs = zip(own, [*own[1:], DhRow()], strict=True)  # θ and d of one, the rest of the next
-    return [replace(after, theta=row.theta, d=row.d) for row, after in pairs]
+    numbers = [[dh.dh_number(table, i, *key) for key in keys] for i in range(n)]
+    own = np.vstack([NO_ROW, np.nan_to_num(numbers)])
+    if convention == "modified":  # θ and d of one, the rest of the next
+        own[:, 2:] = np.vstack([own[1:], NO_ROW])[:, 2:]
+    return list(own)
