@@ -1,6 +1,7 @@
 """`import elastocal as ec`: its names, what they cost, and the day's work from plan to commands."""
 
 import ast
+import csv
 import inspect
 import json
 import pickle
@@ -165,6 +166,16 @@ def test_a_plan_saves_itself_and_is_simulated_as_its_file_is(plan, model):
     assert np.array_equal(read.q, direct.q) and np.array_equal(read.force, direct.force)
     assert read.configuration_labels == direct.configuration_labels
     assert list(plan.to_dataframe()["configuration"]) == ["1", "2", "3", "4"]
+
+
+def test_a_plan_of_several_loads_states_those_of_each_row_as_they_were_asked_for(model, tmp_path):
+    loads = [[0.0, 0.0, -2600.0], [0.0, 900.0, 0.0]]
+    ec.design(model, poses=5, criterion="D", loads=loads, levels={"joint2": [-0.44, -1.74]},
+              candidates=30, effort="quick").save(tmp_path / "plan.csv")  # fmt: skip
+    with (tmp_path / "plan.csv").open() as file:
+        rows = [row for row in csv.DictReader(file)]
+    stated = {tuple(float(row[f"force_{axis}_N"]) for axis in "xyz") for row in rows}
+    assert stated == {(0.0, 0.0, 0.0), *map(tuple, loads)}  # deflections need both
 
 
 def test_design_is_that_of_the_command_line(plan):

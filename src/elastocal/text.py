@@ -114,12 +114,12 @@ def cell_meaning(cell: str) -> str:
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
-# The minus signs of text programs at the beginning of a number, in UTF-8: −, –, －.
-_MINUS = re.compile(rb'(^|[,;\t"][ \t"]*)(?:\xe2\x88\x92|\xe2\x80\x93|\xef\xbc\x8d)(?=[\d.,])')
+# The minus signs of text programs at the beginning of a number.
+_MINUS = re.compile(r"^([ \t]*)[−–－](?=[\d.,])")
 
 
-def plain_minus(line: bytes) -> bytes:
-    return line if line.isascii() else _MINUS.sub(rb"\1-", line)
+def plain_minus(cell: str) -> str:
+    return cell if cell.isascii() else _MINUS.sub(r"\1-", cell)
 
 
 def plain(value: Any) -> Any:

@@ -10,8 +10,12 @@ from scipy.stats import multivariate_normal
 from support.diagnosis_data import campaign
 from support.noisy_data import dense_noise, random_data, used_rows
 
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.component_search import _component
 from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum, posed
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
@@ -101,3 +105,15 @@ def test_a_compliance_below_zero_is_no_cause() -> None:
     assert positive.score - either.score == pytest.approx(np.log(2), abs=1e-6)
     assert positive.earned[0] - either.earned[0] == pytest.approx(np.log(2), abs=1e-6)
     assert negative.components and not none.components
+
+
+def test_what_was_found_at_settings_of_its_own_costs_its_search() -> None:
+    """As many nats as there are values that it could have had."""
+    model, table = campaign("gear_eccentricity:joint4", n=20)
+    base, hypotheses = fit_baseline(model, table), possible(model, table)[0]
+    h = next(h for h in hypotheses if h.key == ("gear_ripple", "joint5"))
+    dataset = diagnosis_data_of(base, [h])
+    grid = dataset.grids[h.key]
+    k = int(np.argmin(grid.log_prior))
+    found = _component(dataset, Item(h, grid.values[k], 0.0))
+    assert found.search == -grid.log_prior[k] > np.log(10)
