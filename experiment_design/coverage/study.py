@@ -70,7 +70,7 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
         found[METHODS.index(method)] = np.column_stack([x, std, np.broadcast_to(dof, p)])
 
     readings = s.readings(e)
-    noise = settle(readings, good=majority(readings.B, readings.e)[0]).noise
+    noise = settle(readings, good=majority(readings.B, readings.e)[0])[0]
     put("default", noise.x, noise.covariance.std, noise.covariance.dof)
     put("oracle", *s.oracle(e, clean), np.inf)
     plain = ols(B, e)

@@ -88,9 +88,9 @@ def test_an_effect_that_the_parameters_explain_is_left_out():
 @pytest.mark.parametrize("kind", ["auto", "groups+configuration", "polar+configuration", "stated"])
 def test_perfect_data_have_next_to_no_noise(kind):
     r = readings(replace(BASE, configurations=9), 0)
-    found = settle(r.moved(0 * r.e), kind)
-    assert found.good.all() and not found.noise.x.any()
-    assert found.noise.covariance.std.max() < 1e-30
+    found, good = settle(r.moved(0 * r.e), kind)
+    assert good.all() and not found.x.any()
+    assert found.covariance.std.max() < 1e-30
 
 
 # Which readings are judged to be faulty.
@@ -144,7 +144,7 @@ def test_false_alarms_on_clean_tables_are_as_rare_as_stated(kind):
     r = table(1, configurations=10, repeats=3, unbalanced=False)
     tables = 120 if kind == "independent" else 15
     for _ in range(tables):
-        alarms += not settle(r.moved(1e-5 * rng.normal(size=r.e.shape)), kind).good.all()
+        alarms += not settle(r.moved(1e-5 * rng.normal(size=r.e.shape)), kind)[1].all()
     assert alarms <= stats.binom.ppf(0.9999, tables, FALSE_ALARM)
 
 
@@ -156,7 +156,7 @@ def test_gross_errors_are_found_and_nothing_else(kind):
         e = 1e-5 * rng.normal(size=r.e.shape)
         e[bad, rng.integers(3, size=3)] += 1e-3
         start = majority(r.B, e)[0] if kind == "auto" else None
-        assert set(np.flatnonzero(~settle(r.moved(e), kind, start).good)) == set(bad)
+        assert set(np.flatnonzero(~settle(r.moved(e), kind, start)[1])) == set(bad)
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.4, False), (0.6, True)])
@@ -166,4 +166,4 @@ def test_more_than_half_are_never_excluded(monkeypatch, share, kept):
     faulty = np.arange(len(r)) < share * len(r)
     judge = "elastocal.identification.outliers.unexplained_readings"
     monkeypatch.setattr(judge, lambda *_: faulty)
-    assert settle(r, "independent").good.all() == kept
+    assert settle(r, "independent")[1].all() == kept

@@ -17,13 +17,12 @@ from elastocal.identification.covariance import (
     Covariance,
     cluster_robust,
     clustered,
-    of_rows,
     orthogonal,
 )
 
 
 def hc(B, e, kind):
-    return of_rows(cluster_robust(B, e, np.arange(len(e)), f"CR{kind[2]}"), len(e), kind)
+    return cluster_robust(B, e, np.arange(len(e)), kind)
 
 
 def residual(B, y):

@@ -57,7 +57,7 @@ def test_the_study_estimates_what_the_tool_does():
     result = identify(model, replace(table, position=position), Options())
     readings = setting.readings(e)
     # The tool knows the tracker of the cell, which stands elsewhere than the study's.
-    noise = study.settle(replace(readings, sight=None, reach=None)).noise
+    noise = study.settle(replace(readings, sight=None, reach=None))[0]
     std = noise.covariance.std
     for k, name in enumerate(setting.names):
         estimate = result[name]

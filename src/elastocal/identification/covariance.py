@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from elastocal.units import Array, IntArray
 
 # An estimated covariance of a fit, and the t intervals that follow from it.
 
+LEVEL = 0.95
+
 
 @dataclass(frozen=True)
 class Covariance:
@@ -24,7 +26,8 @@ class Covariance:
     is known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval
     of a combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers
     to Cx.  `among`: where it is the mean of covariances under several models, their weights and
-    matrices; `dof` then is that of `tails`.
+    matrices; `dof` then is that of `tails`.  `ends` (p, 2): the 95 % intervals where they are not
+    those of t.
     """
 
     kind: str
@@ -32,6 +35,7 @@ class Covariance:
     dof: Array
     description: str
     among: tuple[tuple[float, Array], ...] = ()
+    ends: Array | None = None
 
     @property
     def std(self) -> Array:
@@ -59,9 +63,11 @@ class Covariance:
         parts = (w * (variance_of(rows, matrix) / v - 1) ** 2 / 2 for w, matrix in self.among)
         return sum(parts, np.zeros(len(v)))
 
-    def interval(self, x: Array, level: float = 0.95) -> Array:
+    def interval(self, x: Array, level: float = LEVEL) -> Array:
         """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,); std_j by the
-        share of `tails`."""
+        share of `tails`.  At 95 % the `ends` where there are any."""
+        if self.ends is not None and level == LEVEL:
+            return self.ends
         share = self.tails(np.eye(len(x))[:, None])[1] if self.among else 1.0
         half = t_quantile(level, self.dof) * self.std * np.sqrt(share)
         return np.column_stack([x - half, x + half])
@@ -166,11 +172,15 @@ ALONE = 1e-9  # 1 − leverage below which a cluster is fitted exactly, whatever
 ENTRIES = 2**22  # of a temporary array, 32 MB
 DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
 
-CLUSTER_DESCRIPTION = {
+DESCRIPTION = {
     "CR0": "uncorrected (biased low with few clusters)",
     "CR1": "corrected by G/(G − 1) · (n − 1)/(n − p)",
     "CR2": "bias-reduced, unbiased under the working model",
     "CR3": "nearly the jackknife over clusters",
+    "HC0": "e² as it is (biased low in small samples)",
+    "HC1": "e² · n/(n − p)",
+    "HC2": "e²/(1 − h), unbiased under equal variances",
+    "HC3": "e²/(1 − h)², nearly the jackknife",
 }
 
 
@@ -196,7 +206,8 @@ def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> 
 
 
 def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
-    """The same of rows that come in parts, Q = B V with V Vᵀ = (BᵀB)⁻¹.
+    """The same of rows that come in parts, Q = B V with V Vᵀ = (BᵀB)⁻¹; HC0 to HC3 are the CR where
+    every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
 
     Degrees of freedom by Satterthwaite for every kind, each for its own A_c (Pustejovsky & Tipton
     2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero over the clusters, and far
@@ -226,20 +237,24 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
             "a cluster-robust covariance compares clusters, but all rows are in one;"
             " measure more configurations, or use a covariance of independent rows (HC3)"
         )
-    if lone and kind == "CR3":
+    of_rows, number = kind[0] == "H", kind[-1]
+    if lone and number == "3":
         what, left = ("row", "HC") if n == G else ("cluster", "CR")
         raise InsufficientDataError(
             f"{what} {lone[0]} alone determines a combination of the parameters: leaving it out, "
             f"as {left}3 does, leaves no answer; fit fewer parameters or use {left}2"
         )
-    if kind == "CR1":
+    if number == "1":
         meat *= G / (G - 1) * (n - 1) / (n - p)
-    text = f"rows correlated within {G} clusters, {CLUSTER_DESCRIPTION[kind]}"
-    if alone.any():
+    what = "each row its own variance" if of_rows else f"rows correlated within {G} clusters"
+    text = f"{what}, {DESCRIPTION[kind]}"
+    if alone.any() and not of_rows:
         text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
     square = square + (outer**2).sum(axis=(1, 2))
     told = (trace > 1e-9 * size) & (square > 0) & ~alone  # the residual says something of it
     dof = np.where(told, trace**2 / np.where(told, square, 1.0), 0.0)
+    if kind in ("HC0", "HC1"):
+        dof = np.full(p, float(n - p))
     return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
 
 
@@ -248,24 +263,6 @@ def _blocks(cluster: IntArray, columns: int) -> Iterator[IntArray]:
     for rows in same_size(cluster):
         numbers = len(rows) * columns * max(rows.shape[1], columns)
         yield from np.array_split(rows, -(-numbers // ENTRIES))
-
-
-ROW_DESCRIPTION = {
-    "HC0": "each row its own variance, e² as it is (biased low in small samples)",
-    "HC1": "each row its own variance, e² · n/(n − p)",
-    "HC2": "each row its own variance, e²/(1 − h), unbiased under equal variances",
-    "HC3": "each row its own variance, e²/(1 − h)², nearly the jackknife",
-}
-
-
-def of_rows(found: Covariance, n: int, kind: str) -> Covariance:
-    """HC of n independent rows, each of its own variance: the CR where every row is a cluster.
-
-    Degrees of freedom are n − p for HC0 and HC1.
-    """
-    plain, p = kind in ("HC0", "HC1"), len(found.dof)
-    dof = np.full(p, float(n - p)) if plain else found.dof
-    return replace(found, kind=kind, dof=dof, description=ROW_DESCRIPTION[kind])
 
 
 def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
@@ -279,9 +276,9 @@ def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
     gap = 1 - values
     single = gap < ALONE
     determined = np.asarray(single.any(axis=1))
-    if kind in ("CR0", "CR1"):
+    if kind[-1] in "01":
         return Qc, determined
-    power = np.where(single, 1.0, gap) ** (-0.5 if kind == "CR2" else -1.0)
+    power = np.where(single, 1.0, gap) ** (-0.5 if kind[-1] == "2" else -1.0)
     A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
     return (A @ Qc if by_row else Qc @ A), determined
 

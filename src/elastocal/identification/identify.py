@@ -211,16 +211,16 @@ def summarise(
     `every` holds all readings, `sound` the fit to those that agree; `faulty` are those beyond the
     noise.  `new_poses`: where the arm will be used, by default the workspace.
     """
-    solution, final = found.solution, found.solution.fit
-    kept = solution.reduction.kept
+    solution, final, covariance = found.solution, found.solution.fit, found.spread.matrix
+    kept, observed, weights = (
+        solution.reduction.kept, solution.problem.observations, solution.problem.weights
+    )  # fmt: skip
     spent = len(kept) if found.effective is None else found.effective
     sigma = residual_sigma(final, spent)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
     estimates, combinations = _estimates(model, solution, found, left_out)
     determined = tuple(model.names[c] for c in kept)
-    observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
-    covariance = found.intervals.covariance.matrix
     leverage = found.leverage  # None of a large table
     if leverage is None and not solution.problem.large:
         leverage = solution.leverage
@@ -229,45 +229,23 @@ def summarise(
         fitted = found.solution if set_apart or found.smooth else sound
         report = report_faulty(every, fitted, found.noise, found.good, found.standard)
     result = Calibration(
-        model=model,
-        method=found.method,
-        noise=noise_of(found, sigma),
-        estimates=estimates,
-        combinations=combinations,
-        x=final.x,
-        determined=determined,
-        spread=found.intervals.covariance,
+        model=model, method=found.method, noise=noise_of(found, sigma), weights=weights,
+        noise_parts=noise_parts(found), estimates=estimates, combinations=combinations, x=final.x,
+        determined=determined, spread=found.spread,
         correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
-        observations=observed,
-        residual=final.residual,
-        held_out=solution.heldout,
-        sigma=sigma,
-        dof=len(final.whitened) - spent,
-        residual_rms=rms_3d(final.residual, observed.size),
-        heldout_rms=rms_3d(solution.heldout, observed.size),
-        nominal_rms=solution.nominal_rms,
-        converged=final.converged,
-        reason=final.reason,
-        outliers=() if set_apart else faulty,
-        excluded=faulty if set_apart else (),
-        warnings=(),
+        observations=observed, residual=final.residual, held_out=solution.heldout, sigma=sigma,
+        dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
+        heldout_rms=rms_3d(solution.heldout, observed.size), nominal_rms=solution.nominal_rms,
+        converged=final.converged, reason=final.reason, outliers=() if set_apart else faulty,
+        excluded=faulty if set_apart else (), warnings=(),
         residual_summary=summarise_residuals(
-            observed,
-            final.whitened,
-            leverage,
-            solution.problem.weights.apply(solution.heldout),
-            absolute=solution.problem.weights.absolute,
+            observed, final.whitened, leverage, weights.apply(solution.heldout),
+            absolute=weights.absolute,
         ),
-        faulty_report=report,
-        active=found.active,
-        prior_share=found.prior_share,
-        smooth=found.smooth,
-        left=left_open(solution, found.limits),
-        copies=copies,
-        weights=solution.problem.weights,
-        noise_parts=noise_parts(found),
+        faulty_report=report, active=found.active, prior_share=found.prior_share,
+        smooth=found.smooth, left=left_open(solution, found.limits), copies=copies,
         shown=_shown(solution, covariance, leverage),
-    )
+    )  # fmt: skip
     poses = new_poses or over_the_workspace(model.cell, model, observed.table)
     return _judged(result, found, poses, every.problem.observations.table)
 
@@ -331,9 +309,9 @@ def _shown(solution: Solution, covariance: Array, leverage: Array | None) -> Sho
 def _estimates(
     model: Model, solution: Solution, method: MethodResult, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
-    reduction, x, intervals = solution.reduction, solution.fit.x, method.intervals
-    std, dof = intervals.covariance.std, intervals.covariance.dof
-    bends = bent(solution, intervals.covariance.matrix)
+    reduction, x, every_end = solution.reduction, solution.fit.x, method.ci95
+    std, dof = method.spread.std, method.spread.dof
+    bends = bent(solution, method.spread.matrix)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
@@ -346,7 +324,7 @@ def _estimates(
         parameter = model.parameters[c]
         terms = reduction.terms(k, solution.sizes, std[k])
         value = float(x[c])
-        ends = intervals.ci95[k]
+        ends = every_end[k]
         spread, ci = reduction.widened(k, solution.sizes, std[k], value, ends, bends[k])
         for d in terms:
             partners[d].append(parameter.name)

@@ -11,7 +11,7 @@ from scipy import linalg, sparse, special
 
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification import published
-from elastocal.identification.covariance import Covariance, t_quantile
+from elastocal.identification.covariance import LEVEL, Covariance, t_quantile
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.knowledge import Constraints, GaussianPrior
 from elastocal.identification.least_squares import Fit, KnownFit, PriorRows, Problem, profile_end
@@ -25,15 +25,13 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.options import (
-    LEVEL,
     ROBUST,
     FunctionPrior,
-    Intervals,
     MethodResult,
     Options,
-    intervals_of,
+    spread_of,
 )
-from elastocal.identification.outliers import NoiseAndOutliers, robust_result, settle
+from elastocal.identification.outliers import robust_result, settle
 from elastocal.identification.residuals import held_out_by_parts, held_out_residual, rms_3d
 from elastocal.identification.smooth_fit import fit_smooth
 from elastocal.identification.solve import (
@@ -72,7 +70,7 @@ OF_READINGS = "auto, of readings"  # the best noise model but those that know th
 
 def _adapted(
     every: Solution, start: Solution, good: BoolArray, kind: str, progress: Progress,
-    refit: Refit | None, known: NoiseAndOutliers | None = None,
+    refit: Refit | None, noise: NoiseFit | None = None,
 ) -> Adapted:  # fmt: skip
     """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
 
@@ -80,7 +78,7 @@ def _adapted(
     readings are settled at its values and the kept parameters fitted anew with these weights, until
     neither changes.  Then what was chosen on the way is chosen again by what is there now:
     the parameters, if other readings are good or the weights show more, and the kind of noise,
-    unless it is `known`.  More parameters that do not settle are none: the fit without them stays.
+    unless one is given.  More parameters that do not settle are none: the fit without them stays.
     Without `refit` no reading is judged.
     """
     asked = "auto" if kind == OF_READINGS else kind
@@ -89,13 +87,11 @@ def _adapted(
     check_supported(asked, readings)
     sure, restarts, fewer = False, 0, None
     for left in reversed(range(ROUNDS)):
-        before, kept = now, start.reduction.kept
-        like = None if known is None else known.noise
-        name = asked if like is None else like.kind
+        before, kept, first = now, start.reduction.kept, noise is None
         if refit is None:
-            noise = estimate_noise(readings, name, like)
+            noise = estimate_noise(readings, asked, noise)
         else:
-            noise, now = settle(readings, name, now, known)
+            noise, now = settle(readings, asked, now, noise)
         progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
         solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
@@ -103,8 +99,7 @@ def _adapted(
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         same = np.array_equal(now, before)
         # What relinearising moves by more may have looked like some noise.
-        sure = sure or (known is None and same and moved.max(initial=0.0) < LINEAR)
-        known = NoiseAndOutliers(noise, now)
+        sure = sure or (first and same and moved.max(initial=0.0) < LINEAR)
         if moved.max(initial=0.0) >= SETTLED or not same:
             continue
         others = refit is not None and restarts < RESTARTS and not np.array_equal(now, fitted)
@@ -120,18 +115,17 @@ def _adapted(
             start, sure = replace(start, reduction=more), False
             readings = _linearised(problem, solution.fit.x, more.kept, kind)
             continue
-        if sure:
-            break
-        again, sure = estimate_noise(readings.take(now), asked), True
-        known = NoiseAndOutliers(again, now)
-        if again.kind == noise.kind:
-            noise = again
+        settled, chosen = noise.kind, sure
+        if not sure:
+            noise, sure = estimate_noise(readings.take(now), asked), True
+        if chosen or noise.kind == settled:
             break
     else:
         if fewer is not None:
             solution, noise, now, readings = fewer
+    assert noise is not None
     final = readings.take(now)
-    return solution, over_times(estimate_noise(final, noise.kind, noise), final), now
+    return solution, over_times(estimate_noise(final, like=noise), final), now
 
 
 def _linearised(problem: Problem, x: Array, kept: IntArray, kind: str) -> Readings:
@@ -199,9 +193,10 @@ def _by_method(
     if method in ("eq14", "eq14-residual"):
         return _published(method, every, solution, good, options, progress)
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
-    intervals = intervals_of(solution, options.intervals, None)
-    warnings = (COMPUTED,) if exact else ()
-    return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
+    spread = spread_of(solution, options.intervals, None)
+    return MethodResult(
+        kind, solution, spread, None, good, warnings=(COMPUTED,) if exact else ()
+    )  # fmt: skip
 
 
 # Parameters that the readings hardly show.
@@ -215,12 +210,12 @@ def _by_method(
 def hardly_shown(found: MethodResult) -> dict[int, tuple[float, float]]:
     """The 95 % intervals, by parameter, of those fitted that reach beyond a physical bound and
     stand alone."""
-    solution, intervals = found.solution, found.intervals
-    std, reach = intervals.covariance.std, {}
+    solution, reach = found.solution, {}
+    std, ends = found.spread.std, found.ci95
     for k, c in enumerate(solution.reduction.kept.tolist()):
         p = solution.problem.model.parameters[c]
         _, (low, high) = solution.reduction.widened(
-            k, solution.sizes, std[k], float(solution.fit.x[c]), intervals.ci95[k]
+            k, solution.sizes, std[k], float(solution.fit.x[c]), ends[k]
         )
         beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
         if beyond and not p.shrunk and not solution.reduction.terms(k, solution.sizes, std[k]):
@@ -279,9 +274,9 @@ def _holding(
         readings = linearised(problem.model, observed, fit.x, reduction.kept)
         if len(problem.observations.lead) < len(found.good):
             readings = readings.take(found.good)
-        noise = over_times(estimate_noise(readings, noise.kind, noise), readings)
-    intervals = intervals_of(solution, options.intervals, noise)
-    return replace(found, solution=solution, intervals=intervals, noise=noise)
+        noise = over_times(estimate_noise(readings, like=noise), readings)
+    spread = spread_of(solution, options.intervals, noise)
+    return replace(found, solution=solution, spread=spread, noise=noise)
 
 
 def is_exact(solution: Solution) -> bool:
@@ -297,7 +292,7 @@ def _reml(
     progress: Progress,
 ) -> MethodResult:
     def found(
-        start: Solution, good: BoolArray, kind: str, known: NoiseAndOutliers | None = None
+        start: Solution, good: BoolArray, kind: str, known: NoiseFit | None = None
     ) -> Adapted:
         solution, noise, good = _adapted(every, start, good, kind, progress, refit, known)
         explained = partial(_explained, every, solution, noise, good)
@@ -312,15 +307,14 @@ def _reml(
         # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
         # which make light of it let the fit go where poses left out are predicted worse.
         progress("comparing with noise of the readings alone")
-        known = NoiseAndOutliers(noise.of_readings(), good)
         agreed = sound if np.array_equal(good, ~faulty) else every if good.all() else refit(good)
-        plain = found(agreed, good, OF_READINGS, known)
+        plain = found(agreed, good, OF_READINGS, noise.of_readings())
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
             tests = noise.tests
             solution, noise, good = plain
             noise = replace(noise, tests=tests)  # which say what is not counted
-    intervals = intervals_of(solution, options.intervals, noise)
-    return MethodResult("reml", solution, intervals, noise, good)
+    spread = spread_of(solution, options.intervals, noise)
+    return MethodResult("reml", solution, spread, noise, good)
 
 
 def _explained(
@@ -374,14 +368,13 @@ def _published(
     fitted = good if len(observed.lead) < len(good) else np.ones_like(good)
     solution = refined(every, start, start.fit.x, fitted, weights)
     if options.intervals != "auto":
-        own = intervals_of(solution, options.intervals, None)
+        own = spread_of(solution, options.intervals, None)
         return MethodResult(method, solution, own, None, good)
     covariance = Covariance(
         "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
         "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
     )  # fmt: skip
-    intervals = Intervals.by_t(covariance, solution.fit.x[fit.columns])
-    return MethodResult(method, solution, intervals, None, good)
+    return MethodResult(method, solution, covariance, None, good)
 
 
 # The fit of a method again, under constraints and with a prior.
@@ -445,7 +438,7 @@ ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
 
 def intervals_with_knowledge(
     found: KnownFit, of_readings: Array, kind: str, many: set[str]
-) -> Intervals:
+) -> Covariance:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
     auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
@@ -470,8 +463,8 @@ def intervals_with_knowledge(
         if len(known.P):
             name, text = ("posterior", "readings and prior together, the prior taken at its word")
         lower, upper = known.system.lower[:, None], known.system.upper[:, None]
-        covariance = Covariance(name, matrix, dof, f"{text}; assumes normal noise")
-        return Intervals(covariance, np.clip(plain, lower, upper))
+        plain = np.clip(plain, lower, upper)
+        return Covariance(name, matrix, dof, f"{text}; assumes normal noise", ends=plain)
     ends = np.repeat(x[:, None], 2, axis=1)
     of_functions = np.array([name in many for name in found.names])
     ends[of_functions] = plain[of_functions]
@@ -486,7 +479,7 @@ def intervals_with_knowledge(
                 ends[k, end] += found.reduced.farthest(k, found.best, rise, side)[k]
     model = "nonlinear" if kind == "profile" else "linearised"
     text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
-    return Intervals(Covariance("constrained profile", matrix, dof, text), ends)
+    return Covariance("constrained profile", matrix, dof, text, ends=ends)
 
 
 # The fit of a method, its knowledge added: one more step on the weights that the method ends with.
@@ -536,35 +529,35 @@ def fit_with_knowledge(
         least_squares(problem, columns, fit.x, solution.sizes, known=stated), stated, sigma
     )
     progress("intervals under constraints" if prior is None else "intervals with the prior")
-    told = dict(zip(fit.columns.tolist(), before.intervals.covariance.dof.tolist(), strict=True))
+    told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
     spare = own.dof if own else min(told.values())
     dof = np.array([spare if own else told.get(c, spare) for c in columns.tolist()])
     many = set() if own is None else set(own.prior.names)
-    intervals = intervals_with_knowledge(found, dof, options.intervals, many)
+    spread = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
     shares = {} if prior is None else {
         name: float(share)
         for c, name, share in zip(columns, found.names, found.prior_share, strict=True)
         if np.isfinite(share) and not problem.model.shrunk[c]
     }  # fmt: skip
-    fitted, matrix = _as_fit(found), intervals.covariance.matrix
+    fitted = _as_fit(found)
     # Linearised, with the active constraints kept active: directions of the face are orthonormal by
     # the rows of readings and prior together.
     heldout, leverage = held_out_by_parts(
         problem.model, problem.parts, found.fit.x, columns, found.face
     )
     known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
-    doubts = _contradiction(solution, before.intervals, found, own)
+    doubts = _contradiction(solution, before.spread, found, own)
     return replace(
-        before, method="constrained", solution=known, intervals=intervals,
+        before, method="constrained", solution=known, spread=spread,
         active=found.best.active, prior_share=shares, effective=round(found.effective),
         leverage=leverage, warnings=(*before.warnings, *doubts),
-        smooth=tuple(part.refitted(fitted.x, columns, matrix) for part in before.smooth),
+        smooth=tuple(part.refitted(fitted.x, columns, spread.matrix) for part in before.smooth),
     )  # fmt: skip
 
 
 def _contradiction(
-    solution: Solution, before: Intervals, found: KnownFit, own: FunctionPrior | None
+    solution: Solution, before: Covariance, found: KnownFit, own: FunctionPrior | None
 ) -> tuple[str, ...]:
     """A sentence where the objective grew by more than noise explains (F-test).
 
@@ -576,7 +569,7 @@ def _contradiction(
     if stated < 1:
         return ()
     grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
-    dof = max(float(before.covariance.dof.min()), 1.0)
+    dof = max(float(before.dof.min()), 1.0)
     if own is not None:
         grown, dof = grown - own.stands, own.dof
     F = max(grown, 0.0) / (stated * found.sigma**2)

@@ -445,23 +445,23 @@ def estimate_noise(
 ) -> NoiseFit:
     """Variances of the chosen noise model by REML, and the estimate under it.
 
-    `kind`: the name of a `Kind`, or "auto".  Auto takes the noise of single readings with the
-    smallest criterion that the table has the labels and the readings for, each with what a
-    configuration may share, and then changes by one part what makes the criterion smaller, until
-    nothing does; scatter of the joints and drift are tried where a test finds a trace of them.
-    `like`, a fit of nearly the same readings, is where the search of a named kind starts; how it
-    was chosen there holds here.
+    `kind`: the name of a `Kind`, or "auto", unless it is that of `like`, a fit of nearly the same
+    readings, where the search then starts; how it was chosen there holds here.  Auto takes the
+    noise of single readings with the smallest criterion that the table has the labels and the
+    readings for, each with what a configuration may share, and then changes by one part what makes
+    the criterion smaller, until nothing does; scatter of the joints and drift are tried where a
+    test finds a trace of them.
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
-    asked, (basis, T) = Kind.of(kind), _orthonormal(readings)
+    basis, T = _orthonormal(readings)
+    if like is not None:
+        found = fitted(basis, Kind.parsed(like.kind), like.fit)
+        return _result(like.kind, found, T, like.trials, like.reason, like.tests)
+    asked = Kind.of(kind)
     if kind == "auto":
         return _chosen(basis, T)
-    found = fitted(basis, asked, None if like is None else like.fit)
-    made = _result(kind, found, T, (), "as asked for")
-    if like is None or like.kind != kind:
-        return made
-    return replace(made, trials=like.trials, reason=like.reason, tests=like.tests)
+    return _result(kind, fitted(basis, asked), T, (), "as asked for")
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:

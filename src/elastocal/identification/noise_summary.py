@@ -274,7 +274,7 @@ class Noise:
 
 
 def noise_of(found: MethodResult, sigma: float) -> Noise:
-    weights, covariance = found.solution.problem.weights, found.intervals.covariance
+    weights, covariance = found.solution.problem.weights, found.spread
     noise = Noise(
         weights.kind,
         weights.description,

@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from elastocal.errors import InputError, option
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import (
+    LEVEL,
     Covariance,
     Rows,
     clustered,
-    of_rows,
     root_of,
     t_quantile,
 )
 from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.least_squares import Fit, KnownFit, PriorRows, profile_end
+from elastocal.identification.least_squares import KnownFit, PriorRows, profile_end
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.solve import Solution, residual_sigma
@@ -43,86 +43,50 @@ IntervalKind = Literal[
     "profile",
 ]  # fmt: skip
 KINDS = get_args(IntervalKind)
-LEVEL = 0.95
 
 
-@dataclass(frozen=True)
-class Intervals:
-    """Covariance of the fitted parameters and their 95 % intervals (fitted, 2)."""
-
-    covariance: Covariance
-    ci95: Array
-
-    @classmethod
-    def by_t(cls, covariance: Covariance, x: Array) -> Intervals:
-        """x ± t of the covariance's degrees of freedom."""
-        return cls(covariance, covariance.interval(x, LEVEL))
-
-
-def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Intervals:
-    """Intervals of the solution's fitted parameters.
+def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Covariance:
+    """Covariance and intervals of the solution's fitted parameters.
 
     auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in
     a large table with several readings per configuration cr1;
-    classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations;
-    profile: of the nonlinear sum of squares.
+    classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations,
+    or rows by themselves, in passes over the parts of the table;
+    profile: {v: S(v) − Ŝ ≤ t² s²} of the nonlinear sum of squares.
 
     Raises InsufficientDataError where the data cannot give it.
     """
-    fit, observed = solution.fit, solution.problem.observations
-    x = fit.x[fit.columns]
+    fit, problem = solution.fit, solution.problem
     if kind == "auto" and noise is not None:
-        return Intervals.by_t(noise.covariance, x)
-    problem = solution.problem
+        return noise.covariance
     if kind == "auto" and problem.large:
-        configurations = observed.n_configurations
-        several = len(observed.lead) > configurations >= ENOUGH * len(x)
-        kind = "cr1" if several else kind
+        readings, configurations = (
+            len(problem.observations.lead), problem.observations.n_configurations
+        )  # fmt: skip
+        kind = "cr1" if readings > configurations >= ENOUGH * len(fit.columns) else kind
+    sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
+    classical = Covariance(
+        "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
+        "all readings independent, their noise scaled to the residual",
+    )  # fmt: skip
     if kind in ("auto", "classical"):
-        return Intervals.by_t(_classical(solution), x)
+        return classical
     if kind == "profile":
-        return _profiled(solution, _classical(solution))
-    found = _clustered(fit, kind)
-    if kind[0] == "h":
-        found = of_rows(found, len(fit.whitened), kind.upper())
-    return Intervals.by_t(found, x)
-
-
-def _clustered(fit: Fit, kind: str) -> Covariance:
-    """Over configurations, or rows by themselves, in passes over the parts of the table."""
-    problem, V = fit.problem, fit.r_factor.half
+        names, none = problem.model.names, Constraints()
+        known = PriorRows.stated(names, fit.columns, fit.x, none, None, sigma)
+        found, rises = KnownFit(fit, known, sigma), (sigma * t_quantile(LEVEL, classical.dof)) ** 2
+        ends = [[profile_end(found, k, float(rise), side) for side in (-1, 1)]
+                for k, rise in enumerate(rises)]  # fmt: skip
+        text = "profile of the nonlinear sum of squares (all readings independent)"
+        return replace(classical, kind="profile", description=text, ends=np.array(ends))
+    V = fit.r_factor.half
 
     def rows(part: Part) -> Rows:
         at, own = regressor(problem.model, part, fit.x, fit.columns), part.observations
         labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
         return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
 
-    return clustered(each(problem.parts, rows), V, f"CR{kind[2]}")
-
-
-def _classical(solution: Solution) -> Covariance:
-    fit = solution.fit
-    sigma = residual_sigma(fit, len(fit.columns))
-    dof = len(fit.whitened) - len(fit.columns)
-    return Covariance(
-        "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
-        "all readings independent, their noise scaled to the residual",
-    )  # fmt: skip
-
-
-def _profiled(solution: Solution, classical: Covariance) -> Intervals:
-    """{v: S(v) − Ŝ ≤ t² s²}, the fit being at its minimum."""
-    fit = solution.fit
-    sigma, names = residual_sigma(fit, len(fit.columns)), solution.problem.model.names
-    known = PriorRows.stated(names, fit.columns, fit.x, Constraints(), None, sigma)
-    found = KnownFit(fit, known, sigma)
-    rises = (sigma * t_quantile(LEVEL, classical.dof)) ** 2
-    ends = [
-        [profile_end(found, k, float(rise), side) for side in (-1, 1)]
-        for k, rise in enumerate(rises)
-    ]
-    text = "profile of the nonlinear sum of squares (all readings independent)"
-    return Intervals(replace(classical, kind="profile", description=text), np.array(ends))
+    return clustered(each(problem.parts, rows), V, kind.upper())
 
 
 # What an identification says of a smooth function: its size, and how sure.
@@ -234,7 +198,7 @@ def _finite(value: float) -> float | None:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """The final fit, its intervals, and the noise where it was estimated.
+    """The final fit, its `spread`, and the noise where it was estimated.
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
     fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
@@ -247,7 +211,7 @@ class MethodResult:
 
     method: str
     solution: Solution
-    intervals: Intervals
+    spread: Covariance
     noise: NoiseFit | None
     good: BoolArray
     active: tuple[ActiveConstraint, ...] = ()
@@ -258,6 +222,11 @@ class MethodResult:
     smooth: tuple[SmoothPart, ...] = ()
     standard: Array | None = None
     limits: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def ci95(self) -> Array:
+        """The 95 % intervals (fitted, 2)."""
+        return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import Intervals, MethodResult
+from elastocal.identification.options import MethodResult
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import (
@@ -504,35 +504,25 @@ def prediction_errors(found: NoiseFit, readings: Readings, good: BoolArray, own:
 # The default estimate: faulty readings set apart, noise model chosen, x by its weights.
 
 
-class NoiseAndOutliers(NamedTuple):
-    """The noise found from the `good` readings (N,); the noise does not explain the others."""
-
-    noise: NoiseFit
-    good: BoolArray
-
-
 def settle(
     readings: Readings, kind: str = "auto", good: BoolArray | None = None,
-    known: NoiseAndOutliers | None = None,
-) -> NoiseAndOutliers:  # fmt: skip
-    """Noise and good readings that agree with each other, starting from `good` (default all).
+    noise: NoiseFit | None = None,
+) -> tuple[NoiseFit, BoolArray]:  # fmt: skip
+    """Noise and good readings (N,) that agree with each other, starting from `good` (default all).
 
     The noise model is fitted to the good readings, and every reading judged by the error of its
     prediction from them (false-alarm rate 1 % for the whole table), in turn.  Starting from all,
     errors that hide each other may stay: start from the majority.
 
-    The search begins with the noise that is `known`, and keeps the kind of noise that it begins
-    with.
+    The search begins with the `noise` given, and keeps the kind of noise that it begins with.
     """
     every = np.ones(len(readings), dtype=bool)
     good = every if good is None else good
-    noise = None if known is None else known.noise
     precision: list[Array] = []  # of single readings, by the first noise
 
     def fitted(chosen: BoolArray) -> NoiseFit:
         nonlocal noise
-        own = kind if noise is None else noise.kind
-        noise = estimate_noise(readings.take(chosen), own, noise)
+        noise = estimate_noise(readings.take(chosen), kind, noise)
         return noise
 
     def judged(found: NoiseFit, chosen: BoolArray) -> tuple[Array, float, BoolArray]:
@@ -547,7 +537,7 @@ def settle(
         found, good, _ = until_it_stands(good, fitted, judged)
     except ElastocalError:  # the good ones alone do not show all parameters
         found, good, _ = until_it_stands(every, fitted, judged)
-    return NoiseAndOutliers(found, good)
+    return found, good
 
 
 # Robust fits by name, by reweighting.
@@ -754,5 +744,4 @@ def robust_result(
     problem = replace(problem, x0=sound.problem.x0)
     solution = replace(sound, problem=problem, fit=fit, held=heldout)
     cluster = None if intervals == "auto" else observed.configuration
-    covariance = covariance_of(found, B, cluster)
-    return MethodResult(method, solution, Intervals.by_t(covariance, x[kept]), None, good)
+    return MethodResult(method, solution, covariance_of(found, B, cluster), None, good)

@@ -28,13 +28,12 @@ from elastocal.identification.noise_choice import NoiseFit, linearised, weights_
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
     FunctionPrior,
-    Intervals,
     MethodResult,
     Options,
     SmoothPart,
     check_for_functions,
 )
-from elastocal.identification.outliers import FALSE_ALARM, NoiseAndOutliers, settle
+from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
@@ -546,9 +545,8 @@ class _Course:
         explains."""
         if self.estimating:
             # From the second round on, whose fit has such weights, the kind of noise is known.
-            known = NoiseAndOutliers(noise, good) if noise is not None and k > 1 else None
-            kind = self.options.noise if known is None else known.noise.kind
-            return settle(self.readings.moved(self.standard), kind, good, known)
+            known = noise if k > 1 else None
+            return settle(self.readings.moved(self.standard), self.options.noise, good, known)
         n, size = len(self.standard), self.observed.size
         e = self.every.problem.weights.apply(self.standard.ravel()).reshape(n, size)
         squared, dof = (e**2).sum(axis=1), max(int(good.sum()) * size, 1)
@@ -622,13 +620,12 @@ class _Course:
         )
         matrix = fit.scales.variance * posterior.cofactor
         covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
-        intervals = Intervals.by_t(covariance, x[columns])
         shares = zip(columns.tolist(), posterior.prior_share.tolist(), strict=True)
         method = self.options.resolved
         if not self.estimating:
             method = "ols" if problem.weights.kind == "none" else "wls"
         result = MethodResult(
-            method, solution, intervals, noise, good, leverage=cross[1], standard=self.standard,
+            method, solution, covariance, noise, good, leverage=cross[1], standard=self.standard,
             prior_share={self.model.names[c]: s for c, s in shares if c in f.sized},
             effective=round(effective), warnings=self._warnings(fit),
             smooth=self._parts(fit, covariance.matrix),
