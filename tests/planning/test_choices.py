@@ -44,7 +44,8 @@ def choice_of(cell: Cell) -> Choice:
 
 
 def sizes(cell: Cell, minutes: float) -> tuple[tuple[TimedSize, ...], TimedSize]:
-    return _sizes(choice_of(cell), cell, minutes)[:2]
+    found, best = _sizes(choice_of(cell), cell, minutes)
+    return found, best.size
 
 
 def test_the_tracker_goes_where_its_noise_is_least() -> None:

@@ -81,6 +81,7 @@ SAGGING = {
 }
 CASES: dict[str, tuple[Chain, Cell]] = {
     "one marker fitted": (CHAIN, plan_cell((*FULL[:-1], "marker_position:marker:M2"), "position")),
+    "a tracker that distorts": (CHAIN, plan_cell((*FULL, "tracker_distortion"), "position")),
     "deflections": (CHAIN, plan_cell(loads=DOWN[None])),
     "levels": (
         CHAIN,

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -296,8 +297,8 @@ def within(
 ) -> Plan:  # fmt: skip
     asked = minutes
     for left in reversed(range(TRIES)):
-        sizes, best, poses = _sizes(choice, cell, asked)
-        plan = plan_of(_sized(cell, poses, best.repeats))
+        sizes, best = _sizes(choice, cell, asked)
+        plan = plan_of(best.cell)
         took = plan.execution.total / 60
         if took <= minutes or not left:
             break
@@ -308,27 +309,26 @@ def within(
 
 
 class _Fit(NamedTuple):
-    """A plan that fits a time: how many parameters it determines, its Φ, what it is, of how many
-    poses in all load states it has the stops, and in which states (K, L) candidates are read."""
+    """A plan that fits a time: how many parameters it determines, its Φ, what it is, the cell that
+    asks for its stops, and in which states (K, L) candidates are read."""
 
     kept: int
     value: float
     size: TimedSize
-    poses: int
+    cell: Cell
     read: BoolArray
 
 
-def _sizes(
-    choice: Choice, cell: Cell, minutes: float
-) -> tuple[tuple[TimedSize, ...], TimedSize, int]:
+def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize, ...], _Fit]:
     spec, drawn, found = cell.design, choice.draw(cell), list[_Fit]()
     # Where a reading takes no time nothing says how many of them there may be.
     for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):
         choice.progress(f"within {minutes:.4g} minutes: {repeats} readings each")
-        fit = _best(choice, cell, minutes, drawn, repeats, found[-1].read if found else None)
-        found += [] if fit is None else [fit]
-        least = min((fit.value for fit in found), default=np.inf)
-        if len(found) > WORSE and min(fit.value for fit in found[-WORSE:]) > least:
+        read = found[-1].read if found else None
+        with suppress(ElastocalError):
+            found += _fitting(choice, cell, minutes, drawn, repeats, read)
+        values = [fit.value for fit in found]
+        if len(found) > WORSE and min(values[-WORSE:]) > min(values):
             break
     if not found:
         raise InsufficientDataError(
@@ -339,50 +339,40 @@ def _sizes(
     # A plan that holds more parameters errs less in the others, but not in all.
     most = max(fit.kept for fit in found)
     whole = [fit for fit in found if fit.kept == most]
-    best = min(whole, key=lambda fit: fit.value)
-    return tuple(fit.size for fit in whole), best.size, best.poses
+    return tuple(fit.size for fit in whole), min(whole, key=lambda fit: fit.value)
 
 
-def _best(
-    choice: Choice, whole: Cell, minutes: float, drawn: Candidates, repeats: int,
+def _fitting(
+    choice: Choice, cell: Cell, minutes: float, drawn: Candidates, repeats: int,
     read: BoolArray | None,
-) -> _Fit | None:  # fmt: skip
+) -> list[_Fit]:  # fmt: skip
     """A plan of as many poses as fit, candidates being `read` in load states that were chosen
-    before; None where there is none."""
+    before; empty or an error where there is none."""
+    # What poses read twice would take, more poses may have.
+    motion = replace(cell.design.motion, extra_time=cell.design.motion.longer)
+    spec = replace(cell.design, per_level=(), repeats=repeats, minutes=None, motion=motion)
 
-    def too_long(n: int) -> bool:
-        sized = _sized(whole, n, repeats)
-        everything = np.ones((n, len(plan_forces(sized))), dtype=np.int64)
-        return _minutes(sized, drawn.q[:n], everything) > minutes
+    def sized(poses: int) -> Cell:
+        return replace(cell, design=replace(spec, poses=poses))
 
-    poses = bisect_left(range(1, len(drawn.q) + 1), True, key=too_long)
-    if not poses:
-        return None
-    cell = _sized(whole, poses, repeats)
-    try:
-        point = choice.relaxed(cell, drawn, read)
-        if point is None:
-            return None
-        problem = point.setup.problem(point.pool, shares_of(cell))
-        check_enough(problem)
-        chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
-    except ElastocalError:
-        return None
-    took = _minutes(cell, point.pool.q[chosen], point.pool.readings[chosen])
+    everything = np.ones((len(drawn.q), len(plan_forces(cell))), dtype=np.int64)
+    poses = bisect_left(
+        range(1, len(drawn.q) + 1), True,
+        key=lambda n: _minutes(sized(n), drawn.q[:n], everything[:n]) > minutes,
+    )  # fmt: skip
+    point = choice.relaxed(sized(poses), drawn, read) if poses else None
+    if point is None:
+        return []
+    problem = point.setup.problem(point.pool, shares_of(point.cell))
+    check_enough(problem)
+    chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
+    took = _minutes(point.cell, point.pool.q[chosen], point.pool.readings[chosen])
     # Where a load is not hung there is time for more; Φ goes about as one over their number.
     more = max(int(poses * minutes / took), 1) / poses
     value = point.setup.criterion.figure(phi / more)
     size = TimedSize(round(len(chosen) * more), repeats, took * more, value)
-    return _Fit(len(problem.prior), phi / more, size, round(poses * more), point.setup.ways > 0)
-
-
-def _sized(cell: Cell, poses: int, repeats: int) -> Cell:
-    # What poses read twice would take, more poses may have.
-    motion = replace(cell.design.motion, extra_time=cell.design.motion.longer)
-    spec = replace(
-        cell.design, poses=poses, per_level=(), repeats=repeats, minutes=None, motion=motion
-    )
-    return replace(cell, design=spec)
+    whole, read = sized(round(poses * more)), point.setup.ways > 0
+    return [_Fit(len(problem.prior), phi / more, size, whole, read)]
 
 
 def _minutes(cell: Cell, q: Array, readings: IntArray) -> float:

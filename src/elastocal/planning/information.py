@@ -61,29 +61,16 @@ def plan_forces(cell: Cell) -> Array:
     return np.vstack([np.zeros((1, 3)), forces[loaded]])
 
 
-def readings_at(
-    q: Array, pose: IntArray, force: Array, marker: IntArray, marker_names: tuple[str, ...],
-    source: str = "plan",
-) -> Measurements:  # fmt: skip
-    """Table rows, not measured yet, of `pose` (n,) of q (N, joints), `force` (n, 3), `marker`
-    (n,)."""
-    return Measurements(
-        source=source,
-        row=pose + 2,
-        q=q[pose],
-        configuration=pose,
-        configuration_labels=tuple(map(str, range(1, len(q) + 1))),
-        repeat=np.zeros(len(pose), dtype=np.int64),
-        marker=marker,
-        marker_names=marker_names,
-        force=force,
-    )
-
-
 def rows_of(q: Array, forces: Array, names: tuple[str, ...]) -> Measurements:
+    """Table rows, not measured yet, of poses q (N, n) under each of `forces` (L, 3), of each
+    marker."""
     pose = np.repeat(np.arange(len(q)), len(forces) * len(names))
     force = np.tile(np.repeat(forces, len(names), axis=0), (len(q), 1))
-    return readings_at(q, pose, force, np.resize(np.arange(len(names)), len(pose)), names)
+    return Measurements.of_poses(
+        "plan", q[pose], force, configuration=pose,
+        configuration_labels=tuple(map(str, range(1, len(q) + 1))),
+        marker=np.resize(np.arange(len(names)), len(pose)), marker_names=names,
+    )  # fmt: skip
 
 
 def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:

@@ -24,7 +24,7 @@ from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
-from elastocal.planning.information import Estimable, readings_at
+from elastocal.planning.information import Estimable
 from elastocal.tables import csv_text
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
@@ -144,15 +144,14 @@ def plan_table(
     units = ["deg" if kind == "revolute" else "mm" for kind in kinds]
     q = [to_si(values, unit) for values, unit in zip(shown, units, strict=True)]
     force = np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]]
-    own = (DEFAULT_MARKER,) if seen is None else tuple(seen)
-    table = replace(
-        readings_at(np.column_stack(q), np.arange(n), force, marker, own),
+    table = Measurements.of_poses(
+        "plan", np.column_stack(q), force, row=np.arange(n) + 2,
         configuration=np.array([labels.index(name) for name in names]),
-        configuration_labels=labels,
+        configuration_labels=labels, marker=marker,
+        marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
         approach=np.array(approach, dtype=float) if approach else None,
-        time=np.round(time, 3) if len(time) else None,
-        joint_kinds=tuple(kinds),
-    )
+        time=np.round(time, 3) if len(time) else None, joint_kinds=tuple(kinds),
+    )  # fmt: skip
 
     def nth(told: Callable[[int, Stop], str], i: int) -> list[str]:
         return [told(*row[i]) if i < len(row) else "" for row in rows]
