@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from planning.order.test_schedule import driven
 from support.calibration import placement
 from support.cells import DOWN, kr270_chain
-from support.design_cells import any_cell, plan_cell, scara
+from support.design_cells import any_cell, plan_cell, scara, value_of
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
@@ -115,7 +115,7 @@ def every_reading_has_a_stop_and_every_move_is_free(
 def the_value_is_that_of_the_poses_and_no_less_than_its_bound(
     plan: Plan, setup: Setup, _: Feasibility
 ) -> None:
-    value = setup.value(plan.q)
+    value = value_of(setup, plan.q)
     assert plan.value == pytest.approx(value, rel=1e-9)
     assert plan.reported == setup.criterion.figure(plan.value)
     c = plan.certificate

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.cells import table_of as rows_with_markers
-from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain
+from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, value_of
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.plan_wishes import TargetPose
@@ -124,7 +124,7 @@ def test_a_point_on_the_tool_goes_with_fitted_markers_where_nothing_else_tells()
     cell = plan_cell(FULL, "position", loads=BOTH, test_poses=poses)
     setup = setup_of(cell, random_poses(CHAIN, 120, seed=1))
     (told,) = [text for text in setup.warnings if "point_m" in text]
-    assert "fixed to the markers" in told and np.isfinite(setup.value(TABLE_2))
+    assert "fixed to the markers" in told and np.isfinite(value_of(setup, TABLE_2))
     model, targets = Model.assembled(CHAIN, cell), target_poses.test_poses(cell, CHAIN)
     x, names = model.nominal, tuple(cell.tool.markers)
     A = prediction_rows(model, targets, x, carried=True)

@@ -97,6 +97,12 @@ def setup_of(
     )  # fmt: skip
 
 
+def value_of(setup: Setup, q: NDArray) -> float:
+    """Φ of a plan of poses q (N, n), each read in all load states."""
+    M = setup.gathered(setup.information.blocks(q))
+    return float(setup.criterion.of_information(M))
+
+
 def as_table(q: NDArray) -> Measurements:
     """Poses (N, n), one row each, for expand_plan."""
     n = len(q)

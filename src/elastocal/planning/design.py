@@ -59,22 +59,8 @@ from elastocal.planning.relaxation import (
     sized_plans,
     values_without,
 )
-from elastocal.planning.search import (
-    EFFORTS,
-    POOL,
-    Search,
-    SearchEffort,
-    Selection,
-    ordered,
-)
-from elastocal.planning.setup import (
-    OPEN,
-    FeasiblePool,
-    Setup,
-    promised,
-    set_up,
-    share_within,
-)
+from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection, ordered
+from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray, Progress
@@ -378,8 +364,8 @@ class _Design:
         wanted, figure = self.cell.design.target, setup.criterion.figure
         assert wanted is not None
         target, tried = self._target(setup, wanted), dict[int, PlanSize]()
-        low = max(pool.n_groups, int(self.pinned.sum()) + 1)
-        most, available = pool.n_groups, np.bincount(pool.group)
+        available = np.bincount(pool.group)
+        most, low = len(available), max(len(available), int(self.pinned.sum()) + 1)
         while most < MOST_POSES and (shares_of(self.cell, most + 1) <= available).all():
             most += 1
         best, high = None, most + 1  # the fewest are in [low, high), or high

@@ -568,7 +568,6 @@ def schedule(
     clock, drift = VisitTimes.of(moves, motion, begun), None
     steps = PER_VISIT * len(begun)
     tour, clock = clock.searched(begun, seed, progress, (SHORT,), steps)
-    moves.check_tour(tour)
     if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, clock, drift = against_drift(clock, motion, tour, alias, seed, progress)
     moves, order = clock.moves, [(node, 0) for node in tour]
@@ -576,7 +575,6 @@ def schedule(
         order = with_references(tour, moves, clock.travel, motion.reference_every, paired)
         while moves.check([node for node, _ in order]):
             pass
-    moves.check_tour([node for node, _ in order])
     return _executed(moves, order, motion, drift)
 
 

@@ -293,13 +293,15 @@ class Moves:
 
     def check_reach(self) -> None:
         """Can each pose be approached from one side at least, where it has to be, and does a chain
-        of free moves join it to the others (and home) of its load state?"""
+        of free moves join it to the others under load, and without, where it is hung and taken off,
+        to all (and home)?"""
         for roadmap in self.maps:
             here = self.loaded[self.load] == roadmap.loaded
             if self.signs is not None:
                 self._check_approaches(roadmap, here)
+            here |= not roadmap.loaded
             needed = [int(point) for point in dict.fromkeys(self.leave[here])]
-            if self.home is not None and len(needed) and not roadmap.loaded:
+            if self.home is not None and not roadmap.loaded:
                 needed.insert(0, self.home)
             if len(needed) < 2:
                 continue
@@ -309,12 +311,6 @@ class Moves:
                 # Where most hang together, all others are told at once.
                 clear = len(most) > len(every) and self.home not in every
                 raise self._unreachable(roadmap, every if clear else lost[0])
-
-    def check_tour(self, tour: list[int]) -> None:
-        for u, v in pairwise([0, *tour, 0]):
-            roadmap, way = self.way(u, v)
-            if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
-                raise self._unreachable(roadmap, [int(self.leave[(v or u) - 1])])
 
     def _check_approaches(self, roadmap: Roadmap, here: BoolArray) -> None:
         for v in np.flatnonzero(here & ~self.free.any(axis=1)):

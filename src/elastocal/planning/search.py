@@ -88,7 +88,7 @@ class Selection:
         """With the poses that stay, in the order of the levels; of a level these come first."""
         pool, chosen, n = self.pool, np.sort(self.chosen), 0
         if pinned is not None:
-            pool, n = pool.joined(pinned), len(pinned)
+            pool, n = FeasiblePool.join([pool, pinned]), len(pinned)
             chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
         chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
         return replace(self, pool=pool, chosen=chosen, pinned=n)
@@ -193,7 +193,7 @@ class Search:
 
     def _join(self, q: Array, group: IntArray, readings: IntArray) -> None:
         if len(q):
-            self.pool = self.pool.joined(self.setup.pool(q, group, readings))
+            self.pool = FeasiblePool.join([self.pool, self.setup.pool(q, group, readings)])
 
     def _better(self, best: IntArray, other: IntArray) -> IntArray:
         return other if self.value(other) < self.value(best) * (1 - SAME) else best

@@ -15,12 +15,7 @@ from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.criteria import (
-    CriterionInputs,
-    ScenarioCriterion,
-    criterion_named,
-    root,
-)
+from elastocal.planning.criteria import CriterionInputs, ScenarioCriterion, criterion_named, root
 from elastocal.planning.execution import Execution
 from elastocal.planning.information import (
     Estimable,
@@ -66,10 +61,6 @@ class FeasiblePool:
     def __len__(self) -> int:
         return len(self.q)
 
-    @property
-    def n_groups(self) -> int:
-        return int(self.group.max()) + 1
-
     def take(self, kept: IntArray | BoolArray) -> FeasiblePool:
         return FeasiblePool(self.q[kept], self.group[kept], self.readings[kept], self.blocks[kept])
 
@@ -77,9 +68,6 @@ class FeasiblePool:
     def join(cls, lots: Sequence[FeasiblePool]) -> FeasiblePool:
         names = ("q", "group", "readings", "blocks")
         return cls(*(np.concatenate([getattr(lot, name) for lot in lots]) for name in names))
-
-    def joined(self, other: FeasiblePool) -> FeasiblePool:
-        return FeasiblePool.join([self, other])
 
 
 @dataclass(frozen=True)
@@ -143,10 +131,6 @@ class Setup:
         """M (p, p) of a plan's blocks (N, r, p) and what was known before."""
         B = blocks.reshape(-1, blocks.shape[-1])
         return np.asarray(self.prior + B.T @ B)
-
-    def value(self, q: Array) -> float:
-        M = self.gathered(self.information.blocks(q))
-        return float(self.criterion.of_information(M))
 
 
 def set_up(

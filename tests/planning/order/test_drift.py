@@ -5,7 +5,7 @@ from itertools import groupby
 import numpy as np
 import pytest
 from support.cells import DOWN, kr270_chain, random_poses
-from support.design_cells import plan_cell, setup_of
+from support.design_cells import plan_cell, setup_of, value_of
 from support.discs import Discs
 
 from elastocal.cell.arm_description import Unsteadiness
@@ -127,7 +127,7 @@ def test_the_alias_is_what_least_squares_make_of_shifted_readings():
     rms = np.sqrt(targets.weight @ ((A @ wrong) ** 2).sum(axis=1))
     found = np.einsum("nl,nlmx,x->m", time, alias.share, direction)
     assert np.linalg.norm(found) == pytest.approx(rms, rel=1e-8)
-    assert alias.noise == pytest.approx(np.sqrt(setup.value(q)), rel=1e-9)
+    assert alias.noise == pytest.approx(np.sqrt(value_of(setup, q)), rel=1e-9)
     assert DRIFT > 0
 
     # What is left of the information where all drifts: generalised least squares with V + FFᵀ.
