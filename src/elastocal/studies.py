@@ -527,7 +527,10 @@ class DaskWorkers:
     def places(self) -> int:
         if self._client.status != "running":
             raise self._lost()
-        threads = sum(self._client.nthreads().values())
+        try:
+            threads = sum(self._client.nthreads(callback_timeout=6 * ANSWER).values())
+        except OSError:  # it went away while it was asked: without a limit that waits for ever
+            raise self._lost() from None
         if not threads and not self._told:
             self._tell("the cluster has no worker; waiting for one")
         self._told = not threads

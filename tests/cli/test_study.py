@@ -98,8 +98,10 @@ def begin(folder, marks, number, *words):
         command, env=os.environ | {"SLOW": "1"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         text=True, start_new_session=True,
     )  # fmt: skip
+    until = time.monotonic() + 300
     while len(os.listdir(marks)) < number:
         assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < until, "no task begins"
         time.sleep(0.01)
     return process
 

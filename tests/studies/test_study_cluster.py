@@ -140,9 +140,11 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path
             time.sleep(0.01)
         cluster.close()
 
-    threading.Thread(target=close, daemon=True).start()
+    closing = threading.Thread(target=close, daemon=True)
+    closing.start()
     with pytest.raises(ClusterLostError, match="went away"):
         run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
+    closing.join(60)  # of a cluster that still closes the next test would see the workers die
     kept = read_results(tmp_path / "r")
     assert 3 <= len(kept) < 200
     assert run_study(folder, tmp_path / "r", only=len(kept) + 5).before >= len(kept)
