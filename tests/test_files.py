@@ -60,15 +60,6 @@ def test_nesting_is_refused_at_once(tmp_path, kind):
     assert time.perf_counter() - begun < 5.0
 
 
-def test_brackets_and_dots_in_texts_and_comments_are_no_nesting(tmp_path):
-    text = f'# {"[" * 99}\na = \'{"[" * 99}\'\nb = "\\"{"{" * 99}"\nc = """\n{"[." * 99}\n"""\n'
-    text += f"d = '{'a.' * 99}'\n" + "".join(
-        f"e{k} = [[1.5, 2.5], [0.5, 1e3]]\n" for k in range(99)
-    )
-    (tmp_path / "cell.toml").write_text(text)
-    assert len(read_toml(tmp_path / "cell.toml", "cell")) == 103
-
-
 @pytest.mark.parametrize("text", [
     "[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{", "9" * 5000, "-1e400",
 ])  # fmt: skip

@@ -178,20 +178,6 @@ def test_a_plan_of_several_loads_states_those_of_each_row_as_they_were_asked_for
     assert stated == {(0.0, 0.0, 0.0), *map(tuple, loads)}  # deflections need both
 
 
-def test_design_is_that_of_the_command_line(plan):
-    cell = Path("cell.toml").read_text().partition("[design]")[0] + (
-        "[design]\nloads_N = [[0, 0, -2600]]\nlevels = {joint2_deg = [-25.24, -99.85]}\n"
-        "test_pose = [{q_si = [0.3, -0.4405, 0.6, 0.2, 0.5, 0.1]}]\n"
-    )
-    Path("design.toml").write_text(cell)
-    done = command("design", "design.toml", "-o", "line.csv", "--poses", "4", "--candidates", "60",
-                   "--criterion", "test_pose", "--effort", "quick", "--fix", "joint1",
-                   "-q")  # fmt: skip
-    assert done.exit_code == 0, done.output
-    plan.save("front.csv")
-    assert Path("front.csv").read_text() == Path("line.csv").read_text()
-
-
 def test_diagnose_is_that_of_the_command_line(folder):
     why = ec.diagnose(ec.Model(folder / "cell.toml"), "data.csv", seed=1)
     done = command("diagnose", "cell.toml", "data.csv", "-o", "line.json", "--seed", "1", "-q")
@@ -361,8 +347,6 @@ def test_what_is_the_same_is_equal(folder, model, fit, plan, tmp_path):
         (tmp_path / name).write_bytes((folder / name).read_bytes())
     elsewhere = ec.Model(tmp_path / "cell.toml")
     data, copy = model.read("data.csv"), elsewhere.read(tmp_path / "data.csv")
-    small = {"poses": 6, "criterion": "D", "effort": "quick", "candidates": 60, "loads": [LOAD],
-             "levels": {"joint2": [-0.44, -1.74]}}  # fmt: skip
     again = ec.identify(elsewhere, copy, fixed=["joint1.compliance"])
     once = ec.identify(model, data, fixed=["joint1.compliance"])
     fit.save(tmp_path / "result.json")
@@ -372,8 +356,6 @@ def test_what_is_the_same_is_equal(folder, model, fit, plan, tmp_path):
         (fit.arm, ec.load(tmp_path / "result.json")),
         (ec.compensate(once, TARGETS), ec.compensate(again, TARGETS)),
         (ec.compare(once, fit), ec.compare(again, fit)),
-        (ec.design(model, **small), ec.design(elsewhere, **small)),
-        (ec.diagnose(model, data), ec.diagnose(elsewhere, copy)),
         (once.position(np.zeros(6)), again.position(np.zeros(6))),
     ]  # fmt: skip
     for one, other in pairs:
@@ -421,19 +403,6 @@ def test_arrays_of_many_markers_are_what_their_file_is(model):
         assert np.array_equal(getattr(table, name), getattr(data, name)), name
     with pytest.raises(ec.InputError, match="`marker` takes a value for each row"):
         ec.table(data.q, data.position, marker=["M1"])
-
-
-def test_a_figure_is_drawn_in_axes_of_the_users_own(fit):
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 5), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    left.plot([1, 2])
-    part = fit.plot("waterfall", ax=right)
-    assert part in figure.subfigs and part.axes[0].get_xlabel() and len(figure.axes) == 2
-    figure.savefig("both.png")
-    with pytest.raises(ec.InputError, match="`ax` takes axes"):
-        fit.plot(ax=Figure())
 
 
 def spoken_for(name: str, what: object) -> Iterator[tuple[str, object]]:

@@ -244,14 +244,6 @@ def _strings(path: Path) -> Iterator[str]:
             yield node.value
 
 
-def test_imports_are_recognised() -> None:
-    """Guard of the guard: those at the top and those in functions are all seen."""
-    assert "errors" in imports()["files"]
-    assert {"cell.work_cell", "errors", "measurements"} <= imports()["model.manipulator"]
-    assert rank("model.manipulator") < rank("identification.solve") < rank("cli.using")
-    assert rank("cell") == rank("measurements") == rank("errors") == rank("files") == 0
-
-
 # Effects
 
 
@@ -277,21 +269,6 @@ def test_no_module_but_the_catalogue_names_an_effect() -> None:
         if id(node) not in options(path)
     ]
     assert named == []
-
-
-def test_no_module_compares_the_name_of_a_criterion() -> None:
-    """They are written where the classes are; others ask the class, or the plan."""
-    from elastocal.planning.criteria import CRITERIA
-
-    compared = [
-        f"{module}, line {node.lineno}"
-        for module, path in MODULES.items()
-        for node in nodes(path)
-        if isinstance(node, ast.Compare)
-        for word in (node.left, *node.comparators)
-        if isinstance(word, ast.Constant) and word.value in set(CRITERIA) - {"c"}
-    ]
-    assert compared == []
 
 
 def test_no_module_imports_scipy_stats_when_it_is_imported() -> None:

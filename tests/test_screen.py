@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import os
-import re
 import subprocess
 import sys
 import unicodedata
@@ -16,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal.cli.app import reporting_errors
-from elastocal.screen import SHARE, complain, progress_line, safe_console
+from elastocal.screen import complain, safe_console
 from elastocal.text import printable
 
 TITLE, MARK = "\x1b]0;owned\x07", "\u202egpj.exe"
@@ -104,13 +103,6 @@ def test_what_a_library_raises_is_a_sentence_with_the_files(raised, code, told, 
     assert re.search(told, error) and error.count("\n") == 1 and "Traceback" not in error
 
 
-def test_warnings_of_numpy_do_not_reach_the_user(recwarn):
-    import numpy as np
-
-    reporting_errors(lambda: np.array([1e300]) * np.array([1e300]))()
-    assert not list(recwarn)
-
-
 # What stands here is run as a command; it is interrupted in a place that cannot raise.
 SWALLOWED = {
     "by a finaliser": """
@@ -159,15 +151,3 @@ main()
     )
     told = (130, "elastocal: interrupted\n") if "by nobody" not in how else (0, "")
     assert (done.returncode, done.stderr) == told
-
-
-def test_the_progress_line_shows_time_and_where_it_is_known_the_share(monkeypatch):
-    """Without a terminal a line for each message."""
-    text = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", text)
-    with progress_line(False) as tell:
-        tell("pose 3 of 12")
-    assert re.fullmatch(r"… pose 3 of 12 \(\d+ s\)\n", text.getvalue())
-    found = SHARE.search("pose 3 of 12")
-    assert found and found.groups() == ("3", "12")
-    assert SHARE.search("fitting with the noise found (stated)") is None

@@ -124,15 +124,3 @@ def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
     assert found["tool"]["rms_um"] > 10 * found["tool"]["by_chance_rms_um"] > 0
     arms = [ec.read_calibrated("soft.toml", f"soft{k}.json") for k in (0, 1)]
     assert ec.compare(*arms, load=[0, 0, 0]).distance.max() < 1e-6
-
-
-def test_all_that_only_one_of_both_determines_is_named_at_once(folder):
-    model = ec.Model("cell.toml")
-    data = ec.simulate(model, np.random.default_rng(1).uniform(-1.4, 1.0, (24, 6)), seed=3)
-    for name, fixed in (("first", ["link3", "link5.dx"]), ("second", ["link1", "link2", "link4"])):
-        ec.identify(model, data, fixed=fixed).save(f"{name}.json")
-    code, _, err = run("cell.toml", "first.json", "second.json")
-    told = " ".join(err.split())
-    assert code == 2 and "first.json does not determine what second.json does: link3." in told
-    assert "; second.json does not determine what first.json does: link1." in told
-    assert "more); identify both with these held (--fix)" in told

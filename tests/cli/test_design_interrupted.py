@@ -96,11 +96,11 @@ def stages_in(begun):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 @pytest.mark.parametrize(
-    ("effort", "stage"),
-    [("quick", "candidates"), pytest.param("normal", "start0", marks=pytest.mark.long),
-     pytest.param("normal", "warm0", marks=pytest.mark.long)],
+    ("effort", "stage", "number"),
+    [("quick", "candidates", signal.SIGKILL),
+     *(pytest.param("normal", stage, number, marks=pytest.mark.long)
+       for stage in ("start0", "warm0") for number in (signal.SIGINT, signal.SIGKILL))],
 )  # fmt: skip
 def test_a_process_that_is_stopped(tmp_path, effort, stage, number):
     cell, begun = write_cell(tmp_path), tmp_path / "plan.csv.resume"

@@ -7,10 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.calibration import cell_of, random_chain
 from support.cells import (
     COMPENSATOR,
     COMPLIANCE,
@@ -27,7 +26,6 @@ from elastocal.compensation.compensate import (
     Compensation,
     compensate,
     nominal_path,
-    one_target,
     read_targets,
     targets_at,
 )
@@ -36,7 +34,7 @@ from elastocal.compensation.correction_table import (
     CorrectionGrid,
     correction_table,
 )
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import InputError
 from elastocal.model.calibrated import (
     CalibratedArm,
     Conditions,
@@ -52,7 +50,6 @@ from elastocal.model.rigid import nominal_flanges
 from elastocal.units import Array
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
-SOME = ("joint_offset", "link_geometry:link3", "joint_compliance")
 # Regular postures of the KR 270, well inside its limits.
 POSTURES = np.radians(
     [
@@ -156,33 +153,6 @@ def test_every_effect_is_undone(effects):
     assert found.before.min() > 1e-4
 
 
-@settings(max_examples=3, deadline=None, derandomize=True)
-@given(
-    seed=st.integers(0, 10_000),
-    joints=st.integers(6, 7),
-    oriented=st.booleans(),
-    load=st.floats(0.0, 300.0),
-)
-def test_random_arms_reach_what_they_can(seed, joints, oriented, load):
-    """Targets of the nominal arm: reached within the limits, or said not to be."""
-    rng = np.random.default_rng(seed)
-    chain = random_chain(seed, joints)
-    arm = calibrated(chain, cell_of(SOME, nominal=Nominal(joint_compliance=(1e-5,) * joints)))
-    arm = replace(arm, x=erring(arm.model, rng, 0.3))
-    q = rng.uniform(-1.8, 1.8, (4, joints))
-    T = nominal_flanges(chain, q)
-    goal = targets_at("t", T[:, :3, 3], T[:, :3, :3] if oriented else None, "base",
-                      load * np.array([0.3, 0.2, -1.0]))  # fmt: skip
-    found = commanded(arm, goal, near=q[0])
-    good = found.reached
-    miss, turn = tool_errors(arm, found)
-    assert np.all(miss[good] < FARTHEST) and np.all(turn[good] < FARTHEST)
-    # A row that is not reached is never told to be, and never said to be near.
-    assert np.all(miss[~good] > 1e-9) or np.all(turn[~good] > 1e-9)
-    assert np.all(np.abs(found.q) <= 2.5)
-    assert np.allclose(np.nan_to_num(found.after), np.nan_to_num(miss), atol=1e-12)
-
-
 def test_a_limit_is_kept_and_named():
     chain, high = kr270_chain(), POSTURES[0, 2]
     cell = replace(kr270_cell(EVERYWHERE), limits={"joint3": (high - 0.5, high)})
@@ -261,15 +231,6 @@ def test_what_no_marker_showed_is_told():
     place = commanded(arm, at_postures(None), "0.1,0.2,0.3")
     assert np.all(place.uncertainty.unknown > 1e-3)
     assert any("link6." in told and "`point`" in told for told in place.warnings)
-
-
-def test_too_soft_an_arm_has_no_equilibrium():
-    arm = arm_of("joint_compliance", nominal=Nominal(joint_compliance=(1e-3,) * 6))
-    found = commanded(arm, at_postures(n=2))
-    assert set(found.status) == {"no equilibrium"}
-    assert np.isnan(found.after).all()
-    place = targets_at("targets.csv", found.goals.position, None, "base", DOWN)
-    assert set(commanded(arm, place).status) == {"no equilibrium"}
 
 
 # Paths
@@ -361,12 +322,12 @@ def test_corrected_targets_are_reached_by_the_nominal_arm() -> None:
 
 def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
     arm, point = arm_and_point()
-    axes = joint_box((2, 2, 2, 1, 1, 1))
+    axes = joint_box((2, 1, 1, 1, 1, 1))
     assert correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN).warnings == ()
     axes[4] = np.zeros(1)
     found = correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN)
     (told,) = found.warnings
-    assert told.startswith("only 0 of 8 grid points are exact")
+    assert told.startswith("only 0 of 2 grid points are exact")
     assert "singular by the levels of q5_deg = 0;" in told and "q4" not in told and "q6" not in told
 
 
@@ -387,17 +348,6 @@ def test_tables_that_say_no_target_are_refused(tmp_path, text, told) -> None:
     path.write_text(text)
     with pytest.raises(InputError, match=told):
         read_targets(path, ("revolute",) * 6, "base")
-
-
-@settings(max_examples=60, deadline=None)
-@given(text=st.text("0123456789,.-+eE naif", max_size=30))
-def test_any_target_text_is_a_target_or_told(text) -> None:
-    try:
-        targets = one_target(text, "base")
-    except ElastocalError as error:
-        assert "`target` takes" in str(error)
-    else:
-        assert np.isfinite(targets.position).all()
 
 
 @given(

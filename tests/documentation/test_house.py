@@ -36,13 +36,6 @@ def test_every_package_and_module_has_a_line_of_the_table_and_packages_a_room(ho
     assert packages - {"demo"} <= set(house.ROOMS)
 
 
-def test_every_arrow_leads_downwards(house, uses):
-    assert uses["model"] == {"cell", "measurements"}
-    assert "model" in uses["identification"]
-    for room, direct in uses.items():
-        assert all(house.ROOMS[target][1] < house.ROOMS[room][1] for target in direct), room
-
-
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_the_picture_shows_the_imports_of_today(uses, scheme):
     picture = (ROOT / "docs" / "images" / f"house_{scheme}.svg").read_text(encoding="utf-8")

@@ -8,14 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 from support.cells import nominal_flanges
 from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, write_result
 from support.robots import packaged_urdf, random_chain_urdf
 
-from elastocal.export.rigid_files import NEARLY_PARALLEL, split, transform
 from elastocal.model.dh import read_dh
 
 CONVENTIONS = {"dh": "standard", "mdh": "modified"}
@@ -77,28 +73,3 @@ def test_numbers_that_calibration_leaves_alone_are_the_users(format: str, tmp_pa
     assert len(rows) == 6
     for i in (0, 1, 2):  # links beyond the error move, those before it do not
         assert all(float(rows[i][k]) == float(nominal[i][k]) for k in ("theta0_rad", "d_m", "a_m"))
-
-
-@given(
-    st.tuples(*[st.floats(-1, 1)] * 3),
-    st.tuples(*[st.floats(-3, 3)] * 3),
-    st.sampled_from([1.0, 1e-3, 1e-9, 0.0]),
-)
-def test_a_link_is_its_row_and_a_remainder_about_the_next_axis(
-    shift: tuple[float, ...], turn: tuple[float, ...], scale: float
-) -> None:
-    """`scale` brings the two axes to and into parallel."""
-    vector = np.array(turn) * [scale, scale, 1.0]
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_rotvec(vector).as_matrix(), shift
-    row, rest = split(T)
-    assert np.abs(transform(row) @ rest - T).max() < 1e-12
-    away = rest.copy()
-    away[:2, :2], away[2, 3] = np.eye(2), 0.0
-    tilted = np.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
-    if not tilted and row[2] == 0.0:  # a common normal below 1e-12 m counts as none
-        assert np.abs(away[:2, 3]).max() < 1e-12
-        away[:2, 3] = 0.0
-    # The foot of nearly parallel lines' common normal carries rounding over their angle.
-    assert np.abs(away - np.eye(4)).max() < (1e-12 if tilted else 1e-13)
-    assert tilted == (row[4] == 0.0) or row[4] == 0.0

@@ -131,9 +131,7 @@ HINDERED = {
     "site": ("</default>", '<site type="box" size="1 1 1" euler="1 2 3"/></default>'),
     "gravcomp": ('<body name="l2"', '<body gravcomp="1" name="l2"'),
     "no gravity": ("<option ", '<option><flag gravity="disable"/></option><option '),
-    "no springs": ("<option ", '<option><flag passive="disable"/></option><option '),
     "no actuation": ("<option ", '<option><flag actuation="disable"/></option><option '),
-    "gravity to the side": ("<option ", '<option gravity="0 -9.81 0" '),
 }  # fmt: skip
 
 

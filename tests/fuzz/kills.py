@@ -29,19 +29,18 @@ KILLED = ("identify", "design", "diagnose", "simulate", "export", "study")
 HARMS = ("killed", "disk full", "interrupted")
 
 
-def at_operation(number: int, act: Callable[[], object]) -> list[int]:
-    """`act` before the `number`-th operation that writes or moves a file; how many there were."""
+def at_operation(number: int, act: Callable[[int], object]) -> None:
+    """`act` before the `number`-th operation that writes or moves a file; before all for 0."""
     done = [0]
 
     def hook(event: str, arguments: tuple[object, ...]) -> None:
         reads = event == "open" and not int(arguments[2] or 0) & (os.O_WRONLY | os.O_RDWR)
         if event in OPERATIONS and not reads:
             done[0] += 1
-            if done[0] == number:
-                act()
+            if number in (0, done[0]):
+                act(done[0])
 
     sys.addaudithook(hook)
-    return done
 
 
 def full_disk(byte: int) -> None:
@@ -58,13 +57,7 @@ class Victim:
         shutil.copytree(base, self.folder)
         self.inputs, begun = seen(base), time.monotonic()
         counter = os.open(folder / "count", os.O_RDWR | os.O_CREAT)
-
-        def counted() -> None:
-            done = at_operation(0, int)
-            sys.addaudithook(lambda event, _: os.pwrite(counter, b"%d" % done[0], 0)
-                             if event in OPERATIONS else None)  # fmt: skip
-
-        whole = self.run(counted)
+        whole = self.run(lambda: at_operation(0, lambda n: os.pwrite(counter, b"%d" % n, 0)))
         assert whole.code == 0, f"the command itself fails: {whole.told()}"
         self.took, after = time.monotonic() - begun, seen(self.folder)
         self.sizes = {name: len(after[name] or b"") for name in after if name not in self.inputs
@@ -90,7 +83,7 @@ class Victim:
         after, number = rng.uniform(0, self.took), rng.randint(1, self.operations)
         which = signal.SIGINT if harm == "interrupted" else signal.SIGKILL
 
-        def strike() -> None:
+        def strike(_: int = 0) -> None:
             os.kill(os.getpid(), which)
 
         def by_clock() -> None:

@@ -68,26 +68,18 @@ def some_replaced(
     return text
 
 
-def other_number(text: str, rng: Random) -> str:
-    new = rng.choice((READ, READ, UNREAD))
-    return some_replaced(text, NUMBER, lambda number: rng.choice(new), rng)
-
-
-def scaled_number(text: str, rng: Random) -> str:
-    """By a wrong unit, or to what may well be meant: what comes after reading is reached so."""
+def tokens_changed(text: str, rng: Random) -> str:
+    """Numbers are others, of a wrong unit, or what may well be meant (what comes after reading is
+    reached so); names and units are others."""
+    named, read = rng.choice((WORD.findall(text) or NAMES, NAMES)), rng.choice((READ, READ, UNREAD))
     factors = rng.choice(((1e3, 1e-3, 1e6, -1.0, 57.2958, 1e18), (0, 0.5, 0.9, 1.1, 2, 10)))
-    new = lambda number: f"{float(number) * rng.choice(factors):.9g}"  # noqa: E731
-    return some_replaced(text, NUMBER, new, rng, most=6)
-
-
-def other_word(text: str, rng: Random) -> str:
-    names = rng.choice((WORD.findall(text) or NAMES, NAMES))
-    return some_replaced(text, WORD, lambda word: rng.choice(names), rng, most=2)
-
-
-def other_unit(text: str, rng: Random) -> str:
-    units = ("", *(found[0] for found in UNIT.finditer(text)), "_mm", "_deg", "_m", "_rad", "_kN")
-    return some_replaced(text, UNIT, lambda unit: rng.choice(units), rng)
+    units = ("", *UNIT.findall(text), "mm", "deg", "m", "rad", "kN")
+    pattern, new = rng.choice((
+        (NUMBER, lambda old: rng.choice(read)),
+        *[(NUMBER, lambda old: f"{float(old) * rng.choice(factors):.9g}")] * 2,
+        (WORD, lambda old: rng.choice(named)), (UNIT, lambda old: f"_{rng.choice(units)}"),
+    ))  # fmt: skip
+    return some_replaced(text, pattern, new, rng)
 
 
 def pieces_changed(text: str, rng: Random) -> str:
@@ -188,7 +180,7 @@ KINDS: dict[str, Callable[[Path], object]] = {
     # sparse: it takes no room
     "large": lambda path: (path.touch(), os.truncate(path, 3_000_000_000)),
 }
-ON_TEXT = (other_number, scaled_number, scaled_number, other_word, other_unit, pieces_changed)
+ON_TEXT = (*[tokens_changed] * 4, pieces_changed)
 BY_ENDING = {".csv": columns_changed, ".json": json_changed, ".urdf": xml_changed}
 
 
@@ -203,7 +195,7 @@ def spoil(path: Path, rng: Random) -> str:
     for _ in range(rng.choice((1, 1, 1, 1, 2, 4))):
         data = path.read_bytes()
         text = data.decode("utf-8", errors="surrogateescape")
-        own = [BY_ENDING[path.suffix]] * 4 if path.suffix in BY_ENDING else []
+        own = [BY_ENDING[path.suffix]] * 2 if path.suffix in BY_ENDING else []
         change = rng.choice((*ON_TEXT, *own))
         if rng.random() < 0.15:
             path.write_bytes(bytes_changed(data, rng))

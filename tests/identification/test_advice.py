@@ -7,6 +7,7 @@ import pytest
 from support.calibration import (
     GEOMETRY,
     PLACED,
+    campaign,
     cell_of,
     measured,
     planar_chain,
@@ -23,10 +24,8 @@ from elastocal.model.manipulator import Model
 SIGMA = 5e-5
 
 
-def identified(effects, seed=0, poses=30, sigma=SIGMA, q=None, change=lambda table: table):
-    model, rng = Model.assembled(planar_chain(), cell_of(effects)), np.random.default_rng(seed)
-    q = random_poses(model.chain, poses, seed) if q is None else q
-    table = measured(model, table_at(q), true_values(model, rng), sigma, rng)
+def identified(effects, change=lambda table: table, **how):
+    model, table, _ = campaign(effects, **how)
     return identify(model, change(table))
 
 
@@ -48,7 +47,11 @@ def test_ill_conditioned():
     even the barely visible directions are worth a column."""
     q = random_poses(planar_chain(), 60, 0)
     q[:, 2] = 0.5 + 2e-4 * q[:, 2]
-    result = identified(("base_frame", "link_geometry", "marker_position"), q=q, sigma=1e-10)
+    model = Model.assembled(
+        planar_chain(), cell_of(("base_frame", "link_geometry", "marker_position"))
+    )
+    rng = np.random.default_rng(0)
+    result = identify(model, measured(model, table_at(q), true_values(model, rng), 1e-10, rng))
     (warning,) = (w for w in result.warnings if w.startswith("Ill-conditioned (condition number"))
     assert "in which the joints differ more, or fix one of these parameters" in warning
     named = warning.split("barely separate ")[1].split(". Measure")[0].split(", ")

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from support.calibration import (
     GEOMETRY,
-    PLACED,
+    campaign,
     cell_of,
     combination_truth,
     measured,
-    planar_chain,
     table_at,
 )
 from support.cells import kr270_chain, random_poses
@@ -53,9 +52,7 @@ def test_the_expression_at_the_true_values_is_the_value_that_was_found():
 
 
 def test_an_interval_without_an_end_is_null_with_the_reason():
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    plan, rng = table_at(random_poses(model.chain, 9, 1)), np.random.default_rng(1)
-    result = identify(model, measured(model, plan, model.nominal, 1e-5, rng))
+    result = identify(*campaign(poses=9, seed=1, sigma=1e-5)[:2])
     known = result.estimates[0]
     endless = replace(known, ci95=(-np.inf, known.ci95[1]))
     endless = replace(result, estimates=(endless, *result.estimates[1:]))

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table_at, true_values
-from support.cells import random_poses
+from support.calibration import GEOMETRY, campaign
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.diagnosis import diagnosis as diagnosis_result
@@ -18,7 +17,6 @@ from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.sentences import warning_sentences
-from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
 PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
@@ -28,10 +26,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
 def result():
     """A clean, adequate identification with its noise stated: it has no warning."""
     tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
-    model = Model.assembled(planar_chain(), cell_of(GEOMETRY, tracker=tracker))
-    rng = np.random.default_rng(0)
-    plan = table_at(random_poses(model.chain, 40, 0), [[0, 0, 0]])
-    found = identify(model, measured(model, plan, true_values(model, rng), SIGMA, rng))
+    found = identify(*campaign(GEOMETRY, 40, tracker=tracker)[:2])
     assert found.warnings == ()
     return found
 

@@ -13,7 +13,6 @@ from support.calibration import (
     cell_of,
     covered,
     measured,
-    planar_chain,
     random_chain,
     table_at,
     true_values,
@@ -103,50 +102,6 @@ def test_distance_observation():
     # joint 1's offset turns everything about an axis, the anchor included
     assert not result["joint1.offset"].identifiable
     assert_one_arm_is_covered(result, truth)
-
-
-def test_turning_and_moving_the_tracker_changes_nothing():
-    """Positions and forces in another frame: the same arm, the same residuals.
-
-    Loads are dead forces without link weights, so even the vertical may turn.
-    """
-    nominal = Nominal((2e-5,) * 3)
-    cell = cell_of((*GEOMETRY, "joint_compliance"), nominal=nominal, load_point=(0.1, 0.1, 0.1))
-    model, rng = Model.assembled(planar_chain(), cell), np.random.default_rng(0)
-    plan = table_at(random_poses(model.chain, 20, 0), [[0, 0, 0], [0, 0, -400], [150, 100, -400]])
-    table = measured(model, plan, true_values(model, rng), SIGMA, rng)
-    R, shift = Rotation.random(rng=0), np.array([2.0, -1.0, 0.7])
-    moved = replace(table, position=R.apply(table.position) + shift, force=R.apply(table.force))
-    a, b = identify(model, table), identify(model, moved)
-    turned_back = R.inv().apply(b.residual.reshape(-1, 3)).ravel()
-    # both fits stop within 1e-4 of a standard deviation of their minimum
-    np.testing.assert_allclose(turned_back, a.residual, atol=1e-3 * SIGMA)
-    for i in range(1, 4):
-        one, two = (r[f"joint{i}.compliance"] for r in (a, b))
-        std = np.sqrt(a.covariance[(k := a.determined.index(one.name)), k])
-        assert abs(one.held - two.held) < 0.01 * std
-
-
-def test_held_out_rms_is_what_new_poses_show():
-    """40 poses held out one by one against 300 new ones, noise included in both.
-
-    Squares of 120 (900) components: relative standard errors of the rms of 7 % (2.4 %); 4 of
-    them together."""
-    model = Model.assembled(kr270_chain(), cell_of(GEOMETRY))
-    rng = np.random.default_rng(4)
-    truth = true_values(model, rng)
-    table, other = (
-        measured(model, table_at(random_poses(model.chain, n, s)), truth, SIGMA, rng)
-        for n, s in ((40, 4), (300, 5))
-    )
-    result = identify(model, table, test=other)
-    assert result.test.n == 300
-    assert result.test.rms == pytest.approx(result.heldout_rms, rel=4 * np.hypot(0.07, 0.024))
-    assert result.residual_rms < result.heldout_rms < result.nominal_rms
-    error = (other.position.ravel() - model.predict(other, result.x)).reshape(-1, 3)
-    length = np.linalg.norm(error, axis=1)
-    of_test = result.test.rms, result.test.mean, result.test.maximum
-    assert of_test == pytest.approx((np.sqrt(np.mean(length**2)), length.mean(), length.max()))
 
 
 def test_error_on_new_poses_is_the_cramer_rao_prediction():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.calibration import measured, with_values
-from support.cells import DOWN, SLANTED, TABLE_2, kr270_cell, table_of
+from support.cells import DOWN, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import InputError
 from elastocal.identification.identify import identify
@@ -16,7 +16,6 @@ from elastocal.identification.knowledge import (
     Constraints,
     GaussianPrior,
     LinearEquality,
-    physical_constraints,
     read_knowledge,
 )
 from elastocal.identification.options import Options
@@ -29,13 +28,6 @@ DOCS = Path(__file__).parents[2] / "docs" / "file-formats.md"
 
 
 @lru_cache
-def bearings() -> Model:
-    """Six drives and the bearing of joint 2, whose true compliance is zero."""
-    effects = ("joint_compliance", "off_axis_compliance:joint2")
-    return Model(kr270_cell(effects, observe="deflection"))
-
-
-@lru_cache
 def drives() -> Model:
     """Six drives, linear in them; the first cannot be seen under a vertical load."""
     return Model(kr270_cell(["joint_compliance"], observe="deflection", deflection_model="linear"))
@@ -45,30 +37,6 @@ def readings(model: Model, seed: int, force=DOWN, **values: float) -> Measuremen
     truth = with_values(model, values)
     plan = table_of(TABLE_2, np.asarray(force, dtype=float), both=model.observe == "deflection")
     return measured(model, plan, truth, SIGMA / 2**0.5, np.random.default_rng(seed))
-
-
-# --- physics ----------------------------------------------------------------------------------
-
-
-def test_a_negative_compliance_is_reported_at_its_bound_with_a_one_sided_interval():
-    model, table = bearings(), readings(bearings(), 0, SLANTED)
-    alone = identify(model, table)
-    assert alone[BEARING_X].value is None and alone[BEARING_X].limits[0] < 0
-    found = identify(model, table, Options(constraints=physical_constraints(model)))
-    at_bound = found[BEARING_X]
-    assert found.method == "constrained" and found.converged
-    assert (at_bound.value, at_bound.ci95[0]) == (0.0, 0.0) and at_bound.identifiable
-    assert 0 < at_bound.ci95[1] < 3 * at_bound.std
-    assert all(found[n].value >= 0 for n in model.names)
-    (active,) = found.active
-    assert (active.label, active.kind, active.names) == (f"{BEARING_X} >= 0", "lower", (BEARING_X,))
-    assert active.multiplier > 0
-    assert re.search(rf"{BEARING_X} +0\.0* +\[0\.0*, ", str(found))
-    # Whoever is not held back is where a fit without the bearing's axis has it.
-    held = identify(model, table, Options(fixed=(BEARING_X,)))
-    np.testing.assert_allclose(found.x, held.x, rtol=1e-5, atol=1e-13)
-    assert found.heldout_rms == pytest.approx(held.heldout_rms, rel=1e-4)
-    assert found.dof == held.dof
 
 
 # --- priors -----------------------------------------------------------------------------------

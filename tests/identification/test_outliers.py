@@ -5,19 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.calibration import (
-    PLACED,
+    campaign,
     cell_of,
     measured,
     planar_chain,
     table_at,
-    true_values,
     with_values,
 )
 from support.cells import random_poses
 
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.identification.outliers import blocks, kept_of, rejection_point
+from elastocal.identification.outliers import blocks
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
@@ -48,9 +47,8 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found():
 
 
 def test_dropping_equals_never_having_had_them():
-    model, rng = Model.assembled(planar_chain(), cell_of(PLACED)), np.random.default_rng(2)
-    plan = table_at(random_poses(model.chain, 40, 2))
-    table = measured(model, plan, true_values(model, rng), SIGMA, rng)
+    model, table, _ = campaign(poses=40, seed=2)
+    rng = np.random.default_rng(1)
     bad, position = np.sort(rng.permutation(40)[:6]), table.position.copy()
     position[bad] += rng.choice([-1.0, 1.0], (6, 3)) * rng.uniform(1e-3, 1e-2, (6, 3))
     dropped = identify(model, replace(table, position=position), Options(faulty="drop"))
@@ -67,35 +65,11 @@ def test_dropping_equals_never_having_had_them():
 def test_stated_sigmas_count():
     """A reading of sigma 2 mm that is off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm
     is."""
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    rng = np.random.default_rng(9)
-    truth = true_values(model, rng)
-    plan = table_at(random_poses(model.chain, 30, 9))
-    sigma = np.full((30, 3), 2e-5)
+    model, exact, _ = campaign(seed=9, sigma=0.0)
+    rng, sigma = np.random.default_rng(1), np.full((30, 3), 2e-5)
     sigma[:10] = 2e-3
-    exact = measured(model, plan, truth, 0.0, rng)
     position = exact.position + sigma * rng.normal(size=(30, 3))
     position[3] = exact.position[3] + [3e-3, 0, 0]
     position[20] = exact.position[20] + [1e-3, 0, 0]
-    result = identify(model, replace(plan, sigma=sigma, position=position))
+    result = identify(model, replace(exact, sigma=sigma, position=position))
     assert rows_of(result.faulty).tolist() == [20]
-
-
-@pytest.mark.parametrize("dof", [3, 8])
-def test_what_setting_far_readings_apart_makes_of_a_mean(dof):
-    """Means of readings of which those beyond the rejection point are set apart, as identification
-    does it: of the variance, and the size of what is kept, that are said."""
-    rng, readings, draws = np.random.default_rng(4), 180, 600
-    z = rng.standard_t(dof, size=(draws, readings, 3)) * np.sqrt(1 - 2 / dof)
-    kept = np.ones(z.shape[:2], dtype=bool)
-    for _ in range(8):
-        count = kept.sum(axis=1)[:, None]
-        mean = (z * kept[..., None]).sum(axis=1) / count
-        off = z - mean[:, None]
-        sigma = np.sqrt((off**2 * kept[..., None]).sum(axis=(1, 2)) / (3 * (count[:, 0] - 1)))
-        kept = (np.abs(off) < rejection_point(3 * readings) * sigma[:, None, None]).all(axis=2)
-    said = kept_of(dof, 3 * readings, 3)
-    assert readings * np.mean(mean**2) == pytest.approx(said.variance, rel=0.1)
-    assert np.sqrt(np.mean(sigma**2)) == pytest.approx(said.sigma, rel=0.03)
-    # No estimate knows more than the Fisher information of t, (dof + 1)/(dof + 3) over its scale.
-    assert said.variance > (1 - 2 / dof) * (dof + 3) / (dof + 1)

@@ -5,12 +5,11 @@ import pytest
 from scipy import linalg
 from support.calibration import (
     GEOMETRY,
+    campaign,
     cell_of,
-    measured,
     planar_chain,
     random_chain,
     table_at,
-    true_values,
 )
 from support.cells import kr270_chain, random_poses
 
@@ -80,9 +79,8 @@ def test_no_interval_for_what_the_data_cannot_determine():
     Such arms are truth + v with B v = 0; with every |v_d| up to its typical size, a parameter
     with an interval may move by less than its standard deviation.
     """
-    model, rng = Model.assembled(random_chain(0, 4), cell_of(GEOMETRY)), np.random.default_rng(0)
-    truth, plan = true_values(model, rng), table_at(random_poses(model.chain, 25, 0))
-    result = identify(model, measured(model, plan, truth, 5e-5, rng))
+    model, table, _ = campaign(GEOMETRY, 25, chain=random_chain(0, 4))
+    rng, result = np.random.default_rng(1), identify(model, table)
     B = model.regressor(result.observations.table, result.x).B
     sizes = model.sizes(B)
     _, singular, Vt = linalg.svd(B * sizes)

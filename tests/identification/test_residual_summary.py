@@ -26,18 +26,6 @@ def noise(observed: Observations, seed: int) -> np.ndarray:
     return np.random.default_rng(seed).normal(size=len(observed.value))
 
 
-def test_statistics_are_those_of_scipy() -> None:
-    observed = readings(40)
-    e = noise(observed, 1)
-    found = summarise_residuals(observed, e).groupings[0].groups[1]
-    y = e.reshape(-1, 3)[:, 1]
-    assert found.mean_square == pytest.approx(np.mean(y**2))
-    assert found.skewness == pytest.approx(stats.skew(y))
-    assert found.excess_kurtosis == pytest.approx(stats.kurtosis(y))
-    assert found.normality_p == pytest.approx(stats.normaltest(y).pvalue)
-    assert found.p == pytest.approx(2 * min(stats.chi2.cdf(y @ y, 160), stats.chi2.sf(y @ y, 160)))
-
-
 def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
     """With p = 40 of 96 rows fitted, raw residuals have mean square 0.58; z of variance 1."""
     observed = readings(8)

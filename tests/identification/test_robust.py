@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import statsmodels.api as sm
 from scipy import integrate, stats
-from support.calibration import binomial_band
 
 from elastocal.identification.outliers import (
     HUBER,
@@ -111,25 +110,6 @@ def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
     assert total <= problem.value * (1 + 1e-6)
     np.testing.assert_allclose(found.x, x.value, atol=1e-4)
     assert found.converged
-
-
-def covers(found, arm, cluster=None):
-    """How many of the intervals hold the truth."""
-    low, high = covariance_of(found, arm.B, cluster).interval(found.x).T
-    return int(((low < arm.x) & (arm.x < high)).sum())
-
-
-def test_intervals_hold_the_truth_where_readings_of_a_configuration_err_alike(arm):
-    """A deviation as large as the noise, in 15 clusters; intervals of independent readings do
-    not."""
-    rng, alike, alone = np.random.default_rng(4), 0, 0
-    for _ in range(20):
-        common = np.repeat(rng.normal(size=(15, 3)), 18, axis=0)
-        found = huber(arm.B, arm.observed(arm.errors(rng)[0] + common), 3)
-        alike += covers(found, arm, arm.configuration)
-        alone += covers(found, arm)
-    low, _ = binomial_band(20 * 9 // 3, 0.95)
-    assert alone / 3 < low <= alike / 3
 
 
 # The majority and the report.

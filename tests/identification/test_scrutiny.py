@@ -13,7 +13,6 @@ from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.identification.residuals import rms_3d
 from elastocal.identification.scrutiny import autocorrelation
 from elastocal.model.manipulator import Model
 
@@ -73,17 +72,3 @@ def test_residuals_alike_in_time_are_found_and_clean_ones_seldom(fitted):
         noise = replace(result.noise, ratio_to_stated=ratio)
         f = judged(replace(result, residual=drift.ravel(), noise=noise)).finding("autocorrelated")
         assert f.severity == severity and "random order" in f.remedy
-
-
-def test_the_budget_adds_up_to_the_held_out_error(fitted):
-    table, result = fitted
-    budget = result.uncertainty()
-    assert budget.instrument == pytest.approx(SIGMA * np.sqrt(3), rel=0.1)
-    assert budget.repeatability == 0 and budget.parameters > 0
-    B = result.B[:, [result.model.names.index(n) for n in result.determined]]
-    own = rms_3d(np.sqrt(np.einsum("rj,jk,rk->r", B, result.covariance, B)), 3)
-    assert budget.parameters == pytest.approx(own)
-    assert budget.total == pytest.approx(result.heldout_rms, rel=0.1)
-    assert budget.lack_of_fit == pytest.approx(result.predicted.lacking)
-    there = result.uncertainty(table.take(np.arange(6)))
-    assert there.instrument == budget.instrument and there.parameters != budget.parameters

@@ -99,21 +99,6 @@ def test_held_out_residuals_are_those_of_refits():
         assert np.allclose(fit.held_out[~rows], expected, rtol=0.02, atol=2e-8)
 
 
-def test_two_readings_of_one_place_that_err_alike_are_no_faulty_readings():
-    """The model lacks something there; where they are far from each other they are faulty."""
-    model, rng = arm(), np.random.default_rng(7)
-    x, found = true(model, rng), []
-    table = readings(model, x, 80, rng)
-    for near in (True, False):
-        q, position = table.q.copy(), table.position.copy()
-        q[50] = q[5] + 1e-3 if near else q[50]
-        position[50] = measured(model, replace(table, q=q), x, 0.0, rng).position[50]
-        position[[5, 50]] += 3e-4
-        fit = identify(model, replace(table, q=q, position=position))
-        found.append({o.line for o in fit.excluded})
-    assert found == [set(), set(table.row[[5, 50]])]
-
-
 def test_nothing_is_claimed_where_there_are_no_curves():
     model, rng = arm(), np.random.default_rng(7)
     x = true(model, rng, curves=0.0)
@@ -139,25 +124,3 @@ def test_faulty_readings_are_judged_beside_the_curves():
     assert {o.line for o in fit.excluded} == set(table.row[[5, 40]])
     assert not clean.faulty
     assert fit.test.rms < 1.2 * clean.test.rms
-
-
-def test_the_result_says_where_it_was_not_measured():
-    """Geometry and curves fitted in a corner of the joints' ranges, and tested there and beyond."""
-    effects = (*EFFECTS, "link_geometry")
-    model, rng = arm(*effects), np.random.default_rng(3)
-    x = true(model, rng)
-    for i, p in enumerate(model.parameters):
-        if p.effect == "link_geometry":
-            x[i] += float(p.typical or 0.0) * rng.normal()
-    drawn = ((0.6, 1.0, 100, SIGMA), (0.6, 1.0, 100, 0.0), (-HALF, HALF, 200, 0.0))
-    table, near, away = (
-        measured(model, table_at(rng.uniform(low, high, (n, 3))), x, sigma, rng)
-        for low, high, n, sigma in drawn
-    )
-    inside, far = (identify(model, table, test=test) for test in (near, away))
-    assert inside.test.p_far > 0.01 and inside.finding("test_data_far") is None
-    assert far.test.p_far < 1e-9 and far.test.far > 100
-    assert far.finding("test_data_far").numbers["far"] == far.test.far
-    assert far.test.std > 2 * inside.test.std > 0
-    assert far.to_json()["test"]["far"] == far.test.far
-    assert far.to_json()["measured_poses"]["configurations"] == 100

@@ -13,7 +13,6 @@ from support.tracker_exports import (
     spatialanalyzer,
 )
 
-from elastocal.cell.work_cell import read_cell
 from elastocal.errors import InputError
 
 DATA = "name,x,y,z,a\n" + "".join(f"{i}_M1,{100 * i},{i},{i},{7 * i}\n" for i in range(1, 7))
@@ -42,15 +41,12 @@ def refused(tmp_path, match, mapping=GOOD, **files):
         ('x_mm = "x"', 'x_mm = "xx"',
          r"data.csv: no line.*line 1 has 'name', 'x'.*not x_mm = 'xx'"),
         ('x_mm = "x"', 'x_mm = true', r"x_mm.*takes places in the file.*found true"),
-        ('x_mm = "x"', 'x_mm = ["x", "y"]', "x_mm takes one column"),
-        ('x_mm = "x"', 'x_mm = "x"\nx_m = "y"', "x_mm and x_m fill the same column"),
         ('z_mm = "z"\n', "", r"x_mm, y_mm without z"),
         ('q1_deg = "a"', 'q2_deg = "a"', "fills q2, but not q1"),
         ('q1_deg = "a"', "", "no joint values; map q1_deg"),
         ('q1_deg = "a"', '"q#_deg" = 5', r"q#_deg takes a name with #.*q1_deg = 5"),
         ("[[source]]", '[[source]]\nfiles = ["x*"]', r"no file fits files = 'x\*'.*data.csv"),
         ("[[source]]", "[[source]]\nnames = { pattern = '(' }", "no regular expression"),
-        ("[[source]]", "[[source]]\nnames = { pattern = '(.)' }", "none of the groups"),
         (
             "[[source]]",
             r"[[source]]" "\nnames = { pattern = '^(?P<configuration>[1-3])_' }",
@@ -59,8 +55,6 @@ def refused(tmp_path, match, mapping=GOOD, **files):
         ("[[source]]", '[loads]\nfull = [0, 0, -1]\n[[source]]', "no file says which load"),
         ("[[source]]", '[[source]]\nload = "full"', r"line 2: load 'full' is not in \[loads\]"),
         ("[[source]]", "[joints]\nsign = [1, 1]\n[[source]]", "sign has 2 numbers.*1 joints"),
-        ("[[source]]", "[joints]\nsign = [2]\n[[source]]", "1 or -1"),
-        ("[[source]]", "[joints]\norder = [2]\n[[source]]", r"order = \[2\]"),
         (
             "[[source]]",
             "[joints]\ncoupling = [{ joint = 3, of = 1, factor = 1.0 }]\n[[source]]",
@@ -118,27 +112,6 @@ def with_cell(tmp_path, readings, mapping="", points=None, log=None):
 def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
     moved = readings[2] + np.random.default_rng(0).normal(0, 3.0, readings[2].shape)
     assert with_cell(tmp_path, readings, points=moved).warnings == ()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ("sign = [1, 1, -1, 1, 1, 1]", "sign of joint 3"),
-        ("offset_deg = [0, 90, 0, 0, 0, 0]", "offset_deg -90 at joint 2"),
-        ("coupling = [{ joint = 3, of = 2, factor = 1.0 }]", "factor = -1 }"),
-        ([1, 0, 2], "two columns of the positions swapped"),
-        (None, "one pose later"),
-    ],
-)
-def test_what_would_make_the_readings_fit_is_named(tmp_path, readings, change, words):
-    cell, degrees, points = readings
-    cell = replace(read_cell(cell.path), limits={})
-    mapping = f"[joints]\n{change}\n" if isinstance(change, str) else ""
-    points = points[..., change] if isinstance(change, list) else points
-    log = None if change else krl(np.roll(degrees, 1, axis=0))
-    found = with_cell(tmp_path, (cell, degrees, points), mapping, log=log)
-    (warning,) = [w for w in found.warnings if "nominal arm" in w]
-    assert words in warning
 
 
 def test_markers_and_joints_must_be_the_cells(tmp_path, readings):

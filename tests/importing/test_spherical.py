@@ -75,22 +75,6 @@ def test_every_unit_and_sense_gives_the_positions_back(
     assert found.warnings == ()
 
 
-def test_the_preset_by_its_name_reads_a_total_station_in_gon(tmp_path, readings):
-    """Units come from the header; zenith angles and elevations are told apart by it too."""
-    points = readings[2].reshape(-1, 3)
-    names = [f"P{i}_{m}" for i in range(1, 11) for m in MARKERS]
-    for height, header in (("zenith", "Zenith [gon]"), ("elevation", "Elevation [gon]")):
-        polar = read_by_a_tracker(points, "gon", height)
-        rows = [
-            f"{n},{d:.12f},{a:.12f},{v:.12f}" for n, (d, a, v) in zip(names, polar, strict=True)
-        ]
-        header = f"Point ID,Range [mm],Hz [gon],{header}"
-        files = {"points.csv": "\n".join([header, *rows, ""]), "poses.dat": krl(readings[1])}
-        found = imported(tmp_path, files, presets=("spherical", "kuka"), cell=readings[0])
-        np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
-        assert found.warnings == ()
-
-
 def test_azimuths_counted_the_other_way_are_told_with_a_cell(tmp_path, readings):
     polar = read_by_a_tracker(readings[2].reshape(-1, 3), clockwise=True)
     found = brought_in(tmp_path, readings, polar)

@@ -169,14 +169,3 @@ def test_a_lone_force_column_is_the_load_and_no_marker(tmp_path, readings):
     assert "force_x, force_y in no column: taken as 0 N beside force_z" in done.output
     first = table(tmp_path / "data.csv")[0]
     assert {first[f"force_{a}_N"] for a in "xy"} == {"0.0"} and first["force_z_N"] == "-100.0"
-
-
-@pytest.mark.parametrize("width", [40, 77])
-def test_the_preview_shows_as_many_whole_columns_as_there_is_room_for(tmp_path, readings, width):
-    _, degrees, points = readings
-    file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
-    words = ["import", str(file), "--preset", "wide", "--preview"]
-    shown = CliRunner().invoke(app, words, env={"COLUMNS": str(width)}).output.splitlines()
-    at = next(i for i, line in enumerate(shown) if line.startswith("The first rows"))
-    rule = next(i for i in range(at, len(shown)) if "───" in shown[i])
-    assert shown[rule - 2].strip() == "" and shown[rule - 1].startswith(" configuration  repeat")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 
 import casadi as ca
 import numpy as np
@@ -158,23 +156,6 @@ def test_few_rows_are_evaluated_by_casadi_as_by_numpy() -> None:
     assert by_numpy(few)
 
 
-def test_complex_numbers_are_evaluated_by_numpy() -> None:
-    auto = function()
-    found = auto(ROWS + 1e-30j)[0]
-    assert by_numpy(auto)
-    expected = np.cos(ROWS[:, 0]) * ROWS[:, 1] + np.sin(ROWS[:, 0])
-    np.testing.assert_allclose(found[:, 0, 0].imag / 1e-30, expected, rtol=1e-14)
-
-
-@pytest.mark.parametrize("wrong", [
-    (), (ROWS, ROWS), (ROWS[:, :1],), (ROWS[None],), (np.ones(3),), (np.float64(1),),
-])  # fmt: skip
-def test_arrays_of_other_shapes_are_refused(wrong: tuple) -> None:
-    for backend in ("auto", "numpy"):
-        with pytest.raises(ValueError, match="per row"):
-            function(backend)(*wrong)
-
-
 # --- threads
 
 
@@ -197,13 +178,3 @@ def test_results_do_not_depend_on_threads_or_chunks(monkeypatch: pytest.MonkeyPa
     for n, chunk in ((1, 1), (3, 1), (6, 7), (7, 7), (8, 7)):
         for one, few in zip(found[1], function(x[:n], p, chunk=chunk), strict=True):
             np.testing.assert_allclose(few, one[:n], rtol=1e-15, atol=1e-15)
-
-
-def test_one_tape_and_its_pickled_copy_may_be_called_by_several_threads() -> None:
-    function, x = BatchFunction(*mixed(), "numpy"), np.random.default_rng(1).uniform(0, 1, (500, 3))
-    expected = function(x, np.ones(1))
-    again = pickle.loads(pickle.dumps(function))  # its tape is made anew there
-    with ThreadPoolExecutor(8) as pool:
-        for results in pool.map(lambda k: (function, again)[k % 2](x, np.ones(1)), range(8)):
-            for one, other in zip(results, expected, strict=True):
-                np.testing.assert_array_equal(one, other)

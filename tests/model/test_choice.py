@@ -12,11 +12,10 @@ from scipy.spatial.transform import Rotation
 from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_table
 from support.registered import forgotten, write_example
 
-from elastocal.cell.arm_description import Nominal, Tool
-from elastocal.cell.work_cell import Cell
+from elastocal.cell.arm_description import Nominal
 from elastocal.errors import InputError
 from elastocal.model.arm import Arm
-from elastocal.model.effects.base import DrivenEffect, JointMotion
+from elastocal.model.effects.base import DrivenEffect
 from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins
@@ -38,20 +37,6 @@ def test_weights_without_masses_are_refused() -> None:
 
 
 # --- markers -------------------------------------------------------------------------------
-
-
-def without_markers(*effects: str) -> Cell:
-    return replace(kr270_cell(effects), tool=Tool())
-
-
-def test_markers_are_the_tables_where_the_cell_lists_none() -> None:
-    model = Model(without_markers("marker_position"), ("front", "back"))
-    assert model.names[::3] == ("marker:front.x", "marker:back.x")
-    assert not model.nominal.any()
-    table = random_table(model.chain, 2, seed=0, markers=("back", "front"))
-    x = np.array([1.0, 0, 0, 0, 0, 0])
-    moved = np.linalg.norm((model.predict(table, x) - model.predict(table)).reshape(-1, 3), axis=1)
-    np.testing.assert_allclose(moved, table.marker == 1, atol=1e-12)  # of "front", by its name
 
 
 def test_an_unknown_marker_in_the_table_is_refused() -> None:
@@ -90,19 +75,6 @@ def test_compliances_must_be_one_per_joint() -> None:
 def test_settings_are_there_in_their_range_and_of_some_effect(effect, stated, told) -> None:
     with pytest.raises(InputError, match=told):
         model_of(effect, nominal=Nominal(settings=stated))
-
-
-@pytest.mark.parametrize(
-    "sizes, told",
-    [
-        ({"joint9": {"offset": 1.0}}, "nominal.sizes: unknown place 'joint9'"),
-        ({"joint2": {"ofset": 1.0}}, "unknown parameter of joint2 'ofset'"),
-        ({"joint2": {"curve_1": 1.0}}, "unknown parameter of joint2 'curve_1'"),
-    ],
-)
-def test_sizes_of_what_no_effect_has_are_refused(sizes, told) -> None:
-    with pytest.raises(InputError, match=told):
-        model_of("joint_offset", nominal=Nominal(sizes=sizes))
 
 
 @pytest.mark.parametrize("name", [n for n, e in CATALOGUE.items() if isinstance(e, DrivenEffect)])
@@ -151,45 +123,6 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
 
 
 # --- traits, and effects of one's own
-
-
-class Stranger(JointMotion):
-    """Nothing but what every effect must state."""
-
-    name = "stranger"
-
-
-@pytest.mark.parametrize("observe", ["position", "pose", "distance"])
-def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> None:
-    cell = kr270_cell((), observe, link_gravity=True)
-    never = {n for n, e in CATALOGUE.items() if not e.may_be_missing(cell)}
-    only = {"marker_orientation": "pose", "distance_sensor": "distance"}
-    together = {  # judged with all other components of the gap
-        "joint_curve", "residual_field", "gear_spectrum", "gravity_sag", "link_weights",
-        "torque_coupling", "torque_tilt",
-    }  # fmt: skip
-    loads = {"payload", "link_gravity"}
-    assert never == loads | together | {n for n, o in only.items() if o != observe}
-    assert {n for n, e in CATALOGUE.items() if e.acts_unasked(cell)} == {"payload", "link_gravity"}
-    light = kr270_cell((), observe)
-    assert {n for n, e in CATALOGUE.items() if e.acts_unasked(light)} == {"payload"}
-
-
-@pytest.mark.parametrize(
-    ("changes", "told"),
-    [
-        ({"name": "Big"}, "name takes lower-case letters"),
-        ({"stage": "gears"}, "stage takes transmission, geometry"),
-        ({"formats": ("urdf",)}, "formats takes rigid, elastic"),
-        (
-            {"needs": ("wind",)},
-            "needs takes time, .*, load, torque; found 'wind'",
-        ),
-    ],
-)
-def test_what_is_stated_wrongly_is_named(changes: dict[str, object], told: str) -> None:
-    with pytest.raises(InputError, match=told):
-        register(type("Wrong", (Stranger,), changes)())
 
 
 def test_the_example_of_the_page_is_one_more_effect(tmp_path: Path) -> None:

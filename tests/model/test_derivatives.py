@@ -204,14 +204,6 @@ def test_at_the_nominal_values() -> None:
     assert largest_excess(c, spread([*range(len(c.x))], 80)) <= 1
 
 
-def test_of_each_column_alone() -> None:
-    """A choice of columns is the same columns of B."""
-    c = everything("position", "equilibrium")
-    chosen = np.array([len(c.x) - 1, 3, 17])
-    B = c.model.regressor(c.table, c.x, chosen).B
-    np.testing.assert_allclose(B, c.B[:, chosen], rtol=1e-12, atol=1e-15 * np.abs(c.B).max())
-
-
 @pytest.mark.parametrize("observed", ["position", "pose"])
 def test_with_measured_torques(observed: str) -> None:
     explicit = ("joint_compliance", "joint_hardening", "backlash", "hysteresis")

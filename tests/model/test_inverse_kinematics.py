@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import casadi as ca
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from support.cells import kr270_chain, nominal_flanges, random_poses
 from support.robots import PACKAGED, packaged_urdf
 
 from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
-from elastocal.model.rigid import nominal_flange
 from elastocal.model.urdf import read_urdf
 
 POINT = np.array([0.1, -0.05, 0.2])
@@ -63,40 +58,6 @@ def test_whatever_the_arm_reaches_is_reached(name: str, oriented: bool) -> None:
     assert len(found.out_of_reach) == 0
     assert found.reached[:, 0].all()
     check(chain, found, position, wanted)
-
-
-@pytest.mark.parametrize("name", ["KR270", "Panda"])
-def test_the_first_posture_is_the_nearest(name: str) -> None:
-    """Against constrained minimisation (SLSQP) of the distance from many starts."""
-    chain = robot(name)
-    lower, upper = limits(chain)
-    position, _ = places(chain, random_poses(chain, 4, seed=1), np.zeros(3))
-    near = random_poses(chain, 1, seed=77)[0]
-    found = inverse_kinematics(chain, position, (lower, upper), near=near)
-    symbol = ca.SX.sym("q", chain.n_joints)
-    place = nominal_flange(chain, symbol)[:3, 3]
-    f = ca.Function("f", [symbol], [place])
-    J = ca.Function("J", [symbol], [ca.jacobian(place, symbol)])
-    starts = np.vstack([near, random_poses(chain, 4, seed=5)])
-    for target, q in zip(position, found.q[:, 0], strict=True):
-        reach: dict[str, Any] = {
-            "type": "eq",
-            "fun": lambda x, p=target: f(x).full().ravel() - p,
-            "jac": lambda x: J(x).full(),
-        }
-        best = np.inf
-        for start in starts:
-            tried = minimize(
-                lambda x: ((x - near) ** 2).sum(),
-                start,
-                jac=lambda x: 2 * (x - near),
-                method="SLSQP",
-                bounds=list(zip(lower, upper, strict=True)),
-                constraints=reach,
-            )
-            if tried.success:
-                best = min(best, float(np.sqrt(tried.fun)))
-        assert np.linalg.norm(q - near) < best + 1e-3
 
 
 @pytest.mark.parametrize("far", [5.0, 1e4, 1e300])

@@ -54,22 +54,6 @@ def test_a_rated_torque_comes_from_compliance_weights_or_the_strongest_joint() -
     assert torque_scale(bare, unknown, 0) == 1.0
 
 
-@pytest.mark.parametrize(
-    "effect, computed, weighed, measured",
-    [
-        ("backlash", ("load",), (), ()),
-        ("off_axis_compliance", ("load",), (), ("load",)),  # of no torque that a drive measures
-        ("hysteresis", ("approach",), ("approach",), ("approach",)),
-    ],
-)
-def test_what_the_table_must_say(effect: str, computed, weighed, measured) -> None:
-    """A load, unless the links' weights are one or the joint's torque is measured."""
-    needed = CATALOGUE[effect].needed
-    assert needed(kr270_cell()) == computed
-    assert needed(kr270_cell(link_gravity=True)) == weighed
-    assert needed(kr270_cell(torque="measured")) == measured
-
-
 def test_recorded_torques_turn_other_joints_and_tilt_links() -> None:
     """Joints about z: the link behind joint 1 tilts about x and y, which lifts the tip 1 m on."""
     coupled, tilted = model(TWO, "torque_coupling:joint1"), model(TWO, "torque_tilt:link1")

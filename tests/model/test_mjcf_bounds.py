@@ -38,7 +38,6 @@ def nested(depth: int, count: int, inside: str = BODY) -> str:
 
 WORLDS = {
     "nested replicates": nested(9, 10),
-    "a count as a float": nested(1, 0).replace('"0"', '"1e8"'),
     "composite": '<body><freejoint/><composite type="cable" count="1000000 1 1" size="1"/></body>',
     "flexcomp": '<flexcomp name="f" type="grid" count="300 300 300" spacing=".1 .1 .1"/>',
     "many elements": '<site size=".1"/>' * 6000,
@@ -49,8 +48,6 @@ TOPS = {
     + "".join(f'<hfield name="h{k}" nrow="900" ncol="900" size="1 1 1 1"/>' for k in range(2))
     + "</asset>",
     "userdata": '<size nuserdata="2000000000"/>',
-    "memory": '<size memory="900G"/>',
-    "numeric": '<custom><numeric name="n" size="10000000"/></custom>',
     "mesh": '<asset><mesh name="m" builtin="supersphere" params="90000 1 1"/></asset>',
 }
 

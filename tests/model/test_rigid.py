@@ -1,4 +1,4 @@
-"""Rotation vectors: exp and log against scipy, round trips, and their ends at 0 and π."""
+"""Rotation vectors: log against scipy, near no turn and near half a turn too."""
 
 from __future__ import annotations
 
@@ -11,11 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.model import rigid
 
-_r, _R = ca.SX.sym("r", 3), ca.SX.sym("R", 3, 3)
+_R = ca.SX.sym("R", 3, 3)
 _log = ca.Function("log", [_R], [rigid.vector_from_rotation(_R)])
-_exp_slope = ca.Function("slope", [_r], [ca.jacobian(rigid.rotation_from_vector(_r), _r)])
-_round_trip = rigid.vector_from_rotation(rigid.rotation_from_vector(_r))
-_round_trip_slope = ca.Function("slope", [_r], [ca.jacobian(_round_trip, _r)])
 
 NEAR_ZERO = [0.0, 1e-300, 1e-20, 1e-15, 1e-12, 1e-8, 1e-4]
 
@@ -34,18 +31,6 @@ angles = st.floats(0, np.pi - 0.01) | st.sampled_from(NEAR_ZERO)
 def test_log_is_scipys(axis: np.ndarray, angle: float) -> None:
     R = Rotation.from_rotvec(angle * axis).as_matrix()
     np.testing.assert_allclose(log(R), angle * axis, rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("angle", NEAR_ZERO)
-@given(axis=axes)
-@settings(deadline=None)
-def test_derivatives_are_regular_near_zero(angle: float, axis: np.ndarray) -> None:
-    """∂exp(r)/∂r is the three generators, the round trip's is the identity."""
-    generators = np.array([np.cross(np.eye(3)[k], np.eye(3)).T for k in range(3)])
-    expected = np.array([G.ravel(order="F") for G in generators]).T
-    np.testing.assert_allclose(_exp_slope(angle * axis).full(), expected, rtol=0, atol=2 * angle)
-    slope = _round_trip_slope(angle * axis).full()
-    np.testing.assert_allclose(slope, np.eye(3), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("below", [0.0, 1e-12, 1e-9, 1e-6, 1e-3])

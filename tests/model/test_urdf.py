@@ -40,9 +40,6 @@ def test_kinds_limits_and_default_axis(tmp_path: Path) -> None:
 # --- what is wrong
 
 CASES: dict[str, tuple[str, str]] = {
-    "not xml": ("hello", "not XML: syntax error in line 1, column 1"),
-    "root": ("<sdf/>", "root element is <sdf>, a URDF has <robot.*this is SDF"),
-    "no links": ("<robot/>", "has no <link>"),
     "xacro prefix": ("<robot><xacro:kuka/></robot>", "xacro macros are left in.*run xacro first"),
     "xacro value": (
         arm(replace={'xyz="0 0 1"': 'xyz="0 0 ${d}"'}),
@@ -52,10 +49,6 @@ CASES: dict[str, tuple[str, str]] = {
         arm(replace={'<parent link="l1"/>': ""}),
         "joint 'q2' has no parent link; add <parent",
     ),
-    "unknown parent": (
-        arm(replace={'<parent link="l1"/>': '<parent link="l1x"/>'}),
-        r"joint 'q2': parent link 'l1x' is not there \(did you mean 'l1'\?\)",
-    ),
     "two parents": (
         arm(extra=joint("again", "l0", "l2")),
         "link 'l2' has two parents, joints 'q2' and 'again'; kinematic loops are not supported",
@@ -64,9 +57,6 @@ CASES: dict[str, tuple[str, str]] = {
         arm(extra=joint("back", "l4", "l0")),
         "joints .*q1.* form a closed loop.*open it at one joint",
     ),
-    "two roots": (arm(extra=link("lost")), "2 links have no parent joint: l0, lost;.*connect"),
-    "unnamed link": (arm(extra="<link/>"), 'link number 6 has no name; write <link name="…">'),
-    "no type": (arm(replace={' type="revolute"': ""}), "joint 'q1' has no type; write type="),
     "type": (
         arm(replace={'type="revolute"': 'type="revolut"'}),
         r"joint 'q1': unknown joint type 'revolut' \(did you mean 'revolute'\?\); valid: revol",
@@ -80,22 +70,10 @@ CASES: dict[str, tuple[str, str]] = {
         "joint 'q1', origin xyz: 'nan' is not a finite number",
     ),
     "no limit": (arm(replace={LIMIT: ""}), "joint 'q1' is revolute without <limit>; add <limit"),
-    "no room": (
-        arm(replace={'lower="-1" upper="2"': ""}),
-        "joint 'q1': limits lower=0, upper=0 leave no room to move",
-    ),
     "mass": (arm(extra=link("m", -1)), "link 'm': mass -1 kg is negative"),
-    "no mass": (
-        arm(extra='<link name="m"><inertial/></link>'),
-        "link 'm': <inertial> without <mass",
-    ),
     "mimic": (
         arm(replace={LIMIT: LIMIT + '<mimic joint="q2"/>'}),
         "joint 'q1' mimics 'q2' and lies between base and flange; coupled joints are not supp",
-    ),
-    "mimic of nothing": (
-        arm(replace={LIMIT: LIMIT + '<mimic joint="q22"/>'}),
-        r"joint 'q1' mimics joint 'q22', which is not there \(did you mean 'q2'\?\)",
     ),
     "floating": (
         arm(replace={'type="revolute"': 'type="floating"'}),
@@ -135,19 +113,11 @@ def test_base_and_flange_names_are_checked(tmp_path: Path) -> None:
 
 
 def test_unreadable_files_are_explained(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file; check the path of the URDF file"):
-        read_urdf(tmp_path / "nothing.urdf")
-    with pytest.raises(InputError, match="is a directory; give the URDF file itself"):
-        read_urdf(tmp_path)
     large = tmp_path / "large.urdf"
     with large.open("wb") as file:
         os.truncate(file.fileno(), 60_000_000)
     with pytest.raises(InputError, match="larger than 10 MB, which no URDF file is"):
         read_urdf(large)
-    binary = tmp_path / "mesh.urdf"
-    binary.write_bytes(b"\x00\x81solid\xff" * 10)
-    with pytest.raises(InputError, match="not XML"):
-        read_urdf(binary)
     entities = tmp_path / "entities.urdf"
     entities.write_text('<!DOCTYPE robot [<!ENTITY a "aa">]><robot name="&a;"/>')
     with pytest.raises(InputError, match="has a <!DOCTYPE>"):

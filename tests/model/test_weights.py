@@ -68,17 +68,6 @@ def test_the_torques_of_any_weights_are_sums_of_them(tmp_path: Path, seed: int) 
     np.testing.assert_allclose(found, tau[len(tau) // 2 :], atol=1e-9 * np.abs(tau).max())
 
 
-def test_those_of_each_joint_are_independent_and_one_in_size() -> None:
-    chain = kr270_chain()
-    q = random_configurations(chain, 300, 3)
-    turned = [Rotation.random(random_state=k).as_matrix() for k in range(30)]
-    for place in SAG.places(chain, kr270_cell()):
-        cells = (kr270_cell(nominal=Nominal(base_rotation=R)) for R in turned)
-        D = np.vstack([sagging(chain, cell, place, q[k::30]) for k, cell in enumerate(cells)])
-        assert np.linalg.cond(D) < 50
-        np.testing.assert_allclose(np.sqrt((D**2).mean(axis=0)), 1.0, rtol=0.15)
-
-
 def test_the_moments_are_independent_but_for_what_an_upright_base_carries_anyway() -> None:
     chain, cell = kr270_chain(), kr270_cell()
     specs = WEIGHTS.parameters("arm", chain, cell)

@@ -14,12 +14,8 @@ from support.pages import Page
 
 from elastocal.cell.work_cell import CertificateEntries
 from elastocal.errors import InputError
-from elastocal.identification.scrutiny import gap_budget, pose_accuracy
-from elastocal.report.blocks import length
-from elastocal.report.judgement_view import judgement
 from elastocal.report.smaller_views import (
     Certified,
-    certified_values,
     pose_repeatability,
 )
 
@@ -58,24 +54,6 @@ def test_without_entries_it_is_a_report_and_a_missing_one_is_named(case: Any, tm
     with pytest.raises(InputError, match=r"needs \[certificate\] in the cell with number, lab"):
         case.result.certificate(tmp_path / "c.xml")
     assert not (tmp_path / "c.xml").exists()
-
-
-def test_it_is_one_page_of_accuracy_data_verdict_and_u(case: Any, tmp_path: Path) -> None:
-    """U is twice the root sum of squares of its budget."""
-    result = stated(case.result)
-    budget, parts = gap_budget(result), result.uncertainty()
-    one = np.sqrt(sum(p**2 for p in parts.parts.values()) / 3 + (12e-6 / 2) ** 2)
-    assert certified_values(result, budget).expanded == pytest.approx(2 * one)
-    page = Page(written(result, tmp_path / "c.html"))
-    rows = page.named_rows()
-    assert rows["expanded, U with k = 2"][2] == length(float(2 * one))
-    n = len(np.unique(result.observations.place))
-    accuracy = pose_accuracy(result.observations, budget.steps[-1].errors)
-    assert rows["calibrated"][1:3] == [str(n), length(float(accuracy.mean()))]
-    assert rows["d.csv"][1] == "SHA-256 abc" and rows["made on"][1]
-    assert "µm" in rows["Instrument, standard deviations"][1]
-    assert judgement(result).headline in page.text and "ISO 9283" in page.text
-    assert not page.tags["svg"]
 
 
 @pytest.mark.parametrize(

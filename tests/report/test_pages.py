@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import html
-import itertools
 import json
 import re
 from dataclasses import replace
@@ -22,11 +21,6 @@ from support.pages import Page
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.errors import InputError
-from elastocal.identification.faulty_readings import FaultyGroup, OutlierReport
-from elastocal.identification.findings import judged
-from elastocal.identification.noise_choice import Trial
-from elastocal.identification.noise_summary import NoiseSize
-from elastocal.identification.outliers import Outlier
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -89,36 +83,6 @@ def test_names_from_files_are_text(hostile: Any) -> None:
     assert len(seen(page).split()) <= 900
 
 
-def test_names_of_noise_models_and_groups_are_text_and_every_group_is_told(
-    case: Any, no_figures: None
-) -> None:
-    script, n = "<script>\x1b[31m", len(case.result.observations.lead)
-    noise = replace(
-        case.result.noise, description=script, reason=script,
-        sizes=(NoiseSize(script, 1e-6), NoiseSize("rz", 5e-6)),
-        tried=tuple(Trial(script, 1, float(k)) for k in range(2)),
-    )  # fmt: skip
-    groups = [
-        FaultyGroup("configuration", f"<b>{k}\x1b", "common", tuple(range(366)),
-                    tuple(range(142, 508)), 366, 8.8, 8.8, 1e-12, 23.0, 0)
-        for k in range(9)
-    ]  # fmt: skip
-    report = OutlierReport(
-        tuple(groups), 1.0, 100, np.ones(n, dtype=bool), {}, 0.01, tuple(case.result.determined)
-    )
-    single = tuple(Outlier(line, "7", "M1", 4.5e-3, 9.0) for line in range(142, 508))
-    changed = replace(case.result, method="reml", noise=noise, outliers=(), excluded=single,
-                      faulty_report=report)  # fmt: skip
-    page = page_of(judged(changed))
-    found = Page(page)
-    found.check_harmless(page)
-    assert script.replace("\x1b", "\\x1b") in found.text and not found.tags["b"]
-    section = page[page.index("<summary>Outliers (366)") : page.index("<summary>Which conf")]
-    assert section.count("<li>") == 9
-    assert "at most 1 %" in section and "and 266 more" in section
-    assert "\x1b" not in str(judged(changed))
-
-
 def test_an_identification_has_900_words_open_one_minus_sign_and_one_name_for_each_error(
     case: Any, shifted: Any, no_figures: None
 ) -> None:
@@ -129,26 +93,6 @@ def test_an_identification_has_900_words_open_one_minus_sign_and_one_name_for_ea
     assert re.findall(r"(?<![\w.)\]-])-\d\S*", page) == []
     errors = set(re.findall(r"(nominal arm(?:, held out)?) +([\d.]+ [µm]m)", page))
     assert len(errors) == len({name for name, _ in errors}) == 2
-
-
-@pytest.mark.long
-def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
-    """40 000 readings: thinned, said so, and below 6 MB."""
-    observed = case.result.observations
-    times = 40000 // len(observed.lead) + 1
-    rows = np.tile(np.arange(len(observed.table)), times)
-    long = replace(
-        case.result,
-        observations=observe(observed.table.take(rows), observed.kind),
-        residual=np.tile(case.result.residual, times),
-        held_out=np.tile(case.result.held_out, times),
-        noise=replace(case.result.noise, kind="none"),
-        weights=None,
-        prior_share={"joint1.offset": 0.1},  # so that nobody asks what a configuration decides
-    )
-    write_page(long, tmp_path / "r.html")
-    assert (tmp_path / "r.html").stat().st_size < 6e6
-    assert "a random choice of 5000 of" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("name", ["explained", "unknown", "many unknown"])
@@ -229,23 +173,3 @@ def test_writing_is_whole_or_not_at_all_and_names_what_was_read(
     with pytest.raises(InputError, match="cannot be written"):
         write_page(case.result, tmp_path / "full.html")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["data.csv", "r.html"]
-
-
-@pytest.mark.parametrize(("largest", "ratio"), [(1.66e3, 1.3), (270.0, 5.0), (1.9e4, 40.0)])
-def test_lengths_along_an_axis_do_not_overlap(largest, ratio):
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    rows = [
-        (f"step {k}", v, (0.9 * v, 1.1 * v), "") for k, v in enumerate((largest / ratio, largest))
-    ]
-    shown = figures.rows_of_dots("errors", "Errors", rows, "error", lengths=True)
-    figure = Figure(figsize=(shown.width, shown.height), layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    shown.draw(figure)
-    canvas.draw()
-    axis = figure.axes[0].xaxis
-    boxes = [t.get_window_extent() for t in axis.get_ticklabels() if t.get_text()]
-    boxes = sorted((b for b in boxes if b.width), key=lambda b: b.x0)
-    assert len(boxes) > 2
-    assert all(b.x1 < c.x0 for b, c in itertools.pairwise(boxes))

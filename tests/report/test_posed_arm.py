@@ -21,7 +21,6 @@ from elastocal.cell.arm_description import Nominal, Robot, Tracker
 from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
 from elastocal.model.manipulator import load_chain
 from elastocal.report.arm_view import (
-    frames_at,
     in_script,
     plan_figure,
     residual_arm,
@@ -55,20 +54,6 @@ def test_triangles_close_the_solid_from_outside(shape: Any) -> None:
     there = {tuple(edge) for edge in edges.tolist()}
     assert there == {(j, i) for i, j in there}
     assert len(there) == len(edges)
-
-
-def test_arm_stands_where_the_kinematics_puts_it() -> None:
-    cell, chain = kr270_cell(), kr270_chain()
-    frames, flange = frames_at(cell, chain, TABLE_2)
-    assert flange == pytest.approx(nominal_flanges(chain, TABLE_2))
-    assert frames.shape == (len(TABLE_2), chain.n_joints + 1, 4, 4)
-    moved = PLACED @ flange
-    frames_moved, end = frames_at(cell, chain, TABLE_2, moved)
-    assert end == pytest.approx(moved)
-    assert frames_moved == pytest.approx(PLACED @ frames)
-    # A pose without equilibrium stands at its nominal place.
-    moved[3] = np.nan
-    assert frames_at(cell, chain, TABLE_2, moved)[1][3] == pytest.approx(flange[3])
 
 
 @given(st.lists(st.text() | st.integers(), max_size=4))

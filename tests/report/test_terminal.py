@@ -15,9 +15,9 @@ from rich.cells import cell_len
 from rich.console import Console
 from support.diagnoses import MANY, VERDICTS
 
-from elastocal.report.blocks import ShownTable, probability, settings_text
+from elastocal.report.blocks import ShownTable, probability
 from elastocal.report.diagnosis_view import place_table
-from elastocal.report.identification_view import parameter_table, texts, undetermined_table
+from elastocal.report.identification_view import texts
 from elastocal.report.renderers import print_report
 
 
@@ -34,19 +34,6 @@ def printed(width: int, *arguments: Any, **how: Any) -> str:
 def cells(table: ShownTable) -> list[dict[str, str]]:
     """Rows of a table, column header → text."""
     return [dict(zip(table.heads, row, strict=True)) for row in table.rows]
-
-
-def test_every_parameter_has_a_row_and_a_number_only_where_determined(case: Any) -> None:
-    known = {row["parameter"]: row for row in cells(parameter_table(case.result))}
-    others = {row["parameter"]: row for row in cells(undetermined_table(case.result))}
-    assert set(known) | set(others) == set(case.result.model.names)
-    for e in case.result.estimates:
-        assert (e.name in known) == e.identifiable != (e.name in others)
-        if e.identifiable:
-            assert float(known[e.name]["value"]) == pytest.approx(float(texts(e, None)[0]))
-            assert float(known[e.name]["± 95 %"]) > 0
-        else:
-            assert others[e.name]["why"].startswith(("held", "only as", "fixed"))
 
 
 @pytest.mark.parametrize("width", [40, 60])
@@ -98,16 +85,6 @@ def test_a_probability_is_never_told_as_certain(p):
     text = probability(p)
     assert text not in ("0.00", "1.00")
     assert abs(float(text.strip("<> ")) - p) <= 0.0101
-
-
-def test_a_range_of_angles_has_one_unit():
-    told = settings_text({"curve_low_rad": 0.0, "curve_high_rad": 0.00391, "curve_size_rad": 1e-4})
-    assert told == "from 0° to 0.224°, size 0.100 mrad"
-
-
-def test_of_many_orders_the_rest_is_counted():
-    told = settings_text({f"order_{k}": float(k) for k in range(1, 10)})
-    assert told.startswith("orders 1.000, 2.000") and told.endswith("6.000 and 3 more")
 
 
 def test_an_effect_that_two_findings_share_a_place_with_stands_below_one_of_them_only():

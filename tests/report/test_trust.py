@@ -9,17 +9,13 @@ from html import unescape
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from identification.test_far_values import CASES
 
 import elastocal as ec
-from elastocal.identification import scrutiny
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_summary import LackOfFit
-from elastocal.identification.result import Finding, TestErrors
-from elastocal.identification.scrutiny import gap_budget
-from elastocal.identification.sentences import Told
+from elastocal.identification.result import TestErrors
 from elastocal.report import judgement_view
 from elastocal.report.blocks import length
 from elastocal.report.renderers import page_of
@@ -109,14 +105,6 @@ def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doub
     assert any("Compare the test poses" in step for step in found.steps) == doubted
 
 
-def test_what_is_only_a_note_is_not_called_a_warning(fine: Any) -> None:
-    found = (Finding("ill_conditioned", "note"), Finding("not_held_out", "care"))
-    told = (Told("a", "ill_conditioned"), Told("b", "not_held_out"), "of the table")
-    result = replace(fine, findings=(*fine.findings, *found), warnings=told)
-    labels = [("Note", "a"), ("Warning", "b"), ("Warning", "of the table")]
-    assert judgement_view.warnings_beside(result) == labels
-
-
 def test_headline_default_point_and_map_speak_of_the_same_point(tmp_path: Path) -> None:
     """Of the cell as init writes it: nobody said where the load point lies among the markers."""
     folder = CASES / "init_markers"
@@ -131,29 +119,3 @@ def test_headline_default_point_and_map_speak_of_the_same_point(tmp_path: Path) 
     bare = ec.identify(cell, folder / "train.csv")
     assert bare.load_point_error is None
     assert "load point" not in bare.to_json()["verdict"]["sentence"]
-
-
-def test_budget_goes_from_the_nominal_arm_to_the_held_out_error(case: Any) -> None:
-    budget = gap_budget(case.result)
-    assert budget is not None
-    assert [step.step for step in budget.steps] == ["nominal_arm", "geometry", "compliance"]
-    first, middle, last = (step.heldout_rms for step in budget.steps)
-    assert first == pytest.approx(case.result.nominal_rms, rel=0.5)
-    assert first > 3 * middle
-    # The true compliances are the nominal ones: to fit them costs a little and buys nothing.
-    assert middle == pytest.approx(last, rel=0.1) and middle < last
-    assert last == pytest.approx(case.result.heldout_rms)
-    for step in budget.steps:
-        assert step.ci95[0] < step.heldout_rms < step.ci95[1]
-
-
-def test_floor_is_the_scatter_of_repeats_where_there_are_some(case: Any) -> None:
-    """Every reading twice, moved apart by ± d: the scatter of a pair is √2 d per coordinate."""
-    observed, d = case.result.observations, 7e-6
-    rows = np.repeat(np.arange(len(observed.table)), 2)
-    twice = replace(observed, table=observed.table.take(rows), lead=np.arange(len(rows)))
-    apart = np.tile([d, -d], len(rows) // 2)[:, None]
-    residual = (np.zeros((len(rows), 3)) + apart).ravel()
-    floor, name = scrutiny._floor(replace(case.result, observations=twice, residual=residual))
-    assert name == "repeats alone"
-    assert floor == pytest.approx(np.sqrt(3 * 2) * d)

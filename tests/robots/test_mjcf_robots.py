@@ -20,9 +20,7 @@ TENDONS = (
 MOCAP = '<body name="target" mocap="true"/>'
 FREE = '<body name="cup" pos="2 0 0"><freejoint/><geom size="0.05"/><site name="rim"/></body>'
 LOOPS = {
-    "connect bodies": '<connect body1="rod" body2="l3" anchor="0 0 0.6"/>',
     "connect sites": '<connect site1="rodtip" site2="s3"/>',
-    "weld bodies": '<weld body1="rod" body2="l3"/>',
     "weld of a middle link to the world": '<weld body1="l3"/>',
     "connect of the flange to the world": '<connect body1="l6" anchor="0 0 0"/>',
     "joint follows": '<joint joint1="j3" joint2="j2"/>',
@@ -32,8 +30,6 @@ LOOPS = {
 }
 OPEN = {
     "weld to mocap": '<weld body1="l6" body2="target"/>',
-    "connect to mocap": '<connect body1="l6" body2="target" anchor="0 0 0"/>',
-    "weld to the world": '<weld body1="l6"/>',
     "a held cup": '<weld body1="l6" body2="cup"/>',
     "a rope to a passive rod": '<tendon tendon1="rope"/>',
     "a passive rod follows": '<joint joint1="jr" joint2="j2"/>',

@@ -136,9 +136,3 @@ def test_tails_have_the_stated_standard_deviation_and_many_far_readings():
     assert found[1] > 10 * max(found[0], 1e-4)
     with pytest.raises(InputError, match=r"noise\.tails is 2\.0: .* take a number > 2"):
         Unsteadiness(tails=2.0)
-
-
-def test_as_many_numbers_as_joints_are_needed():
-    model = model_with(noise=Unsteadiness(np.full(7, 1e-5)))
-    with pytest.raises(InputError, match=r"noise\.joints_urad has 7 numbers"):
-        simulate(model, plan_of(model), model.nominal, 0)

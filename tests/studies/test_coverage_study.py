@@ -27,16 +27,6 @@ study = study_of(FOLDER)
 NAMES = {s.key: s for s in scenarios.SCENARIOS}
 
 
-@pytest.mark.parametrize("key", ["table1_6_effect", "polar_3"])
-def test_draws_have_the_covariance_that_the_oracle_knows(key):
-    """Mean of dᵀ Σ⁻¹ d over 40 draws of n rows: n ± 5 √(2 n / 40)."""
-    setting = scenarios.Setting(NAMES[key])
-    inverse = np.linalg.inv(setting.covariance)
-    squared = [e @ inverse @ e for e in (setting.draw(k)[0] for k in range(40))]
-    n = len(setting.covariance)
-    assert abs(np.mean(squared) - n) < 5 * np.sqrt(2 * n / 40)
-
-
 def test_the_study_estimates_what_the_tool_does():
     """The study works on the model linearised at the truth; the same campaign through `identify`
     gives the same estimates and intervals within a small part of a standard deviation."""

@@ -12,10 +12,14 @@ from elastocal.cli.main import app
 
 FOLDER = Path(__file__).parents[2] / "experiment_design" / "real_arms"
 
-pytestmark = pytest.mark.skipif(
-    not os.environ.get("ELASTOCAL_DATASETS"),
-    reason="ELASTOCAL_DATASETS is unset; experiment_design/real_arms/README.md says what it names",
-)
+pytestmark = [
+    pytest.mark.long,  # of every day is the golden real_ur5
+    pytest.mark.skipif(
+        not os.environ.get("ELASTOCAL_DATASETS"),
+        reason="ELASTOCAL_DATASETS is unset; "
+        "experiment_design/real_arms/README.md says what it names",
+    ),
+]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +67,6 @@ def test_iiwa_bends_at_its_joints(folder):
     assert compliance["identifiable"] and 5e-5 < compliance["value"] < 2e-4
 
 
-@pytest.mark.long
 def test_the_faulty_block_of_the_cable_data_is_found(folder):
     """A shift by some 4 mm over lines 142 to 507, seen by the tool itself."""
     as_is = identified(folder, "irb120.toml", "irb120.csv", "--outliers", "keep")
@@ -93,7 +96,6 @@ def of_written_cell(folder, cell, train, test=None):
     return errors
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, train, test, bar",
     [
@@ -113,7 +115,6 @@ def diagnosed(folder, cell, data):
     return ran("diagnose", folder, cell, data)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(
     "cell, calibrated", [("iiwa7_rigid.toml", 1650), ("iiwa7_rigid_scale.toml", 990)]
 )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from support.cells import choices, table_at  # noqa: F401
+from support.cells import choices, random_poses, table_at
 
 from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.cell.work_cell import Cell
@@ -111,6 +111,18 @@ def measured(
         return replace(exact, distance=np.asarray(exact.distance) + noise)
     noise = sigma * rng.normal(size=(len(table), 3))
     return replace(exact, position=np.asarray(exact.position) + noise)
+
+
+def campaign(
+    effects: Sequence[str] = PLACED, poses: int = 30, seed: int = 0, sigma: float = 5e-5,
+    forces: Any = ((0, 0, 0),), chain: Chain | None = None, **cell: Any,
+) -> tuple[Model, Measurements, Array]:  # fmt: skip
+    """An arm, by default a planar one, readings of it, and the true values behind them."""
+    model = Model.assembled(chain or planar_chain(), cell_of(effects, **cell))
+    rng = np.random.default_rng(seed)
+    x = true_values(model, rng)
+    plan = table_at(random_poses(model.chain, poses, seed), forces)
+    return model, measured(model, plan, x, sigma, rng), x
 
 
 def with_values(model: Model, values: dict[str, float]) -> Array:
