@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -123,13 +124,13 @@ def draw(
     for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
         progress(f"drawing candidates, level {group + 1} of {groups}")
         wanted, lots, count = n // groups + (group < n % groups), list[Candidates](), 0
-        for lot in _checked(checker, forces, group, sobol(space, group, stream), jobs):
+        for lot in _checked(checker, forces, group, points(space, group, stream), jobs):
             lots.append(lot)
             count += len(lot.q)
             if count >= wanted or len(lots) * CHUNK >= max(TRIES * wanted if count else 0, GIVE_UP):
                 break
         if not count:
-            some = np.concatenate([*islice(sobol(space, group, stream), PER_TASK)])
+            some = np.concatenate([*islice(points(space, group, stream), PER_TASK)])
             at, j = "", space.held
             if j is not None:
                 at = f" with joint{j + 1} at {told(chain, j, space.levels[group])}"
@@ -192,14 +193,18 @@ def brought(
     return found, [names[k] for k in new], told
 
 
-def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
-    """Chunks (CHUNK, n) of an endless scrambled Sobol sequence of poses of a group."""
+def sobol(dimension: int, seed: int | np.random.SeedSequence) -> Any:
+    """A scrambled Sobol sequence of points of the unit cube."""
     from scipy.stats import qmc  # slow to import, and identify needs this module
 
-    free = len(space.lower) - (space.held is not None)
-    engine = qmc.Sobol(free, seed=np.random.default_rng(stream))
+    return qmc.Sobol(dimension, rng=np.random.default_rng(seed))
+
+
+def points(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
+    """Chunks (CHUNK, n) of an endless sequence of poses of a group."""
+    drawn = sobol(len(space.lower) - (space.held is not None), stream)
     while True:
-        yield space.poses(engine.random(CHUNK), group)
+        yield space.poses(drawn.random(CHUNK), group)
 
 
 def _check(checker: Feasibility, forces: Array, group: int, q: Array) -> Candidates:

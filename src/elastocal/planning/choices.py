@@ -25,7 +25,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import Candidates, draw, shares_of
+from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import at_stops, nearest_first
 from elastocal.planning.feasibility import Feasibility
@@ -174,11 +174,9 @@ class Choice:
         return self._least("loads,", [_with_loads(cell, given[some]) for some in hung])
 
     def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
-        from scipy.stats import qmc  # slow to import, and identify needs this module
-
         cell = self.work.cell if begun is None else begun.cell
-        draws = qmc.Sobol(3 * len(boxes.names), rng=np.random.default_rng(self.seed))
-        starts = [boxes.unit(boxes.places(cell)), *draws.random(STARTS)]
+        draws = sobol(3 * len(boxes.names), self.seed).random(STARTS)
+        starts = [boxes.unit(boxes.places(cell)), *draws]
         best = self._least("places, start", [boxes.placed(cell, boxes.at(s)) for s in starts])
         for k in range(ROUNDS):
             if best is None:

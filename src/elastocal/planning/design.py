@@ -428,11 +428,7 @@ class _Design:
         noise, alias = model.cell.noise, found.alias
         left = M if alias is None or not noise.drift else alias.information(M, when, noise)
         phi = np.sort(np.asarray(setup.criterion.of_information(drawn), dtype=np.float64))
-        seen, read = setup.information.seen(q), setup.information.seen(q, readings)
-        observed = readings.shape[1] - (model.cell.model.observe == "deflection")
-        numbers = int((read * readings[:, :, None])[:, -observed:].sum())
-        numbers *= blocks.shape[1] // (observed * read.shape[2])
-        numbers *= 2 if spec.motion.both_directions else 1
+        seen, numbers = setup.information.seen(q), setup.information.numbers(q, readings)
         numbers += 0 if known.done is None else known.done.numbers
         R, gain = setup.target_rows, None
         if known.done is not None and R is not None:

@@ -33,7 +33,7 @@ from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.model.chain import joint_index
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, available_noise, observe
+from elastocal.model.observations import SIZE, Observations, available_noise, observe
 from elastocal.simulation import simulate
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
@@ -213,6 +213,12 @@ class PoseInformation:
             found[:, 1:] &= found[:, :1]
             found[:, 0] &= found[:, 1:].any(axis=1)
         return found
+
+    def numbers(self, q: Array, readings: IntArray) -> int:
+        """How many numbers are observed of poses q (N, n), with `readings` (N, L) in each state."""
+        kind, read = self.model.observe, self.seen(q, readings) * readings[:, :, None]
+        visits = 2 if self.model.cell.design.motion.both_directions else 1
+        return visits * SIZE[kind] * int(read[:, int(kind == "deflection") :].sum())
 
     def noise(self, q: Array, readings: IntArray | None = None) -> tuple[Observations, Array]:
         """What is read at the poses q (N, n), and the Cholesky factors (N, r, r) of its covariance,

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
-from elastocal.planning.candidates import CHUNK, JointSpace, sobol
+from elastocal.planning.candidates import CHUNK, JointSpace, points
 from elastocal.planning.checkpoint import State
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.feasibility import Feasibility
@@ -231,7 +231,7 @@ def estimate(
     chunks = -(-POINTS // CHUNK)
     for group in levels:
         progress(f"searching the continuum, level {group + 1} of {len(problem.shares)}")
-        q = np.concatenate([*islice(sobol(searches.space, group, streams[group]), chunks)])
+        q = np.concatenate([*islice(points(searches.space, group, streams[group]), chunks)])
         new = setup.pool(q, np.full(len(q), group))
         lots.append(new.take(_best_feasible(searches, new.q, price(new))))
         both = FeasiblePool.join([lots[-1], pool.take(problem.group == group)])

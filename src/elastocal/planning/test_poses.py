@@ -25,7 +25,7 @@ from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm, Total
 from elastocal.planning.bodies import data_base
-from elastocal.planning.candidates import told
+from elastocal.planning.candidates import sobol, told
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, why
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
@@ -266,35 +266,33 @@ class _Sources:
                 where = raw.where(i, columns["q"][beyond[0]].header)
                 raise InputError(f"{where}: {beyond[1]}; correct the path or the limits")
 
-        def missed(t: int) -> tuple[str, str]:
-            headers = ", ".join(column.header for column in columns["position"])
-            at = f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place"
-            return at, ""
-
         if q is None:
-            assert position is not None  # _layout: joints or positions
+            assert position is not None  # _columns: joints or positions
             rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()
-            q, more = self.reached(position, rotation, spec, force, missed)
+            headers = ", ".join(column.header for column in columns["position"])
+            q, more = self.reached(
+                position, rotation, spec, force,
+                lambda t: f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place",
+            )  # fmt: skip
             source += more
         return self.poses(q, source, spec, force, weight)
 
     def box(self, box: TargetBox) -> TargetPoses:
-        position = box.lower + (box.upper - box.lower) * self.sobol(3, box.count)
+        position = box.lower + (box.upper - box.lower) * self.drawn_in(3, box.count)
         turned = box.rotation
         rotation = None if turned is None else np.broadcast_to(turned, (box.count, 3, 3))
 
-        def missed(t: int) -> tuple[str, str]:
-            x, y, z = position[t]
-            at = f"[design.test_box]: the place [{x:.3f}, {y:.3f}, {z:.3f}] m in it"
-            free = "" if turned is None else "leave out rpy_deg, "
-            return f"{self.cell.path or self.cell.name}: {at}", f"make the box smaller, {free}"
-
-        q, more = self.reached(position, rotation, box, None, missed)
+        where = f"{self.cell.path or self.cell.name}: [design.test_box]: the place"
+        q, more = self.reached(
+            position, rotation, box, None,
+            lambda t: "{} [{:.3f}, {:.3f}, {:.3f}] m in it".format(where, *position[t]),
+            f"make the box smaller, {'' if turned is None else 'leave out rpy_deg, '}",
+        )  # fmt: skip
         return self.poses(q, f"{box.count} in [design.test_box]{more}", box)
 
     def reached(
         self, position: Array, rotation: Array | None, spec: TargetPath | TargetBox,
-        force: Array | None, missed: Callable[[int], tuple[str, str]],
+        force: Array | None, place_of: Callable[[int], str], remedy: str = "",
     ) -> tuple[Array, str]:  # fmt: skip
         """Postures (T, n) with the point at places (T, 3) m of the data's frame, the flange at
         `rotation` (T, 3, 3), None for any, each the first one found that the rules allow under
@@ -315,7 +313,7 @@ class _Sources:
             )  # fmt: skip
             if count == FEW:
                 for t in found.out_of_reach[:1]:
-                    raise InputError(self._far(found, int(t), *missed(int(t))))
+                    raise InputError(self._far(found, int(t), place_of(int(t)), remedy))
                 q = found.q[:, 0].copy()
             if self.rules is None:
                 return q, ""
@@ -351,7 +349,7 @@ class _Sources:
         cell, chain, rules = self.cell, self.chain, self.rules
         low, high = finite_ranges(chain, *joint_limits(cell, chain))
         count = most if rules is None else DRAWN
-        q = low + (high - low) * self.sobol(chain.n_joints, count)
+        q = low + (high - low) * self.drawn_in(chain.n_joints, count)
         for name, levels in cell.model.compliance_levels.items():
             # Elsewhere the model has no compliance for that joint.
             q[:, joint_index(name)] = np.resize(levels, count)
@@ -370,11 +368,9 @@ class _Sources:
                 )
         return self.poses(q, f"{len(q)} drawn over the joint limits (the cell states none)")
 
-    def sobol(self, dimension: int, count: int) -> Array:
-        from scipy.stats import qmc  # slow to import, seldom asked for
-
-        sampler = qmc.Sobol(dimension, scramble=True, seed=self.seed)
-        return np.asarray(sampler.random_base2(int(np.ceil(np.log2(count))))[:count])
+    def drawn_in(self, dimension: int, count: int) -> Array:
+        drawn = sobol(dimension, self.seed).random_base2(int(np.ceil(np.log2(count))))
+        return np.asarray(drawn[:count])
 
 
 # Where position must be right: A_t, how the parameters move the tool at the test poses.
