@@ -15,7 +15,6 @@ from typer.testing import CliRunner, Result
 
 from elastocal.cli.app import VERBS
 from elastocal.cli.main import app
-from elastocal.errors import InputError
 from elastocal.model.evaluate import VARIABLE, chosen_backend
 
 
@@ -83,16 +82,6 @@ def test_a_second_cell_file_is_no_table_and_no_result(tmp_path, monkeypatch) -> 
                   "compensate placed.toml placed.toml targets.csv -o"):  # fmt: skip
         told = run(*words.replace("-o", f"-o {tmp_path}/out.csv").split())
         assert told.exit_code == 2 and "ends in .toml, where the" in told.stderr
-
-
-@pytest.mark.parametrize("key", ["a" * 20_000, "'" + "é" * 20_000 + "'"])
-def test_a_message_has_an_end(key: str, tmp_path: Path) -> None:
-    cell = tmp_path / "cell.toml"
-    name = key if key.isalnum() else f'"{key}"'
-    cell.write_text(f"[robot]\n{name} = 1\n", encoding="utf-8")
-    done = run("effects", cell)
-    assert done.exit_code == 2 and len(done.stderr) < 4000 and "cell.toml" in done.stderr
-    assert len(str(InputError(key))) < 9000
 
 
 def test_a_first_cell_that_cannot_be_read_is_not_left_behind(

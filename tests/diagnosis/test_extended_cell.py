@@ -112,25 +112,6 @@ def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
     assert [p.name for p in tmp_path.iterdir()] == ["cell.toml"]
 
 
-def test_the_model_gains_the_parameters_of_the_effects_with_their_sizes_and_no_others(tmp_path):
-    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
-    source, sizes = tmp_path / "cell.toml", {"move_lag": 2.5e-3, "move_lag_sign": 1e-3}
-    source.write_text(
-        '[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n'
-        "[model.nominal]\nsizes.joint2 = { encoder_scale = 0.01 }\n"
-    )
-    lag = replace(ECCENTRICITY, effect="move_lag", parameters=(), sizes=sizes)
-    keys, new = {"play_side": "load_and_approach"}, tmp_path / "new.toml"
-    cell = write_extended_cell(source, new, (ECCENTRICITY, JUMP, lag), keys)
-    assert cell.model.play_side == "load_and_approach"
-    assert cell.model.nominal.sizes == {"joint2": {"encoder_scale": 0.01, **sizes}}
-    typical = {p.name: p.typical for p in Model(new).parameters}
-    assert typical["joint2.move_lag"] == 2.5e-3 and typical["joint2.move_lag_sign"] == 1e-3
-    added = {p.name for f in (ECCENTRICITY, JUMP) for p in f.parameters}
-    lags = {name for name in typical if ".move_lag" in name}
-    assert typical.keys() - set(Model(source).names) == added | lags
-
-
 def test_the_cell_says_where_its_smooth_functions_end(tmp_path):
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
     source = tmp_path / "cell.toml"

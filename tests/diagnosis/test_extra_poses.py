@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from support.cells import COMPLIANCE, DOWN, kr270_cell, kr270_chain, table_of
+from support.cells import DOWN, kr270_chain, table_of
+from support.diagnosis_data import FITTED, Fault, cell, measured
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal
-from elastocal.cell.work_cell import Cell, Workspace
+from elastocal.cell.work_cell import Workspace
 from elastocal.diagnosis.diagnosis import Candidate, EffectAt, NoiseFloor
 from elastocal.diagnosis.extra_poses import plan_extra
 from elastocal.errors import InputError
@@ -21,20 +21,12 @@ from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.saving import save_extra_poses
-from elastocal.simulation import simulate, values_from
 
 Key = tuple[str, str]
 
-FITTED = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
 SIGMA, REPEATABILITY = 20e-6, 6e-6
 ECCENTRIC: Key = ("gear_eccentricity", "joint3")
 SCALE: Key = ("encoder_scale", "joint3")
-
-
-def cell_of(effects: Sequence[str] = (), **model: Any) -> Cell:
-    cell = kr270_cell([*FITTED, *effects], **model)
-    tracker = replace(cell.tracker, noise=CartesianNoise(np.full(3, SIGMA)))
-    return replace(cell, tracker=tracker)
 
 
 def diagnosis_of(rivals: Mapping[Key, float]) -> Any:
@@ -57,47 +49,26 @@ def diagnosis_of(rivals: Mapping[Key, float]) -> Any:
 
 
 def campaign(
-    effects: Mapping[str, float], half_range: float, seed: int = 0, n: int = 30, **model: Any
+    half_range: float, *faults: Fault, seed: int = 0, n: int = 30, link_gravity: bool = False
 ) -> tuple[Model, Measurements]:
-    """The plain model and readings of an arm with `effects` (parameter → value), joint 3 within
-    ± `half_range` rad, times a minute apart."""
-    chain = kr270_chain()
-    plain = cell_of(**model)
+    """The plain model and readings of an arm with `faults`, joint 3 within ± `half_range` rad,
+    times a minute apart."""
+    chain, plain = kr270_chain(), cell(FITTED, sigma=SIGMA, link_gravity=link_gravity)
     rng = np.random.default_rng((seed, 1))
     q = rng.uniform(*finite_ranges(chain, *joint_limits(plain, chain)), (n, 6))
     q[:, 2] = rng.uniform(-half_range, half_range, n)
     table = table_of(q, DOWN, both=True)
     table = replace(table, time=30.0 * (np.arange(len(table)) // 3))
-    return Model.assembled(chain, plain), measured(table, effects, seed, **model)
+    return Model.assembled(chain, plain), measured(chain, plain, faults, table, seed)
 
 
-def measured(
-    table: Measurements, effects: Mapping[str, float], seed: int, **model: Any
-) -> Measurements:
-    """The table as read on the arm with `effects`, with tracker noise and repeatability."""
-    names = {"eccentricity": "gear_eccentricity", "hysteresis": "hysteresis"}
-    active = {
-        f"{names[key.split('_')[0]]}:{where}"
-        for where, _, key in (name.partition(".") for name in effects)
-    }
-    nominal = Nominal(joint_compliance=COMPLIANCE)
-    truth = Model.assembled(kr270_chain(), cell_of(sorted(active), nominal=nominal, **model))
-    rng = np.random.default_rng((seed, 2))
-    key = np.column_stack([table.configuration, table.force])
-    visit = np.unique(key, axis=0, return_inverse=True)[1].ravel()
-    shake = REPEATABILITY * rng.normal(size=(visit.max() + 1, 6))
-    read = simulate(
-        truth, replace(table, q=table.q + shake[visit]), values_from(truth, dict(effects)), rng
-    )
-    return replace(read, q=table.q)
-
-
-NARROW = {"joint3.eccentricity_sin": 1.5e-4, "joint3.eccentricity_cos": -1e-4}
+def eccentric(joint: str, sine: float, cosine: float = 0.0) -> Fault:
+    return Fault("gear_eccentricity", joint, {"eccentricity_sin": sine, "eccentricity_cos": cosine})
 
 
 @pytest.fixture(scope="module")
 def narrow() -> tuple[Model, Measurements]:
-    return campaign(NARROW, 0.5)
+    return campaign(0.5, eccentric("joint3", 1.5e-4, -1e-4))
 
 
 @pytest.fixture(scope="module")
@@ -138,9 +109,7 @@ def test_rivals_that_stay_alike_are_planned_for_as_one() -> None:
         ("link_mass_error", "link2"): 0.3,
         ("encoder_scale", "joint2"): 0.3,
     }
-    model, table = campaign(
-        {"joint2.eccentricity_sin": 1e-4, "joint2.eccentricity_cos": 1e-4}, 2.0, link_gravity=True
-    )
+    model, table = campaign(2.0, eccentric("joint2", 1e-4, 1e-4), link_gravity=True)
     extra = plan_extra(model, table, diagnosis_of(trio), most=3)
     alike = [t for t in extra.advice if "no pose separates" in t]
     assert len(alike) == 1 and "encoder_scale" not in alike[0]
@@ -157,12 +126,14 @@ def test_rivals_that_stay_alike_are_planned_for_as_one() -> None:
 def test_the_side_of_approach_is_chosen_where_rivals_depend_on_it() -> None:
     """Approached from one side only, hysteresis is an offset of the joint times its load."""
     pair = {("hysteresis", "joint3"): 0.5, ("joint_hardening", "joint3"): 0.5}
-    model, table = campaign({}, 2.0)
-    true = {"joint3.hysteresis": 1e-4}
+    model, table = campaign(2.0)
+    true = Fault("hysteresis", "joint3", {"hysteresis": 1e-4})
     sides = np.random.default_rng(5).choice([-1.0, 1.0], (30, 6))
     sides[:, 2] = 1.0
     table = replace(table, approach=sides[table.configuration])
-    extra = plan_extra(model, measured(table, true, 3), diagnosis_of(pair), most=4)
+    extra = plan_extra(
+        model, measured(model.chain, model.cell, [true], table, 3), diagnosis_of(pair), most=4
+    )
     assert extra.plan is not None
     assert (extra.plan.approach[:, 2] == -1.0).any()
     assert any("side that the plan states" in text for text in extra.advice)
@@ -170,7 +141,7 @@ def test_the_side_of_approach_is_chosen_where_rivals_depend_on_it() -> None:
 
 def test_a_horizontal_pull_is_advised_where_it_helps() -> None:
     """A weight turns joint 2 about one axis; a pull bends it across that axis too."""
-    model, table = campaign({"joint2.eccentricity_sin": 1e-4}, 2.0)
+    model, table = campaign(2.0, eccentric("joint2", 1e-4))
     bent, base = ("off_axis_compliance", "joint2"), ("base_compliance", "base")
     hard = ("joint_hardening", "joint2")
 
@@ -182,7 +153,7 @@ def test_a_horizontal_pull_is_advised_where_it_helps() -> None:
     assert "would separate off_axis_compliance:joint2 and base_compliance:base" in apart
     low, high = map(float, re.findall(r"from (0\.\d+) to (0\.\d+)", more)[0])
     assert more.startswith("pull horizontally: 2 poses") and high > low + 0.1
-    assert not told(("encoder_scale", "joint3"), ("gear_eccentricity", "joint2"))
+    assert not told(SCALE, ECCENTRIC)
 
 
 def test_a_cell_without_room_says_which_rule_is_in_the_way(narrow) -> None:

@@ -17,9 +17,7 @@ from typer.testing import CliRunner
 
 import elastocal as ec
 from elastocal.cli.main import app
-from elastocal.export.export import Wish
-from elastocal.export.export import export as to_text
-from elastocal.export.exportable import Conditions, random_table, read_joint_correction
+from elastocal.export.exportable import read_joint_correction
 from elastocal.export.mjcf_file import MujocoRest
 
 HELD = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
@@ -175,31 +173,6 @@ def test_what_is_no_joint_correction_is_refused(tmp_path, text, told):
     (tmp_path / "c.csv").write_text(text)
     with pytest.raises(ec.InputError, match=told):
         read_joint_correction(tmp_path / "c.csv")
-
-
-@pytest.mark.parametrize("robot", ['mjcf = "arm.xml"', f'urdf = "{KR270}"'])
-def test_a_file_of_the_user_takes_what_was_fitted(tmp_path, robot):
-    """Gear errors known exactly are the correction alone; the file without it is fitted to them."""
-
-    def value(p: ec.Parameter) -> float | None:
-        return 2e-4 if p.effect == "gear_eccentricity" else None
-
-    write_arm(tmp_path, LOADABLE)
-    cell, result = write_result(tmp_path, robot, (*HELD, "gear_eccentricity"), value=value)
-    content = json.loads(result.read_text())
-    q = random_table(ec.read_calibrated(cell, result).model, Conditions(), 40, 0).q
-    force = np.tile([0.0, 0.0, -80.0], (40, 1))
-    content["measured_visits"] = {"q": q.tolist(), "force_N": force.tolist()}
-    result.write_text(json.dumps(content))
-    arm = ec.read_calibrated(cell, result)
-    for correct in (False, True):
-        done = to_text(arm, Wish("mjcf", poses=100, correct_joints=correct))
-        assert done.refit is not None and done.checked < 1e-6
-        assert not [warning for warning in done.warnings if "cannot take" in warning]
-        if correct:
-            assert done.refit.correction < 1e-6 < 0.1 * done.refit.after
-        else:
-            assert done.refit.taken and done.refit.after < 0.8 * done.refit.before
 
 
 # What a file written elsewhere or in another format says

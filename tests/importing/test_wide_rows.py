@@ -68,18 +68,6 @@ def test_a_marker_that_was_hidden_is_left_out_alone_and_listed(tmp_path, reading
     assert len(table(tmp_path / "data.csv")) == 2 * len(degrees) - 1
 
 
-def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path, readings):
-    _, degrees, points = readings
-    file = wide(tmp_path / "log.csv", degrees, points, "pos{axis}({marker})", "")
-    (tmp_path / "map.toml").write_text(
-        '[[source]]\n[source.columns]\n"q#_deg" = "q#"\nx_mm = "posx(*)"\ny_mm = "posy(*)"\n'
-        'z_mm = "posz(*)"\n[source.names]\nmarkers = { M2 = "ball" }\n'
-    )
-    done = run(file, "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
-    assert done.exit_code == 0, done.output
-    assert {row["marker"] for row in table(tmp_path / "data.csv")} == {"M1", "ball"}
-
-
 @pytest.mark.parametrize(
     ("name", "force"),
     [("log_2600N", 2600.0), ("payload_2p5kg", 2.5 * 9.80665), ("load2.6kN", 2600.0),

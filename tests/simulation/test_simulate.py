@@ -18,7 +18,7 @@ from elastocal.cell.arm_description import (
 from elastocal.errors import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import position_covariance
-from elastocal.simulation import draw_errors, expand_plan, simulate
+from elastocal.simulation import draw_errors, simulate
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 5e-5])))
 POLAR = Tracker(np.array([3.0, 0.5, 1.0]), PolarNoise(2e-6, 5e-6, 1e-5, 3e-5))
@@ -37,17 +37,6 @@ def chi2_band(dof, level=1e-3):
 
 
 # --- readings -------------------------------------------------------------------------------
-
-
-def test_without_noise_the_readings_are_the_models_prediction():
-    model = model_with()
-    plan, truth = plan_of(model), true_values(model_with(), np.random.default_rng(0))
-    table = simulate(model, plan, truth, 0, noise=False)
-    np.testing.assert_allclose(table.position.ravel(), model.predict(plan, truth), atol=1e-14)
-    # a cell that states no noise makes exact readings, too
-    assert np.array_equal(simulate(model, plan, truth, 0).position, table.position)
-    exact = simulate(model_with(AXIS), plan, truth, 0, noise=False)
-    assert np.array_equal(exact.position, table.position)
 
 
 @pytest.mark.parametrize(("tracker", "rows"), [(AXIS, None), (POLAR, None), (AXIS, "polar")])
@@ -91,19 +80,6 @@ def test_drawn_errors_have_the_typical_sizes():
 
 
 # --- plans ----------------------------------------------------------------------------------
-
-
-def test_expand_plan_orders_rows_as_one_would_measure():
-    plan = table_at(np.arange(6.0).reshape(2, 3))
-    rows = expand_plan(plan, ("A", "B"), repeats=2, load=np.array([0.0, 0.0, -100.0]))
-    assert len(rows) == 2 * 2 * 2 * 2
-    labels = list(zip(rows.configuration, rows.repeat, rows.force[:, 2], rows.marker, strict=True))
-    expected = [(c, r, f, m) for c in (0, 1) for r in (0, 1) for f in (0.0, -100.0) for m in (0, 1)]
-    assert labels == expected
-    assert rows.marker_names == ("A", "B")
-    assert np.array_equal(rows.row, np.repeat(plan.row, 8))
-    assert np.array_equal(rows.q, plan.q[rows.configuration])
-    assert np.array_equal(plan.force, np.zeros((2, 3)))  # the plan itself is left alone
 
 
 def test_a_drift_is_correlated_in_time_and_the_table_says_when():
