@@ -193,16 +193,18 @@ def brought(
     return found, [names[k] for k in new], told
 
 
-def sobol(dimension: int, seed: int | np.random.SeedSequence) -> Any:
-    """A scrambled Sobol sequence of points of the unit cube."""
+def sobol(dimension: int, seed: int | np.random.Generator) -> Any:
+    """A scrambled Sobol sequence of points of the unit cube; a number is another seed to it than a
+    generator made of that."""
     from scipy.stats import qmc  # slow to import, and identify needs this module
 
-    return qmc.Sobol(dimension, rng=np.random.default_rng(seed))
+    return qmc.Sobol(dimension, seed=seed)
 
 
 def points(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
     """Chunks (CHUNK, n) of an endless sequence of poses of a group."""
-    drawn = sobol(len(space.lower) - (space.held is not None), stream)
+    free, rng = len(space.lower) - (space.held is not None), np.random.default_rng(stream)
+    drawn = sobol(free, rng)
     while True:
         yield space.poses(drawn.random(CHUNK), group)
 

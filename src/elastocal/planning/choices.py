@@ -175,7 +175,7 @@ class Choice:
 
     def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
         cell = self.work.cell if begun is None else begun.cell
-        draws = sobol(3 * len(boxes.names), self.seed).random(STARTS)
+        draws = sobol(3 * len(boxes.names), np.random.default_rng(self.seed)).random(STARTS)
         starts = [boxes.unit(boxes.places(cell)), *draws]
         best = self._least("places, start", [boxes.placed(cell, boxes.at(s)) for s in starts])
         for k in range(ROUNDS):
