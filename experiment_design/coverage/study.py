@@ -17,7 +17,7 @@ import pandas as pd
 from scenarios import SCENARIOS, Setting, setting
 from scipy import stats
 
-from elastocal.identification.covariance import cluster_robust
+from elastocal.identification.least_squares import cluster_robust
 from elastocal.identification.outliers import majority, settle
 from elastocal.identification.published import eq14, ols
 

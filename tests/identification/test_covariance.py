@@ -13,7 +13,7 @@ import statsmodels.api as sm
 from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.covariance import (
+from elastocal.identification.least_squares import (
     Covariance,
     cluster_robust,
     clustered,

@@ -27,7 +27,7 @@ from elastocal.export.exportable import (
 )
 from elastocal.export.mjcf_file import MujocoRest, NotInPlace
 from elastocal.files import atomic_write_text, together
-from elastocal.identification.covariance import t_quantile
+from elastocal.identification.least_squares import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain
 from elastocal.model.effects.catalogue import effect_of

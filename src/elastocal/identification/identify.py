@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
-from elastocal.identification.least_squares import Problem
-from elastocal.identification.methods import is_exact, run_method
+from elastocal.identification.least_squares import Covariance, Problem, variance_of
 from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.noise_choice import (
+    NoiseFit,
+    estimate_noise,
+    linearised,
+    over_times,
+    weights_of,
+)
+from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.noise_summary import noise_of, noise_parts
-from elastocal.identification.options import MethodResult, Options
-from elastocal.identification.outliers import Outlier, describe, find_faulty
+from elastocal.identification.options import ROBUST, MethodResult, Options, spread_of
+from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
     left_open,
@@ -25,6 +34,7 @@ from elastocal.identification.prediction import (
     predicted_error,
 )
 from elastocal.identification.residuals import (
+    held_out_residual,
     rms_3d,
     summarise_residuals,
     told_by_one,
@@ -32,7 +42,14 @@ from elastocal.identification.residuals import (
 from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.sentences import warning_sentences
-from elastocal.identification.solve import Solution, bent, residual_sigma, solve
+from elastocal.identification.solve import (
+    Solution,
+    bent,
+    chosen_again,
+    fit_kept,
+    residual_sigma,
+    solve,
+)
 from elastocal.identification.start import (
     check_rows,
     check_table,
@@ -58,7 +75,7 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, subset
-from elastocal.units import Array, BoolArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 __all__ = ["Options", "identify"]
 
@@ -134,7 +151,7 @@ def _fitted(
 
     progress("looking for outliers")
     none = np.zeros(len(observed.lead), dtype=bool)
-    faulty, sound = none if is_exact(every) else find_faulty(every), every
+    faulty, sound = none if every.exact else find_faulty(every), every
     if faulty.any():
         try:
             sound = refit(~faulty)
@@ -225,7 +242,7 @@ def summarise(
     if leverage is None and not solution.problem.large:
         leverage = solution.leverage
     report = None
-    if not is_exact(every):
+    if not every.exact:
         fitted = found.solution if set_apart or found.smooth else sound
         report = report_faulty(every, fitted, found.noise, found.good, found.standard)
     result = Calibration(
@@ -374,3 +391,330 @@ def _correlations(
     strong = [(a, b) for a, b in zip(i, j, strict=True) if abs(rho[a, b]) > CORRELATED]
     strong.sort(key=lambda ab: -abs(rho[ab]))
     return tuple((names[a], names[b], float(rho[a, b])) for a, b in strong)
+
+
+# The default method: noise estimated from the residuals, faulty readings judged by that noise.
+
+Refit = Callable[[BoolArray], Solution]  # of these observations
+
+ROUNDS, RESTARTS = 14, 2
+# Of a standard deviation: what relinearising may still move an estimate by at the end, and where
+# the kind of noise is chosen.
+SETTLED, LINEAR = 0.01, 1.0
+
+# A fit to the good observations (N,), the noise found from them, and which they are.
+Adapted = tuple[Solution, NoiseFit, BoolArray]
+
+FIRST = ("independent", "stated")  # noise whose weights are those of the first fit
+OF_READINGS = "auto, of readings"  # the best noise model but those that know the arm's visits
+
+
+def _adapted(
+    every: Solution, start: Solution, good: BoolArray, kind: str, progress: Progress,
+    refit: Refit | None, noise: NoiseFit | None = None,
+) -> Adapted:  # fmt: skip
+    """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
+
+    `every` holds all observations, `start` the fit to the `good` (N,) ones.  Noise and good
+    readings are settled at its values and the kept parameters fitted anew with these weights, until
+    neither changes.  Then what was chosen on the way is chosen again by what is there now:
+    the parameters, if other readings are good or the weights show more, and the kind of noise,
+    unless one is given.  More parameters that do not settle are none: the fit without them stays.
+    Without `refit` no reading is judged.
+    """
+    asked = "auto" if kind == OF_READINGS else kind
+    problem, solution, now, fitted = every.problem, start, good, good
+    readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
+    check_supported(asked, readings)
+    sure, restarts, fewer = False, 0, None
+    for left in reversed(range(ROUNDS)):
+        before, kept, first = now, start.reduction.kept, noise is None
+        if refit is None:
+            noise = estimate_noise(readings, asked, noise)
+        else:
+            noise, now = settle(readings, asked, now, noise)
+        progress(f"fitting with the noise found ({noise.kind})")
+        expected = solution.fit.x[kept] + noise.x
+        solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
+        readings = _linearised(problem, solution.fit.x, kept, kind)
+        moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
+        same = np.array_equal(now, before)
+        # What relinearising moves by more may have looked like some noise.
+        sure = sure or (first and same and moved.max(initial=0.0) < LINEAR)
+        if moved.max(initial=0.0) >= SETTLED or not same:
+            continue
+        others = refit is not None and restarts < RESTARTS and not np.array_equal(now, fitted)
+        if others and refit is not None:
+            start, fitted, restarts = every if now.all() else refit(now), now, restarts + 1
+            solution, more = start, start.reduction
+        else:
+            # Weights that make light of what is noisy may show more than those of the first fit.
+            heavy = noise.kind not in FIRST and left > 0
+            more = chosen_again(solution) if heavy else start.reduction
+        if others or len(more.kept) > len(kept):
+            fewer = None if others else (solution, noise, now, readings)
+            start, sure = replace(start, reduction=more), False
+            readings = _linearised(problem, solution.fit.x, more.kept, kind)
+            continue
+        settled, chosen = noise.kind, sure
+        if not sure:
+            noise, sure = estimate_noise(readings.take(now), asked), True
+        if chosen or noise.kind == settled:
+            break
+    else:
+        if fewer is not None:
+            solution, noise, now, readings = fewer
+    assert noise is not None
+    final = readings.take(now)
+    return solution, over_times(estimate_noise(final, like=noise), final), now
+
+
+def _linearised(problem: Problem, x: Array, kept: IntArray, kind: str) -> Readings:
+    readings = linearised(problem.model, problem.observations, x, kept)
+    return replace(readings, visits=None) if kind == OF_READINGS else readings
+
+
+def refined(
+    every: Solution, start: Solution, x: Array, good: BoolArray, weights: Weights
+) -> Solution:
+    observed = every.problem.observations
+    chosen = observed if good.all() else subset(observed, good)
+    problem: Problem = replace(start.problem, observations=chosen, weights=weights)
+    found = fit_kept(problem, start.sizes, x, start.reduction)
+    return replace(start, problem=problem, fit=found)
+
+
+# The methods by name.
+
+COMPUTED = (
+    "The readings agree with the model to rounding: they are computed, not measured, and tell "
+    "nothing of the noise."
+)
+
+
+def run_method(
+    every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, refit: Refit,
+    options: Options, progress: Progress,
+) -> MethodResult:  # fmt: skip
+    """Carry out `options.method` from the fit to all observations and that to the good ones.
+
+    `sound` is the fit to the observations that are not `faulty` (N,), `refit` makes another such;
+    they know nothing of smooth functions among the parameters `free`.  Constraints and prior come
+    last, on the weights and the readings that the method ends with.
+    """
+    own = None
+    if every.problem.model.shrunk[free].any():
+        from elastocal.identification.smooth_fit import fit_smooth  # few models have any
+
+        found, own = fit_smooth(every, sound, faulty, free, options, progress)
+    elif options.knows:
+        alone = replace(options, constraints=None, prior=None, intervals="auto")
+        found = _by_method(every, sound, faulty, refit, alone, progress)
+    else:
+        found = _by_method(every, sound, faulty, refit, options, progress)
+        return with_limits(every, found, options)
+    if not options.knows:
+        return found
+    from elastocal.identification.constrained import fit_with_knowledge  # it brings a cone solver
+
+    return fit_with_knowledge(found, options, progress, own)
+
+
+def _by_method(
+    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, options: Options,
+    progress: Progress,
+) -> MethodResult:  # fmt: skip
+    method, exact = options.resolved, sound.exact
+    if method == "reml" and not every.problem.large and not exact:
+        return _reml(every, sound, faulty, refit, options, progress)
+    if method in ROBUST:
+        return robust_result(method, every, sound, ~faulty, options.intervals)
+    # As published, every reading counts; and at equal weights noisy readings look faulty.
+    explained = partial(_explained, every, sound, None, ~faulty)
+    drop = options.sets_aside(faulty, explained) and (
+        method in ("wls", "reml") or options.faulty == "drop"
+    )
+    solution, good = (sound if drop else every), ~faulty
+    if method in ("eq14", "eq14-residual"):
+        return _published(method, every, solution, good, options, progress)
+    kind = "ols" if solution.problem.weights.kind == "none" else "wls"
+    spread = spread_of(solution, options.intervals, None)
+    return MethodResult(
+        kind, solution, spread, None, good, warnings=(COMPUTED,) if exact else ()
+    )  # fmt: skip
+
+
+# Parameters that the readings hardly show.
+#
+# A compliance or a backlash has a sign, and one whose 95 % interval reaches beyond its physical
+# bound is told from nothing.  Its estimate is mostly noise, and worse than what was known before:
+# where the interval has room for the nominal value, that stands in its place; else the estimate,
+# or the bound where it lies beyond.  What the readings say of it is the interval.
+
+
+def hardly_shown(found: MethodResult) -> dict[int, tuple[float, float]]:
+    """The 95 % intervals, by parameter, of those fitted that reach beyond a physical bound and
+    stand alone."""
+    solution, reach = found.solution, {}
+    std, ends = found.spread.std, found.ci95
+    for k, c in enumerate(solution.reduction.kept.tolist()):
+        p = solution.problem.model.parameters[c]
+        _, (low, high) = solution.reduction.widened(
+            k, solution.sizes, std[k], float(solution.fit.x[c]), ends[k]
+        )
+        beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
+        if beyond and not p.shrunk and not solution.reduction.terms(k, solution.sizes, std[k]):
+            reach[c] = (low, high)
+    return reach
+
+
+def with_limits(every: Solution, found: MethodResult, options: Options) -> MethodResult:
+    """The result with the parameters that the readings hardly show held, and the others fitted
+    anew with the weights and the kind of noise found.
+
+    One that lies beyond its bound by more than its interval contradicts the model and stays
+    fitted: whoever reads it has to see that.  Of methods other than generalised and ordinary least
+    squares all stay fitted; where bounds or knowledge were given, these say what the readings do
+    not, and nothing is held.
+    """
+    fitted = found.method in ("reml", "wls", "ols")
+    limits: dict[int, tuple[float, float]] = {}
+    while True:
+        limits = hardly_shown(found) | limits  # held ones keep what was found of them
+        held = _held(found, limits) if fitted else {}
+        again = _holding(every, found, held, options) if held else None
+        if again is None:
+            return replace(found, limits=limits)
+        found = again
+
+
+def _held(found: MethodResult, limits: dict[int, tuple[float, float]]) -> dict[int, float]:
+    held, fit = {}, found.solution.fit
+    for c in set(limits) & set(fit.columns.tolist()):
+        p, (low, high), x = found.solution.problem.model.parameters[c], limits[c], float(fit.x[c])
+        if p.nominal != 0 and low <= p.nominal <= high:
+            held[c] = p.nominal
+        elif not p.lower <= x <= p.upper and low < p.upper and p.lower < high:
+            held[c] = min(max(x, p.lower), p.upper)
+    return held
+
+
+def _holding(
+    every: Solution, found: MethodResult, held: dict[int, float], options: Options
+) -> MethodResult | None:
+    """The result of a fit that holds some of its parameters; None where there is none."""
+    solution, noise = found.solution, found.noise
+    x0, lost = solution.problem.x0.copy(), np.isin(solution.reduction.kept, list(held))
+    if lost.all():
+        return None
+    x0[list(held)] = list(held.values())
+    reduction = solution.reduction.without(lost)
+    problem = replace(solution.problem, x0=x0)
+    fit = fit_kept(problem, solution.sizes, solution.fit.x, reduction)
+    if not fit.converged:
+        return None
+    solution = replace(solution, problem=problem, fit=fit, reduction=reduction)
+    if noise is not None:
+        observed = every.problem.observations
+        readings = linearised(problem.model, observed, fit.x, reduction.kept)
+        if len(problem.observations.lead) < len(found.good):
+            readings = readings.take(found.good)
+        noise = over_times(estimate_noise(readings, like=noise), readings)
+    spread = spread_of(solution, options.intervals, noise)
+    return replace(found, solution=solution, spread=spread, noise=noise)
+
+
+def _reml(
+    every: Solution,
+    sound: Solution,
+    faulty: BoolArray,
+    refit: Refit,
+    options: Options,
+    progress: Progress,
+) -> MethodResult:
+    def found(
+        start: Solution, good: BoolArray, kind: str, known: NoiseFit | None = None
+    ) -> Adapted:
+        solution, noise, good = _adapted(every, start, good, kind, progress, refit, known)
+        explained = partial(_explained, every, solution, noise, good)
+        if not good.all() and not options.sets_aside(~good, explained):
+            # So many faulty readings look like anything that scatters or drifts.
+            plainly, everything = OF_READINGS if kind == "auto" else kind, np.ones_like(good)
+            solution, noise, _ = _adapted(every, every, everything, plainly, progress, None)
+        return solution, noise, good
+
+    solution, noise, good = found(sound, ~faulty, options.noise)
+    if options.noise == "auto" and Kind.of(noise.kind).by_visit:
+        # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
+        # which make light of it let the fit go where poses left out are predicted worse.
+        progress("comparing with noise of the readings alone")
+        agreed = sound if np.array_equal(good, ~faulty) else every if good.all() else refit(good)
+        plain = found(agreed, good, OF_READINGS, noise.of_readings())
+        if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
+            tests = noise.tests
+            solution, noise, good = plain
+            noise = replace(noise, tests=tests)  # which say what is not counted
+    spread = spread_of(solution, options.intervals, noise)
+    return MethodResult("reml", solution, spread, noise, good)
+
+
+def _explained(
+    every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
+) -> BoolArray:
+    """Readings (N,) that are not `good`, of groups which one common shift each explains."""
+    report = report_faulty(every, fitted, noise, good)
+    known = [] if report is None else [f.readings for f in report.shifted]
+    return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
+
+
+WORSE = 1.02  # held-out errors that differ by less are alike
+
+
+def _held_out_rms(solution: Solution, judge: Solution) -> float:
+    """Root mean square length in m of what poses left out are off by: those which the noise of
+    `judge` takes for one, configurations or blocks in time."""
+    judged, together = judge.problem.observations, judge.problem.weights.together
+    held = solution.heldout
+    if together is not None:
+        block = dict(zip(judged.configuration.tolist(), together.tolist(), strict=True))
+        observed, weights = solution.problem.observations, solution.problem.weights
+        left_out = np.array([block.get(c, -1) for c in observed.configuration.tolist()])
+        if weights.together is not None:
+            weights = replace(weights, together=left_out)
+        fit = solution.fit
+        held = held_out_residual(fit.B, fit.residual, weights, left_out, observed.size)
+    known = held[np.isfinite(held)]
+    return float(np.sqrt(np.mean(known**2)))
+
+
+def _published(
+    method: str,
+    every: Solution,
+    start: Solution,
+    good: BoolArray,
+    options: Options,
+    progress: Progress,
+) -> MethodResult:
+    """Eq. (14) on the linearised model, and a fit of the exact one with the weights it ends at."""
+    from elastocal.identification import published
+
+    progress("iterating the weights of eq. (14)")
+    observed, fit = start.problem.observations, start.fit
+    group = None
+    if method == "eq14":
+        key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
+        group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
+    size = start.sizes[fit.columns]
+    last = published.eq14(fit.B * size, fit.residual, group)[-1]
+    text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
+    weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
+    fitted = good if len(observed.lead) < len(good) else np.ones_like(good)
+    solution = refined(every, start, start.fit.x, fitted, weights)
+    if options.intervals != "auto":
+        own = spread_of(solution, options.intervals, None)
+        return MethodResult(method, solution, own, None, good)
+    covariance = Covariance(
+        "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
+        "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
+    )  # fmt: skip
+    return MethodResult(method, solution, covariance, None, good)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -314,6 +314,25 @@ def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
             where = f"matrix '{stated.label}', entry ({i + 1}, {j + 1})"
             slopes[:, i, j], constant[i, j] = _row(combination(entry), position, where)
     return Matrix(stated.label, constant, slopes, np.ones(n))
+
+
+# What a fit makes of them.
+
+
+@dataclass(frozen=True)
+class ActiveConstraint:
+    """A constraint that holds with equality at the solution.
+
+    `value` is the bound or the equality's right-hand side (0 for a matrix), in the parameter's
+    unit; `multiplier` the shadow price ∂(minimum of the objective)/∂value: ≥ 0 at a lower bound,
+    ≤ 0 at an upper one; for a matrix tr Z, the price of M ⪰ t·I per unit of t.
+    """
+
+    label: str
+    kind: Literal["lower", "upper", "equality", "semidefinite"]
+    names: tuple[str, ...]
+    value: float
+    multiplier: float
 
 
 # What physics demands of the parameters of a model.

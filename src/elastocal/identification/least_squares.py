@@ -8,20 +8,16 @@ P; every fit is the same descent by Levenberg and Marquardt on R factors.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg, special
 
-from elastocal.errors import ElastocalError
-from elastocal.identification.constrained import Minimum, Reduced, minimise
-from elastocal.identification.knowledge import (
-    Constraints,
-    GaussianPrior,
-    System,
-    share_of_prior,
-)
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.identification.knowledge import Constraints, GaussianPrior, System
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Partition,
@@ -31,6 +27,7 @@ from elastocal.identification.weighted_problem import (
     is_large,
     least_norm,
     partition,
+    same_size,
 )
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -193,7 +190,7 @@ class Objective:
             cond = max(at.r_factor.rows, p) * np.finfo(float).eps
             step = least_norm(damped, target, cond=cond)
         else:
-            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
+            step = _least(damped, target, self.limits.moved(u, np.ones(p)))
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
@@ -242,6 +239,13 @@ class Objective:
         return damping
 
 
+def _least(J: Array, t: Array, limits: System) -> Array:
+    """x (p,) with the least |t − J x|² within the limits."""
+    from elastocal.identification.constrained import minimise  # it brings a cone solver
+
+    return minimise(J, t, limits).x
+
+
 def _steepest(at: Evaluation) -> float:
     return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
@@ -273,7 +277,7 @@ def fit(
     known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
     objective = Objective(problem, columns, x, size, known)
     if objective.limits is not None:  # the nearest that is allowed
-        u = minimise(np.eye(len(u)), u, objective.limits).x
+        u = _least(np.eye(len(u)), u, objective.limits)
     u, at, reason, evaluations = objective.descend(u, tolerance, max_steps)
     return Fit(
         objective.values(u), at.residual, problem.weights.apply(at.residual),
@@ -282,118 +286,279 @@ def fit(
     )  # fmt: skip
 
 
-# A fit with knowledge: where its constraints let it go, and how far.
+# An estimated covariance of a fit, and the t intervals that follow from it.
 
-PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
+LEVEL = 0.95
 
 
 @dataclass(frozen=True)
-class KnownFit:
-    """A fit at its minimum with what is known, beside rows of noise `sigma`: the linear problem of
-    the step δ (columns,) from there, |e − B δ|² + |lack − P δ|², and its minimum δ = 0."""
+class Covariance:
+    """Covariance (p, p) of x̂ in the squared units of the parameters, with t degrees of freedom.
 
-    fit: Fit
-    known: PriorRows
-    sigma: float
-
-    @cached_property
-    def reduced(self) -> Reduced:
-        assert self.known.system is not None
-        x, rows = self.fit.x[self.fit.columns], self.fit.r_factor.augmented
-        J, lack = np.vstack([rows[:, :-1], self.known.P]), self.known.target - self.known.P @ x
-        limits = self.known.system.moved(x, np.ones(len(x)))
-        return Reduced.of(J, np.concatenate([rows[:, -1], lack]), limits)
-
-    @cached_property
-    def best(self) -> Minimum:
-        return self.reduced.minimum(self.known.system)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.reduced.system.names
-
-    @property
-    def objective(self) -> float:
-        return float(self.reduced.t @ self.reduced.t)
-
-    @cached_property
-    def face(self) -> Array:
-        """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
-        return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
-
-    @cached_property
-    def cofactor(self) -> Array:
-        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
-
-    @cached_property
-    def on_face(self) -> Array:
-        """The same with every active constraint taken for an equality."""
-        return self._pinned(self.face)
-
-    @property
-    def covariance(self) -> Array:
-        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
-        return self.sigma**2 * self.cofactor
-
-    @property
-    def prior_share(self) -> Array:
-        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
-        return share_of_prior(self.cofactor, self.known.P)
-
-    @property
-    def effective(self) -> float:
-        """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
-        return self.face.shape[1] - float(((self.known.P @ self.face) ** 2).sum())
-
-    def _pinned(self, half: Array) -> Array:
-        fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
-        half = np.where(fixed[:, None], 0.0, half)
-        return np.asarray(half @ half.T)
-
-
-# Ends of profile intervals: how far a parameter can move before the fit becomes too bad.
-#
-# With S(v) the least objective where the parameter is held at v and the others are refitted, and Ŝ
-# its minimum, the interval is {v: S(v) − Ŝ ≤ rise} (Bates and Watts 1988, chapter 6): in a linear
-# model the t interval, and the same under any transformation of the parameter.
-
-PRECISION = 1e-7  # of an interval: a step that short is the last
-MOST_STEPS = 40
-ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
-ENDLESS = 1000.0  # times as far as in the linear model: there is no end
-
-
-def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
-    """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
-    nonlinear objective at most `rise` above its minimum; infinite where there is no end.
-
-    Each step goes to that end of the model linearised where the last one ended, and is halved
-    until the objective there is near what is allowed.  An end may also be where poses have no
-    equilibrium any more.  Steps that do not settle lead to none.
+    `dof` (p,) belongs to the variance of each parameter on its own: infinite where the variance
+    is known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval
+    of a combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers
+    to Cx.  `among`: where it is the mean of covariances under several models, their weights and
+    matrices; `dof` then is that of `tails`.  `ends` (p, 2): the 95 % intervals where they are not
+    those of t.
     """
-    fit, limit, size = found.fit, found.objective + rise, found.fit.sizes[found.fit.columns]
-    objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
-    assert objective.limits is not None
-    far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
-    u = np.zeros(len(size))
-    at = objective.evaluate(u)
-    for _ in range(MOST_STEPS):
-        A, b = objective.rows(u, at)
-        reduced = Reduced.of(A, b, objective.limits.moved(u, np.ones(len(u))))
-        best = reduced.minimum()
-        step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
-        while True:
-            try:
-                at = objective.evaluate(u + step)
-                if objective.cost(u + step, at) <= limit + ASTRAY * rise:
-                    break
-            except ElastocalError:
-                pass  # no equilibrium so far out
-            step = step / 2
-        u = u + step
-        if np.linalg.norm(A @ step) <= PRECISION * np.sqrt(rise):
-            return float(objective.values(u)[fit.columns[index]])
-        if abs(size[index] * u[index]) > far:
-            break
-    return side * np.inf
+
+    kind: str
+    matrix: Array
+    dof: Array
+    description: str
+    among: tuple[tuple[float, Array], ...] = ()
+    ends: Array | None = None
+
+    @property
+    def std(self) -> Array:
+        """Standard deviations (p,); infinite where `dof` is 0."""
+        return np.where(self.dof > 0, np.sqrt(np.diag(self.matrix)), np.inf)
+
+    def tails(self, rows: Array) -> tuple[Array, Array]:
+        """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p), which a typical
+        parameter has, and the share (n,) of that variance which is the squared scale of t.
+
+        Where it is a mean over models, of weights w and variances v_m, normal errors mixed in these
+        shares have the variance v = Σ w v_m and the kurtosis 3 (1 + 2 x), x = Σ w (v_m − v)²/2v².
+        The same two has t with f = 4 + 1/x degrees of freedom and the squared scale v (f − 2)/f;
+        with v itself for the latter, what the models differ by would count twice.
+        """
+        typical = float(np.median(self.dof)) if len(self.dof) else np.inf
+        x = self._apart(rows)
+        unsure = 1 / max(typical, 1e-300) + x / (1 + 4 * x)
+        dof = np.divide(1, unsure, out=np.full(len(x), np.inf), where=unsure > 0)
+        return dof, (1 + 2 * x) / (1 + 4 * x)
+
+    def _apart(self, rows: Array) -> Array:
+        """x (n,) of the combinations `rows`: by how much the models differ."""
+        v = np.maximum(variance_of(rows, self.matrix), 1e-300)
+        parts = (w * (variance_of(rows, matrix) / v - 1) ** 2 / 2 for w, matrix in self.among)
+        return sum(parts, np.zeros(len(v)))
+
+    def interval(self, x: Array, level: float = LEVEL) -> Array:
+        """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,); std_j by the
+        share of `tails`.  At 95 % the `ends` where there are any."""
+        if self.ends is not None and level == LEVEL:
+            return self.ends
+        share = self.tails(np.eye(len(x))[:, None])[1] if self.among else 1.0
+        half = t_quantile(level, self.dof) * self.std * np.sqrt(share)
+        return np.column_stack([x - half, x + half])
+
+
+def variance_of(rows: Array, covariance: Array) -> Array:
+    """tr(A_i C A_iᵀ) (n,), the variances of all combinations A_i of rows (n, k, p) together."""
+    return np.asarray(((rows @ covariance) * rows).sum(axis=(1, 2)))
+
+
+def root_of(covariance: Array) -> Array:
+    """L (…, p, p) with L Lᵀ = covariance, which may be singular."""
+    value, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(value, 0.0))[..., None, :])
+
+
+def t_quantile(level: float, dof: Array) -> Array:
+    """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level; infinite at
+    dof 0."""
+    p, few = (1 + level) / 2, np.where((dof > 0) & np.isfinite(dof), dof, 1.0)
+    t = np.where(np.isinf(dof), special.ndtri(p), special.stdtrit(few, p))
+    return np.where(dof > 0, t, np.inf)
+
+
+# Orthogonal factors of B, in which every covariance estimator of this package works.
+
+EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclass(frozen=True)
+class Orthogonal:
+    """Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and V Vᵀ = (BᵀB)⁻¹.
+
+    Any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ: BᵀB, whose condition is that of B squared,
+    is never formed.  Row j of V is the coefficient of parameter j on the columns of Q.
+    """
+
+    Q: Array
+    V: Array
+
+
+def orthogonal(B: Array) -> Orthogonal:
+    """Factors of the whitened B (rows, p).
+
+    Raises InputError where the columns depend on each other, InsufficientDataError where there are
+    no more rows than parameters.
+    """
+    rows, p = B.shape
+    if rows <= p:
+        raise InsufficientDataError(
+            f"{rows} rows leave no residual of {p} parameters to estimate a variance from;"
+            " measure more configurations or fit fewer parameters"
+        )
+    lengths = np.linalg.norm(B, axis=0)
+    lengths[lengths == 0] = 1.0
+    Q, R, order = linalg.qr(B / lengths, mode="economic", pivoting=True)
+    pivots = np.abs(np.diag(R))
+    dependent = np.flatnonzero(pivots <= rows * EPS * pivots[0])
+    if dependent.size:
+        names = sorted(int(k) for k in order[dependent])
+        raise InputError(f"columns {names} of B depend on the others; drop them first")
+    V = np.empty((p, p))
+    V[order] = linalg.solve_triangular(R, np.eye(p)) / lengths[order, None]
+    return Orthogonal(Q, V)
+
+
+# Satterthwaite degrees of freedom of variance estimates that are sums of squares.
+#
+# A sandwich estimate of var(x̂_j) is v_j = Σ_c (a_cᵀ e_c)², with e = (I − QQᵀ)u and one vector a_c
+# per cluster.  Under the working model u ~ N(0, σ²I) the numbers a_cᵀe_c have covariance
+# σ²Γ, Γ = diag(a_cᵀa_c) − b bᵀ with rows b_c = Q_cᵀa_c, and v_j has the mean σ² tr Γ and the
+# variance 2σ⁴ tr Γ².  A scaled χ² with the same two moments has
+#
+#     dof_j = (tr Γ)² / tr Γ²
+#
+# (Satterthwaite 1946; Bell & McCaffrey 2002; Pustejovsky & Tipton 2018).  With
+#
+#     tr Γ = Σ_c (a_cᵀa_c − |b_c|²),   tr Γ² = Σ_c [(a_cᵀa_c)² − 2 a_cᵀa_c |b_c|²] + ‖Σ_c b_c b_cᵀ‖²
+#
+# only p-dimensional quantities are summed over clusters; neither Γ nor I − QQᵀ is formed.
+
+# Cluster-robust covariance: rows of a cluster may be correlated in any way (CR0 to CR3).
+#
+# A cluster is what shares an error: the readings of one configuration share the arm's
+# repeatability, those of one day its temperature.  With B = QR, cluster rows Q_c, e_c and x̂ = V
+# Qᵀy,
+#
+#     cov(x̂) = V [ Σ_c Q_cᵀA_c e_c e_cᵀA_cᵀQ_c ] Vᵀ
+#
+#     CR0  A_c = I                               Liang & Zeger 1986
+#     CR1  CR0 · G/(G − 1) · (n − 1)/(n − p)     the usual correction for G clusters
+#     CR2  A_c = (I − Q_cQ_cᵀ)^(−1/2)            Bell & McCaffrey 2002: unbiased where whitened rows
+#                                                are independent and of common variance
+#     CR3  A_c = (I − Q_cQ_cᵀ)^(−1)              nearly the jackknife over clusters, errs wide
+#
+# The working model of CR2 and of the degrees of freedom is the identity: B and e are whitened.
+#
+# Where every row is a cluster, rows are independent, each of its own variance: with the leverage
+# h_i = |Q_i|², CR0 to CR3 are then HC0 (White 1980), HC1, HC2, HC3 (MacKinnon and White 1985).
+
+ALONE = 1e-9  # 1 − leverage below which a cluster is fitted exactly, whatever was read there
+ENTRIES = 2**22  # of a temporary array, 32 MB
+DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
+
+DESCRIPTION = {
+    "CR0": "uncorrected (biased low with few clusters)",
+    "CR1": "corrected by G/(G − 1) · (n − 1)/(n − p)",
+    "CR2": "bias-reduced, unbiased under the working model",
+    "CR3": "nearly the jackknife over clusters",
+    "HC0": "e² as it is (biased low in small samples)",
+    "HC1": "e² · n/(n − p)",
+    "HC2": "e²/(1 − h), unbiased under equal variances",
+    "HC3": "e²/(1 − h)², nearly the jackknife",
+}
+
+
+Rows = tuple[Array, Array, IntArray]  # Q_c and e_c of whole clusters, and the cluster of each
+
+
+def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> Covariance:
+    """Covariance of x̂ that allows any correlation within a cluster (equations above).
+
+    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual; `cluster` (n,) labels in
+    any order.
+
+    Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the
+    generalised inverse square root, which leaves parameters outside that direction unbiased
+    (there, Theorem 1).  A parameter that depends on it has no cluster-robust variance: its dof
+    is 0 and its interval unbounded.  CR3 does not exist then: InsufficientDataError, as for a
+    single cluster.
+
+    Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
+    """
+    factors = orthogonal(B)
+    return clustered([(factors.Q, e, cluster)], factors.V, kind)
+
+
+def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
+    """The same of rows that come in parts, Q = B V with V Vᵀ = (BᵀB)⁻¹; HC0 to HC3 are the CR where
+    every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
+
+    Degrees of freedom by Satterthwaite for every kind, each for its own A_c (Pustejovsky & Tipton
+    2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero over the clusters, and far
+    fewer where few clusters matter.
+    """
+    p, n, G = len(V), 0, 0
+    meat, outer, alone = np.zeros((p, p)), np.zeros((p, p, p)), np.zeros(p, dtype=bool)
+    lone: list[int] = []
+    size, trace, square = np.zeros((3, p))  # Σ aᵀa, tr Γ and tr Γ²
+    for Q, e, cluster in parts:
+        n, G = n + len(e), G + len(np.unique(cluster))
+        for rows in _blocks(cluster, p):
+            Qc = Q[rows]
+            adjusted, determined = _adjusted(Qc, kind)
+            lone += cluster[rows[determined][:1, 0]].tolist()
+            alone |= _depends(Qc[determined], V)
+            scores = (e[rows][:, None, :] @ adjusted)[:, 0]
+            meat += scores.T @ scores
+            a = adjusted @ V.T
+            aa, b = (a * a).sum(axis=1), Qc.transpose(0, 2, 1) @ a
+            bb, by_parameter = (b * b).sum(axis=1), b.transpose(2, 1, 0)
+            size, trace = size + aa.sum(axis=0), trace + (aa - bb).sum(axis=0)
+            square = square + (aa * (aa - 2 * bb)).sum(axis=0)
+            outer += by_parameter @ by_parameter.transpose(0, 2, 1)
+    if G < 2:
+        raise InsufficientDataError(
+            "a cluster-robust covariance compares clusters, but all rows are in one;"
+            " measure more configurations, or use a covariance of independent rows (HC3)"
+        )
+    of_rows, number = kind[0] == "H", kind[-1]
+    if lone and number == "3":
+        what, left = ("row", "HC") if n == G else ("cluster", "CR")
+        raise InsufficientDataError(
+            f"{what} {lone[0]} alone determines a combination of the parameters: leaving it out, "
+            f"as {left}3 does, leaves no answer; fit fewer parameters or use {left}2"
+        )
+    if number == "1":
+        meat *= G / (G - 1) * (n - 1) / (n - p)
+    what = "each row its own variance" if of_rows else f"rows correlated within {G} clusters"
+    text = f"{what}, {DESCRIPTION[kind]}"
+    if alone.any() and not of_rows:
+        text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
+    square = square + (outer**2).sum(axis=(1, 2))
+    told = (trace > 1e-9 * size) & (square > 0) & ~alone  # the residual says something of it
+    dof = np.where(told, trace**2 / np.where(told, square, 1.0), 0.0)
+    if kind in ("HC0", "HC1"):
+        dof = np.full(p, float(n - p))
+    return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
+
+
+def _blocks(cluster: IntArray, columns: int) -> Iterator[IntArray]:
+    """Rows (k, size) of clusters of one size, in blocks of bounded memory."""
+    for rows in same_size(cluster):
+        numbers = len(rows) * columns * max(rows.shape[1], columns)
+        yield from np.array_split(rows, -(-numbers // ENTRIES))
+
+
+def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
+    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.
+
+    For g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) the smaller of the two is decomposed.
+    """
+    by_row = Qc.shape[1] < Qc.shape[2]
+    gram = Qc @ Qc.transpose(0, 2, 1) if by_row else Qc.transpose(0, 2, 1) @ Qc
+    values, U = np.linalg.eigh(gram)
+    gap = 1 - values
+    single = gap < ALONE
+    determined = np.asarray(single.any(axis=1))
+    if kind[-1] in "01":
+        return Qc, determined
+    power = np.where(single, 1.0, gap) ** (-0.5 if kind[-1] == "2" else -1.0)
+    A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
+    return (A @ Qc if by_row else Qc @ A), determined
+
+
+def _depends(Qc: Array, V: Array) -> NDArray[np.bool_]:
+    """Which parameters (p,) depend on a direction that one of the clusters determines alone."""
+    values, U = np.linalg.eigh(Qc.transpose(0, 2, 1) @ Qc)
+    share = (V @ U) / np.linalg.norm(V, axis=1)[:, None]
+    in_it = (np.abs(share) > DEPENDS) & (1 - values < ALONE)[:, None, :]
+    return np.asarray(in_it.any(axis=(0, 2)))

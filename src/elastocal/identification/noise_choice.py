@@ -12,17 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse, special
 
-from elastocal.engine.mixed import (
-    ENOUGH,
-    LogPrior,
-    Mixed,
-    MixedFit,
-    Pack,
-    Parts,
-    fit,
-)
+from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts, fit
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.covariance import Covariance, orthogonal, root_of
+from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
     EACH,

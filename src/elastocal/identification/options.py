@@ -11,26 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
-from elastocal.identification.constrained import ActiveConstraint
-from elastocal.identification.covariance import (
+from elastocal.identification.knowledge import ActiveConstraint, Constraints, GaussianPrior
+from elastocal.identification.least_squares import (
     LEVEL,
     Covariance,
+    PriorRows,
     Rows,
     clustered,
     root_of,
     t_quantile,
 )
-from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.least_squares import KnownFit, PriorRows, profile_end
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.solve import Solution, residual_sigma
-from elastocal.identification.weighted_problem import (
-    Part,
-    WeightKind,
-    each,
-    regressor,
-)
+from elastocal.identification.weighted_problem import Part, WeightKind, each, regressor
 from elastocal.model.manipulator import SmoothGroup
 from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray
@@ -72,6 +66,8 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     if kind in ("auto", "classical"):
         return classical
     if kind == "profile":
+        from elastocal.identification.constrained import KnownFit, profile_end
+
         names, none = problem.model.names, Constraints()
         known = PriorRows.stated(names, fit.columns, fit.x, none, None, sigma)
         found, rises = KnownFit(fit, known, sigma), (sigma * t_quantile(LEVEL, classical.dof)) ** 2
@@ -276,7 +272,7 @@ class Options:
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `constraints` and `prior`: a
-    constrained or regularised fit on top of the method's weights (knowledge_fit).  `faulty`:
+    constrained or regularised fit on top of the method's weights (`constrained`).  `faulty`:
     readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
     always, or never; they are listed in the result in any case.  `seed`: of multi-start and
     searches; `jobs` has no effect, as nothing is drawn in processes.

@@ -16,25 +16,13 @@ from numpy.typing import ArrayLike
 from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
-from elastocal.identification.least_squares import Problem
-from elastocal.identification.noise_choice import (
-    NoiseFit,
-    estimate_noise,
-    own_noise,
-    weights_of,
-)
+from elastocal.identification.least_squares import Covariance, Problem, cluster_robust, orthogonal
+from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import MethodResult
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
-from elastocal.identification.weighted_problem import (
-    Part,
-    each,
-    regressor,
-    residual_at,
-    sample,
-)
+from elastocal.identification.weighted_problem import Part, each, regressor, residual_at, sample
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray, IntArray
 

@@ -27,11 +27,10 @@ from scipy import special
 from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
-from elastocal.identification.covariance import Covariance, root_of, variance_of
-from elastocal.identification.methods import EXACT
+from elastocal.identification.least_squares import Covariance, root_of, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.solve import Solution, free_r_factor, reduce
+from elastocal.identification.solve import EXACT, Solution, free_r_factor, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.identification.covariance import orthogonal
+from elastocal.identification.least_squares import orthogonal
 from elastocal.units import Array
 
 SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse

@@ -16,9 +16,9 @@ from elastocal.above import DataFrame, Result, checked_arguments, headline, writ
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny
-from elastocal.identification.constrained import ActiveConstraint
-from elastocal.identification.covariance import Covariance
 from elastocal.identification.faulty_readings import OutlierReport
+from elastocal.identification.knowledge import ActiveConstraint
+from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (

@@ -20,9 +20,8 @@ import numpy as np
 from scipy import sparse, special
 
 from elastocal.engine.mixed import Products, climb
-from elastocal.identification.covariance import Covariance
 from elastocal.identification.knowledge import GaussianPrior, share_of_prior
-from elastocal.identification.least_squares import Fit, PriorRows, Problem
+from elastocal.identification.least_squares import Covariance, Fit, PriorRows, Problem
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
@@ -35,13 +34,7 @@ from elastocal.identification.options import (
 )
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
-from elastocal.identification.solve import (
-    WORTH_A_COLUMN,
-    Reduction,
-    Solution,
-    choose,
-    is_placed,
-)
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, choose, is_placed
 from elastocal.identification.weighted_problem import (
     Part,
     RFactor,

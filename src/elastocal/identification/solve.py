@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.covariance import root_of
-from elastocal.identification.least_squares import Fit, PriorRows, Problem, fit, moved
+from elastocal.identification.least_squares import Fit, PriorRows, Problem, fit, moved, root_of
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -301,6 +300,10 @@ PLACING, CHOOSING = 1e-12, 1e-2
 MANY, SAMPLE = 2000, 5000
 
 
+# Residuals below this, in m, are rounding: no instrument resolves it, and it tells of no noise.
+EXACT = 1e-11
+
+
 @dataclass(frozen=True)
 class Solution:
     """The fit of the kept set, which parameters those are, and how well it predicts.
@@ -316,6 +319,11 @@ class Solution:
     sizes: Array
     nominal_rms: float
     held: Array | None = None
+
+    @property
+    def exact(self) -> bool:
+        """Whether the readings are computed: what is left is rounding."""
+        return rms_3d(self.fit.residual, self.problem.observations.size) < EXACT
 
     @cached_property
     def _looked(self) -> tuple[Array, Array]:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from elastocal.errors import option
-from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.findings import only_placed, shape_of
+from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residuals import ResidualSummary
