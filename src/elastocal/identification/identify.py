@@ -24,7 +24,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
-from elastocal.identification.noise_summary import noise_of, noise_parts
+from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.options import ROBUST, MethodResult, Options, spread_of
 from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
@@ -234,6 +234,7 @@ def summarise(
     )  # fmt: skip
     spent = len(kept) if found.effective is None else found.effective
     sigma = residual_sigma(final, spent)
+    noise, parts = noise_of(found, sigma)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
     estimates, combinations = _estimates(model, solution, found, left_out)
     determined = tuple(model.names[c] for c in kept)
@@ -246,8 +247,8 @@ def summarise(
         fitted = found.solution if set_apart or found.smooth else sound
         report = report_faulty(every, fitted, found.noise, found.good, found.standard)
     result = Calibration(
-        model=model, method=found.method, noise=noise_of(found, sigma), weights=weights,
-        noise_parts=noise_parts(found), estimates=estimates, combinations=combinations, x=final.x,
+        model=model, method=found.method, noise=noise, weights=weights,
+        noise_parts=parts, estimates=estimates, combinations=combinations, x=final.x,
         determined=determined, spread=found.spread,
         correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
         observations=observed, residual=final.residual, held_out=solution.heldout, sigma=sigma,

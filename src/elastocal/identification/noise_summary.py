@@ -19,11 +19,10 @@ from elastocal.identification.noise_choice import (
     own_noise,
     with_stated_sharing,
 )
-from elastocal.identification.noise_structure import CONFIGURATION, TURNED, Readings
+from elastocal.identification.noise_structure import CONFIGURATION, TURNED
 from elastocal.identification.options import MethodResult
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.residuals import f_test
-from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import (
     inverse_factor,
     stated_by_observation,
@@ -273,21 +272,43 @@ class Noise:
         return content
 
 
-def noise_of(found: MethodResult, sigma: float) -> Noise:
-    weights, covariance = found.solution.problem.weights, found.spread
+def noise_of(found: MethodResult, sigma: float) -> tuple[Noise, dict[str, float]]:
+    """The noise that a method found, and its parts: mean square 3-D noise (m²) of single
+    "readings", and what readings of "visits" share; `sigma` is that of a whitened row.
+
+    Where no noise was estimated, all of the residual is taken for that of single readings.
+    """
+    solution, estimated = found.solution, found.noise
+    problem, residual = solution.problem, solution.fit.residual
+    observed, cell, weights = problem.observations, problem.model.cell, problem.weights
+    stated, size = stated_by_observation(observed, cell.tracker), observed.size
+    spent = found.effective if found.smooth else None
+    spent, single = len(solution.fit.columns) if spent is None else spent, None
+    if stated is not None and cell.noise.tails is None:
+        told = not cell.noise.shared  # else repeats scatter by more than the instrument
+        single = single_readings(observed, residual, stated, spent, told)
+    whitened = weights.apply(residual)
+    if estimated is None:
+        squared = residual.reshape(-1, size)[:, :3] ** 2
+        spare = len(residual) / max(len(residual) - spent, 1)
+        parts = {"readings": float(squared.sum()) / len(squared) * spare}
+    else:
+        none = np.zeros(0, dtype=np.int64)
+        bare = linearised(problem.model, observed, solution.fit.x, none)
+        own = own_noise(estimated.fit, bare)[0]
+        alone = np.diagonal(own, axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
+        visits = sum(variance * d.mean_square(3) for d, variance in estimated.fit.of(bare))
+        parts = {"readings": float(alone), "visits": float(visits)}
+        if estimated.fit.common.any():
+            whitened = (inverse_factor(own) @ residual.reshape(-1, size, 1)).ravel()
     noise = Noise(
-        weights.kind,
-        weights.description,
-        sigma=None if weights.absolute else sigma,
-        ratio_to_stated=_ratio_to_stated(found, sigma),
-        lack_of_fit=_lack_of_fit(found),
-        single=_single(found),
-        interval_kind=covariance.kind,
-        interval_description=covariance.description,
-    )
-    if found.noise is not None:
-        return _estimated(noise, found.noise, found.solution.problem.observations.table)
-    return replace(noise, reason=TOO_LARGE) if found.solution.problem.large else noise
+        weights.kind, weights.description, sigma=None if weights.absolute else sigma,
+        ratio_to_stated=_ratio_to_stated(found, sigma, spent),
+        lack_of_fit=lack_of_fit(observed, whitened, spent), single=single,
+        interval_kind=found.spread.kind, interval_description=found.spread.description,
+        reason=TOO_LARGE if estimated is None and problem.large else None,
+    )  # fmt: skip
+    return (noise if estimated is None else _estimated(noise, estimated, observed.table)), parts
 
 
 def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
@@ -299,54 +320,25 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
 
     structure, sizes = fit.noisy.structure, list[NoiseSize]()
     kind = structure.model.name
-    for name, s in zip(structure.names, sigma[:own], strict=True):
-        one = NoiseSize(NUMBERED.sub(label, name), s, turns=name in TURNED)
-        sizes.append(replace(one, sigma=None, factor=s) if kind == "stated" else one)
-    for d, s in zip(fit.noisy.deviations, sigma[own:], strict=True):
-        sizes.append(NoiseSize(d.name, s, None, d.part, d.joints, d.turns))
     error = np.sqrt(np.diagonal(fit.covariance)) / np.maximum(fit.theta, 1e-300)
+    for name, s, r in zip(structure.names, sigma[:own], error[:own].tolist(), strict=True):
+        size, factor = (None, s) if kind == "stated" else (s, None)
+        name = NUMBERED.sub(label, name)
+        sizes.append(NoiseSize(name, size, factor, turns=name in TURNED, relative=r))
+    for d, s, r in zip(fit.noisy.deviations, sigma[own:], error[own:].tolist(), strict=True):
+        sizes.append(NoiseSize(d.name, s, None, d.part, d.joints, d.turns, r))
     drift, record = None, fit.noisy.readings.visits
     if found.lasting is not None and record is not None:
         seconds = found.lasting * record.span if record.timed else None
         drift = Drift(found.lasting, seconds, found.to_longest > LIKELY)
     return replace(
-        noise,
-        kind=found.kind,
-        description=found.description,
-        reason=found.reason,
-        sigma=sigma[0] if kind == "independent" and own == 1 else None,
-        sizes=tuple(replace(s, relative=float(r)) for s, r in zip(sizes, error, strict=True)),
-        tried=found.trials,
-        tests=found.tests,
-        drift=drift,
-    )
+        noise, kind=found.kind, description=found.description, reason=found.reason,
+        sigma=sigma[0] if kind == "independent" and own == 1 else None, sizes=tuple(sizes),
+        tried=found.trials, tests=found.tests, drift=drift,
+    )  # fmt: skip
 
 
-def noise_parts(found: MethodResult) -> dict[str, float]:
-    """Mean square 3-D noise (m²) of single "readings", and what readings of "visits" share.
-
-    Where no noise was estimated, all of the residual is taken for that of single readings.
-    """
-    solution = found.solution
-    observed, fit = solution.problem.observations, solution.fit
-    size, n = observed.size, len(observed.lead)
-    if found.noise is None:
-        squared = fit.residual.reshape(n, size)[:, :3] ** 2
-        spare = max(len(fit.residual) - _spent(found), 1)
-        return {"readings": float(squared.sum()) / n * len(fit.residual) / spare}
-    readings, noise = _bare(solution), found.noise.fit
-    own = np.diagonal(own_noise(noise, readings)[0], axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
-    visits = sum(variance * d.mean_square(3) for d, variance in noise.of(readings))
-    return {"readings": float(own), "visits": float(visits)}
-
-
-def _bare(solution: Solution) -> Readings:
-    problem = solution.problem
-    none = np.zeros(0, dtype=np.int64)
-    return linearised(problem.model, problem.observations, solution.fit.x, none)
-
-
-def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
+def _ratio_to_stated(found: MethodResult, sigma: float, spent: int) -> float | None:
     """Root mean square of the residual in units of the stated noise, per degree of freedom; of
     stated tails, in units of what is left of that noise where far readings are set apart.
 
@@ -375,29 +367,4 @@ def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     if shared:
         Q, _ = np.linalg.qr(stated.apply(fit.B))
         e = e - Q @ (Q.T @ e)
-    return float(np.sqrt(e @ e / max(len(e) - _spent(found), 1))) / unit
-
-
-def _single(found: MethodResult) -> SingleReadings | None:
-    solution = found.solution
-    observed, tracker = solution.problem.observations, solution.problem.model.cell.tracker
-    stated, noise = stated_by_observation(observed, tracker), solution.problem.model.cell.noise
-    if stated is None or noise.tails is not None:
-        return None
-    told = not noise.shared  # else repeats scatter by more than the instrument
-    return single_readings(observed, solution.fit.residual, stated, _spent(found), told)
-
-
-def _spent(found: MethodResult) -> int:
-    spent = found.effective if found.smooth else None
-    return len(found.solution.fit.columns) if spent is None else spent
-
-
-def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
-    solution = found.solution
-    problem, residual = solution.problem, solution.fit.residual
-    noise, whitened = found.noise, problem.weights.apply(residual)
-    if noise is not None and noise.fit.common.any():
-        own = inverse_factor(own_noise(noise.fit, _bare(solution))[0])
-        whitened = (own @ residual.reshape(*own.shape[:2], 1)).ravel()
-    return lack_of_fit(problem.observations, whitened, _spent(found))
+    return float(np.sqrt(e @ e / max(len(e) - spent, 1))) / unit

@@ -318,19 +318,20 @@ class Options:
                 f"the method {self.resolved} does not take stated weights; choose the method wls"
             )
         if self.knows:
-            self._check_knowledge()
+            remedy = f"with these there are {', '.join(WITH_KNOWLEDGE)}"
+            self.check_prior("neither constraints nor a prior", ROBUST, WITH_KNOWLEDGE, remedy)
 
-    def _check_knowledge(self) -> None:
-        if self.resolved in ROBUST:
+    def check_prior(
+        self, what: str, without: tuple[str, ...], intervals: tuple[str, ...], remedy: str
+    ) -> None:
+        """Raise InputError for a method `without` a prior (`what` in words), or other intervals."""
+        if self.resolved in without:
             raise InputError(
-                f"the method {self.resolved} takes neither constraints nor a prior; use the "
-                "default method, which excludes outliers"
+                f"the method {self.resolved} takes {what}; use the default method, which excludes "
+                "outliers"
             )
-        if self.intervals not in WITH_KNOWLEDGE:
-            raise InputError(
-                f"{option('intervals', self.intervals)} knows of neither constraints nor a prior; "
-                f"with these there are {', '.join(WITH_KNOWLEDGE)}"
-            )
+        if self.intervals not in intervals:
+            raise InputError(f"{option('intervals', self.intervals)} knows of {what}; {remedy}")
 
     def sets_aside(
         self, faulty: NDArray[np.bool_], explained: Callable[[], NDArray[np.bool_]] | None = None
@@ -357,17 +358,3 @@ class Options:
         if self.weights == "auto" and self.covariance is None:
             return "reml"
         return "ols" if self.weights == "none" else "wls"
-
-
-def check_for_functions(options: Options) -> None:
-    """Raise InputError for a method or intervals that take no prior, as smooth functions have."""
-    if options.resolved in ROBUST or options.resolved.startswith("eq14"):
-        raise InputError(
-            f"the method {options.resolved} takes no prior, which smooth functions have; use the "
-            "default method, which excludes outliers"
-        )
-    if options.intervals not in ("auto", "classical"):
-        raise InputError(
-            f"{option('intervals', options.intervals)} knows of no prior, which smooth functions "
-            "have; leave it away"
-        )

@@ -26,11 +26,11 @@ from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
+    ROBUST,
     FunctionPrior,
     MethodResult,
     Options,
     SmoothPart,
-    check_for_functions,
 )
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
@@ -363,7 +363,9 @@ def fit_smooth(
 
     Raises InputError for methods and intervals that take no prior.
     """
-    check_for_functions(options)
+    what = "no prior, which smooth functions have"
+    without = (*ROBUST, "eq14", "eq14-residual")
+    options.check_prior(what, without, ("auto", "classical"), "leave it away")
     model, size, tried = every.problem.model, every.problem.observations.size, []
     for sized in (sized_of(model, free), np.zeros(0, dtype=np.int64)):
         progress("fitting smooth functions")

@@ -134,13 +134,10 @@ def stated_by_observation(observed: Observations, tracker: Tracker) -> Array | N
 
     Observations that share a reading are correlated; here each stands for itself.
     """
-    kind = available_noise(observed.table, tracker)
-    if kind == "none" and observed.kind != "distance":
+    kind = _available(observed, tracker)
+    if kind == "none":
         return None
-    try:
-        rows = stated_covariance(observed, tracker, kind)[0]
-    except InputError:
-        return None
+    rows = stated_covariance(observed, tracker, kind)[0]
     stated = observed.combine.power(2) @ rows.reshape(len(rows), -1)
     return np.asarray(stated).reshape(-1, observed.size, observed.size)
 
