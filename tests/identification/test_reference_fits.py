@@ -18,8 +18,8 @@ import pytest
 from scipy import sparse, stats
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.constrained import KnownFit, profile_end
 from elastocal.identification.knowledge import Bounds, Constraints
+from elastocal.identification.knowledge_fit import KnownFit, profile_end
 from elastocal.identification.least_squares import PriorRows, Problem, fit
 from elastocal.identification.published import ols
 from elastocal.identification.weighted_problem import Weights

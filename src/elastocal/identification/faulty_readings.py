@@ -23,7 +23,6 @@ from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.model.effects.placements import MarkerPosition
-from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.
@@ -371,20 +370,15 @@ def report_faulty(
             e = block_diagonal(own) @ (weights.whiten.T @ weights.beside(weights.apply(e)))
         root = block_diagonal(inverse_factor(own))
         B, e = root @ B, root @ e
-    lead = observed.lead
+    lead, fitted = observed.lead, [problem.model.parameters[c] for c in columns]
     marker = _labels(table.marker_names, table.marker[lead])
     visited = _labels(table.configuration_labels, table.configuration[lead])
     report = outlier_report(
         B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1), readings.e[:, :3], good,
         table.row[lead], marker, None if shared else visited,
-        _fitted_markers(problem.model, columns),
+        {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name},
     )  # fmt: skip
-    return replace(report, names=tuple(problem.model.names[c] for c in columns))
-
-
-def _fitted_markers(model: Model, columns: NDArray[np.int64]) -> set[str]:
-    fitted = [model.parameters[c] for c in columns]
-    return {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
+    return replace(report, names=tuple(p.name for p in fitted))
 
 
 def _labels(names: tuple[str, ...], codes: IntArray) -> NDArray[Any] | None:

@@ -14,7 +14,17 @@ from scipy import sparse
 from elastocal.errors import ElastocalError
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
-from elastocal.identification.least_squares import Covariance, Problem, variance_of
+from elastocal.identification.knowledge import Constraints
+from elastocal.identification.least_squares import (
+    LEVEL,
+    Covariance,
+    PriorRows,
+    Problem,
+    Rows,
+    clustered,
+    t_quantile,
+    variance_of,
+)
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.noise_choice import (
     NoiseFit,
@@ -25,7 +35,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.noise_summary import noise_of
-from elastocal.identification.options import ROBUST, MethodResult, Options, spread_of
+from elastocal.identification.options import ROBUST, IntervalKind, MethodResult, Options
 from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
@@ -62,8 +72,11 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import (
+    Part,
     Weights,
+    each,
     partition,
+    regressor,
     residual_at,
     scaled_by_component,
     weights_for,
@@ -485,6 +498,56 @@ def refined(
     return replace(start, problem=problem, fit=found)
 
 
+# Configurations per parameter from which the scatter of those of a large table counts.
+ENOUGH = 10
+
+
+def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Covariance:
+    """Covariance and intervals of the solution's fitted parameters.
+
+    auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in
+    a large table with several readings per configuration cr1;
+    classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations,
+    or rows by themselves, in passes over the parts of the table;
+    profile: {v: S(v) − Ŝ ≤ t² s²} of the nonlinear sum of squares.
+
+    Raises InsufficientDataError where the data cannot give it.
+    """
+    fit, problem = solution.fit, solution.problem
+    if kind == "auto" and noise is not None:
+        return noise.covariance
+    if kind == "auto" and problem.large:
+        readings, configurations = (
+            len(problem.observations.lead), problem.observations.n_configurations
+        )  # fmt: skip
+        kind = "cr1" if readings > configurations >= ENOUGH * len(fit.columns) else kind
+    sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
+    classical = Covariance(
+        "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
+        "all readings independent, their noise scaled to the residual",
+    )  # fmt: skip
+    if kind in ("auto", "classical"):
+        return classical
+    if kind == "profile":
+        from elastocal.identification.knowledge_fit import KnownFit, profile_end
+
+        names, none = problem.model.names, Constraints()
+        known = PriorRows.stated(names, fit.columns, fit.x, none, None, sigma)
+        found, rises = KnownFit(fit, known, sigma), (sigma * t_quantile(LEVEL, classical.dof)) ** 2
+        ends = [[profile_end(found, k, float(rise), side) for side in (-1, 1)]
+                for k, rise in enumerate(rises)]  # fmt: skip
+        text = "profile of the nonlinear sum of squares (all readings independent)"
+        return replace(classical, kind="profile", description=text, ends=np.array(ends))
+    V = fit.r_factor.half
+
+    def rows(part: Part) -> Rows:
+        at, own = regressor(problem.model, part, fit.x, fit.columns), part.observations
+        labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
+        return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
+
+    return clustered(each(problem.parts, rows), V, kind.upper())
+
+
 # The methods by name.
 
 COMPUTED = (
@@ -516,7 +579,7 @@ def run_method(
         return with_limits(every, found, options)
     if not options.knows:
         return found
-    from elastocal.identification.constrained import fit_with_knowledge  # it brings a cone solver
+    from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
 
     return fit_with_knowledge(found, options, progress, own)
 

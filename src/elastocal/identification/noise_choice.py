@@ -418,7 +418,7 @@ class NoiseFit:
         text = self.fit.noisy.structure.model.description
         for part, own in names.items():
             named = " / ".join([own[0], *(name.removeprefix(EACH_HAS) for name in own[1:])])
-            text += PARTS[part].clause.format(named)
+            text += PARTS[part][0].format(named)
         return text
 
     @property
@@ -535,7 +535,8 @@ class _Choice:
         before, record = self.least, self.readings.visits
         together = np.unique(self.readings.configuration, return_counts=True)[1]
         rows = int(together.max()) * self.readings.size
-        known = record is not None and record.n_visits >= FEWEST_VISITS and rows <= MOST_TOGETHER
+        visits = np.zeros(1) if record is None else record.per_visit
+        known = len(visits) >= FEWEST_VISITS and rows <= MOST_TOGETHER
         for part in PARTS:
             assert self.best is not None
             kind = self.best.kind
@@ -546,7 +547,9 @@ class _Choice:
             elif part == EACH:
                 if JOINTS in kind.parts:
                     self.attempt(kind.with_part(EACH), self.best.lasting)
-            elif part == JOINTS and EACH not in kind.parts and record.per_visit >= SEVERAL:
+            # One reading to a visit tells the joints' scatter from its own noise by nothing but how
+            # both change from pose to pose, as the model's own errors do.
+            elif part == JOINTS and EACH not in kind.parts and np.median(visits) >= SEVERAL:
                 self._look_for(part, kind, (self.best.lasting,))
             elif part == TIME and record.drifts:
                 self._look_for(part, kind, record.lasting)

@@ -2,15 +2,15 @@
 
     V = Σ_k θ_k K_k
 
-A `NoiseModel` says how the noise of a single reading is built, a `NoisePart` what readings have in
+A `NoiseModel` says how the noise of a single reading is built, a `Deviation` what readings have in
 common besides; a `Kind` is one of the former with some of the latter.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 from typing import ClassVar, NamedTuple
 
 import numpy as np
@@ -66,14 +66,9 @@ class VisitRecord:
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     @cached_property
-    def n_visits(self) -> int:
-        return len(np.unique(self.visit[self.visit >= 0]))
-
-    @property
-    def per_visit(self) -> float:
-        """Readings to a visit, at the median.  A single one tells the joints' scatter from its own
-        noise by nothing but how both change from pose to pose, as the model's own errors do."""
-        return float(np.median(np.unique(self.visit[self.visit >= 0], return_counts=True)[1]))
+    def per_visit(self) -> IntArray:
+        """Readings to each visit."""
+        return np.unique(self.visit[self.visit >= 0], return_counts=True)[1]
 
     def waves(self, lasting: float) -> Array:
         """Loadings (N, k) on independent deviations of variance 1, which add up to a random course
@@ -579,7 +574,7 @@ PARTITIONS: tuple[tuple[str, ...], ...] = (
 )
 
 
-def of_configurations(readings: Readings, _lasting: float, every: bool) -> Iterator[Deviation]:
+def of_configurations(readings: Readings, every: bool) -> Iterator[Deviation]:
     """Deviations that these readings can tell apart; or `every` one that there may be.
 
     An arm does not come back to quite the same place: a deviation per configuration; per
@@ -614,9 +609,7 @@ def common_to(unit: IntArray, axes: Array, name: str, turns: bool = False) -> De
 ALIKE = 1e-9  # m per rad: joints that move no reading more than this have no scatter to be seen
 
 
-def of_joints(
-    readings: Readings, _lasting: float, _every: bool, each: bool = False
-) -> Iterator[Deviation]:
+def of_joints(readings: Readings, each: bool) -> Iterator[Deviation]:
     """The scatter of the joints from visit to visit: of all that turn and of all that slide, or of
     `each` by itself."""
     record = readings.visits
@@ -637,7 +630,7 @@ def _settling(record: VisitRecord, part: str, who: str, joints: IntArray) -> Dev
     )  # fmt: skip
 
 
-def of_time(readings: Readings, lasting: float, _every: bool) -> Iterator[Deviation]:
+def of_time(readings: Readings, lasting: float) -> Iterator[Deviation]:
     assert readings.visits is not None
     position = np.arange(readings.size) < 3
     for name, along in ((DRIFT, position), (f"{DRIFT} (rotation)", ~position)):
@@ -661,27 +654,15 @@ DRIFT, EACH_HAS = "drift in time", "common to each "
 OF_CONFIGURATION = f"{EACH_HAS}configuration"
 
 
-class NoisePart(NamedTuple):
-    """What readings may have in common: its `deviations` of the readings, how long what drifts
-    lasts, and whether those are asked for that these readings do not tell; a `clause` for the
-    description of a noise that has them, and `words` for a list of models."""
-
-    deviations: Callable[[Readings, float, bool], Iterator[Deviation]]
-    clause: str
-    words: str
-
-
 SETTLE = "joints that settle anew at each visit"
+# What readings may have in common: a clause for the description of a noise that has it, and words
+# for a list of models.
 PARTS = {
-    CONFIGURATION: NoisePart(
-        of_configurations, ", and a deviation {}", "deviations of a configuration"
-    ),
-    JOINTS: NoisePart(of_joints, f", {SETTLE}", SETTLE),
-    EACH: NoisePart(
-        partial(of_joints, each=True), f", {SETTLE}", f"{SETTLE}, each by its own size"
-    ),
-    TIME: NoisePart(of_time, ", and a drift in time", "drift in time"),
-}  # fmt: skip
+    CONFIGURATION: (", and a deviation {}", "deviations of a configuration"),
+    JOINTS: (f", {SETTLE}", SETTLE),
+    EACH: (f", {SETTLE}", f"{SETTLE}, each by its own size"),
+    TIME: (", and a drift in time", "drift in time"),
+}
 BY_VISIT = (JOINTS, EACH, TIME)
 
 
@@ -738,15 +719,22 @@ class Kind(NamedTuple):
     def words(self) -> str:
         model = STRUCTURES.get(self.own)
         own = self.own if model is None else model.words
-        return " + ".join([own, *(PARTS[part].words for part in self.parts if part in PARTS)])
+        return " + ".join([own, *(PARTS[part][1] for part in self.parts if part in PARTS)])
 
     def deviations(
         self, readings: Readings, lasting: float | None, every: bool = False
     ) -> list[Deviation]:
         """What these readings share, where a drift is `lasting` so long; `every` one that there
         may be, or those that the readings tell apart."""
-        each = (PARTS[part].deviations(readings, lasting or 0.0, every) for part in self.parts)
-        return [deviation for own in each for deviation in own]
+        found: list[Deviation] = []
+        for part in self.parts:
+            if part == CONFIGURATION:
+                found += of_configurations(readings, every)
+            elif part == TIME:
+                found += of_time(readings, lasting or 0.0)
+            else:
+                found += of_joints(readings, part == EACH)
+        return found
 
 
 def noise_models() -> tuple[str, ...]:

@@ -12,77 +12,20 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
 from elastocal.identification.knowledge import ActiveConstraint, Constraints, GaussianPrior
-from elastocal.identification.least_squares import (
-    LEVEL,
-    Covariance,
-    PriorRows,
-    Rows,
-    clustered,
-    root_of,
-    t_quantile,
-)
+from elastocal.identification.least_squares import LEVEL, Covariance, root_of, t_quantile
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
-from elastocal.identification.solve import Solution, residual_sigma
-from elastocal.identification.weighted_problem import Part, WeightKind, each, regressor
+from elastocal.identification.solve import Solution
+from elastocal.identification.weighted_problem import WeightKind
 from elastocal.model.manipulator import SmoothGroup
 from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray
-
-# Configurations per parameter from which the scatter of those of a large table counts.
-ENOUGH = 10
 
 IntervalKind = Literal[
     "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
     "profile",
 ]  # fmt: skip
 KINDS = get_args(IntervalKind)
-
-
-def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Covariance:
-    """Covariance and intervals of the solution's fitted parameters.
-
-    auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in
-    a large table with several readings per configuration cr1;
-    classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations,
-    or rows by themselves, in passes over the parts of the table;
-    profile: {v: S(v) − Ŝ ≤ t² s²} of the nonlinear sum of squares.
-
-    Raises InsufficientDataError where the data cannot give it.
-    """
-    fit, problem = solution.fit, solution.problem
-    if kind == "auto" and noise is not None:
-        return noise.covariance
-    if kind == "auto" and problem.large:
-        readings, configurations = (
-            len(problem.observations.lead), problem.observations.n_configurations
-        )  # fmt: skip
-        kind = "cr1" if readings > configurations >= ENOUGH * len(fit.columns) else kind
-    sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
-    classical = Covariance(
-        "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
-        "all readings independent, their noise scaled to the residual",
-    )  # fmt: skip
-    if kind in ("auto", "classical"):
-        return classical
-    if kind == "profile":
-        from elastocal.identification.constrained import KnownFit, profile_end
-
-        names, none = problem.model.names, Constraints()
-        known = PriorRows.stated(names, fit.columns, fit.x, none, None, sigma)
-        found, rises = KnownFit(fit, known, sigma), (sigma * t_quantile(LEVEL, classical.dof)) ** 2
-        ends = [[profile_end(found, k, float(rise), side) for side in (-1, 1)]
-                for k, rise in enumerate(rises)]  # fmt: skip
-        text = "profile of the nonlinear sum of squares (all readings independent)"
-        return replace(classical, kind="profile", description=text, ends=np.array(ends))
-    V = fit.r_factor.half
-
-    def rows(part: Part) -> Rows:
-        at, own = regressor(problem.model, part, fit.x, fit.columns), part.observations
-        labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
-        return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
-
-    return clustered(each(problem.parts, rows), V, kind.upper())
 
 
 # What an identification says of a smooth function: its size, and how sure.
@@ -272,7 +215,7 @@ class Options:
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `constraints` and `prior`: a
-    constrained or regularised fit on top of the method's weights (`constrained`).  `faulty`:
+    constrained or regularised fit on top of the method's weights (`knowledge_fit`).  `faulty`:
     readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
     always, or never; they are listed in the result in any case.  `seed`: of multi-start and
     searches; `jobs` has no effect, as nothing is drawn in processes.

@@ -64,7 +64,8 @@ def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> Publ
     w = _positive("weights", weights, len(dp))
     x, covariance = _solve(B, dp, w)
     if sigma is not None:
-        covariance = _sandwich(B, w, _positive("sigma", sigma, len(dp)), covariance)
+        middle = B * (w**2 * _positive("sigma", sigma, len(dp)))[:, None]
+        covariance = covariance @ (middle.T @ middle) @ covariance
     return PublishedFit("wls", x, covariance, w, dp - B @ x)
 
 
@@ -162,11 +163,6 @@ def _finite(name: str, values: Array, dimensions: int) -> Array:
         shape = "(rows, parameters)" if dimensions == 2 else "(rows,)"
         raise InputError(f"{name} must be finite numbers {shape}; got shape {array.shape}")
     return array
-
-
-def _sandwich(B: Array, w: Array, sigma: Array, cofactor: Array) -> Array:
-    middle = B * (w**2 * sigma)[:, None]
-    return cofactor @ (middle.T @ middle) @ cofactor
 
 
 def _positive(name: str, values: Array, n: int) -> Array:

@@ -20,8 +20,6 @@ from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
-from elastocal.identification.noise_summary import Noise
-from elastocal.identification.options import SmoothPart
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (
     Excess,
@@ -35,7 +33,6 @@ from elastocal.identification.prediction import (
 )
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.scrutiny import MOST_NUMBERS
-from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.arm import check_loads
 from elastocal.model.calibrated import (
@@ -46,9 +43,8 @@ from elastocal.model.calibrated import (
     nominal_flange_rows,
     tool_point,
 )
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import COMPONENTS, Observations, observe
-from elastocal.units import Array, IntArray, microns
+from elastocal.model.observations import COMPONENTS, observe
+from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms
@@ -256,7 +252,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Calibration(Result):
+class Calibration(scrutiny.FoundFit, Result):
     """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
 
     Attributes:
@@ -312,21 +308,12 @@ class Calibration(Result):
         ['joint1.compliance']
     """
 
-    model: Model
     method: str
-    noise: Noise
     estimates: tuple[Estimate, ...]
     combinations: tuple[Combination, ...]
-    x: Array
-    determined: tuple[str, ...]
     spread: Covariance
     correlations: tuple[tuple[str, str, float], ...]
-    observations: Observations
-    residual: Array
-    held_out: Array
     sigma: float
-    dof: int
-    residual_rms: float
     heldout_rms: float
     nominal_rms: float
     converged: bool
@@ -334,9 +321,6 @@ class Calibration(Result):
     outliers: tuple[Outlier, ...]
     excluded: tuple[Outlier, ...]
     warnings: tuple[str, ...]
-    weights: Weights
-    noise_parts: dict[str, float]
-    smooth: tuple[SmoothPart, ...] = ()
     test: TestErrors | None = None
     residual_summary: ResidualSummary | None = None
     faulty_report: OutlierReport | None = None
@@ -347,18 +331,6 @@ class Calibration(Result):
     predicted: PredictedError | None = None
     copies: tuple[int, ...] = ()
     shown: ShownPoses | None = None
-
-    @cached_property
-    def columns(self) -> IntArray:
-        """Indices (determined,) of the parameters `determined` among the model's."""
-        index = {name: i for i, name in enumerate(self.model.names)}
-        return np.array([index[name] for name in self.determined], dtype=np.int64)
-
-    @cached_property
-    def B(self) -> Array:
-        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
-        observed = self.observations
-        return self.model.regressor(observed.table, self.x, observations=observed).B
 
     @property
     def covariance(self) -> Array:

@@ -8,13 +8,16 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.engine.mixed import Standardised
+from elastocal.identification.noise_summary import Noise
+from elastocal.identification.options import SmoothPart
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
 from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
@@ -22,11 +25,39 @@ from elastocal.identification.weighted_problem import Weights, least_norm, same_
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array, BoolArray, IntArray, microns
 
-if TYPE_CHECKING:
-    from elastocal.identification.result import Calibration
+
+@dataclass(frozen=True, repr=False, eq=False, kw_only=True)
+class FoundFit:
+    """What of a `Calibration` is looked at again; it says what each is."""
+
+    model: Model
+    x: Array
+    determined: tuple[str, ...]
+    observations: Observations
+    residual: Array
+    held_out: Array
+    dof: int
+    residual_rms: float
+    weights: Weights
+    noise: Noise
+    noise_parts: dict[str, float]
+    smooth: tuple[SmoothPart, ...] = ()
+
+    @cached_property
+    def columns(self) -> IntArray:
+        """Indices (determined,) of the parameters `determined` among the model's."""
+        index = {name: i for i, name in enumerate(self.model.names)}
+        return np.array([index[name] for name in self.determined], dtype=np.int64)
+
+    @cached_property
+    def B(self) -> Array:
+        """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
+        observed = self.observations
+        return self.model.regressor(observed.table, self.x, observations=observed).B
 
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
@@ -63,7 +94,7 @@ class Influence:
         }
 
 
-def influence(fit: Calibration) -> tuple[Influence, ...]:
+def influence(fit: FoundFit) -> tuple[Influence, ...]:
     observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
     white, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
@@ -207,7 +238,7 @@ CHOSEN = "chosen"
 DRAWS = 1000
 
 
-def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
+def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
     model, free = fit.model, ~fit.model.shrunk
@@ -265,9 +296,7 @@ def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
     return tuple(found)
 
 
-def _refitted(
-    fit: Calibration, y: Array, columns: IntArray, weights: Weights
-) -> tuple[Array, Array]:
+def _refitted(fit: FoundFit, y: Array, columns: IntArray, weights: Weights) -> tuple[Array, Array]:
     """Residual (rows,) of y by these columns, and of each configuration by a fit to the others."""
     B, observed = fit.B[:, columns], fit.observations
     left = y - B @ least_norm(weights.apply(B), weights.apply(y))
@@ -328,7 +357,7 @@ class UncertaintyBudget:
 
 
 def uncertainty_budget(
-    fit: Calibration, arm: CalibratedArm, table: Measurements | None = None
+    fit: FoundFit, arm: CalibratedArm, table: Measurements | None = None
 ) -> UncertaintyBudget:
     B, at = fit.B, "the poses fitted"
     if table is not None:
@@ -368,7 +397,7 @@ class ErrorBudget:
     floor_name: str
 
 
-def gap_budget(result: Calibration) -> ErrorBudget | None:
+def gap_budget(result: FoundFit) -> ErrorBudget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
     functions.
 
@@ -400,9 +429,7 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
     return ErrorBudget(tuple(steps), *_floor(result))
 
 
-def _fitted(
-    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
-) -> Array | None:
+def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_]) -> Array | None:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
     model linearised at the whole fit."""
     model, B = result.model, result.B
@@ -421,7 +448,7 @@ def _fitted(
     return found if np.isfinite(found).all() else None
 
 
-def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
+def _step(name: str, result: FoundFit, residual: Array, rng: np.random.Generator) -> BudgetStep:
     observed = result.observations
     parts = residual.reshape(-1, observed.size)[:, :3]
     squared = (parts**2).sum(axis=1)
@@ -430,7 +457,7 @@ def _step(name: str, result: Calibration, residual: Array, rng: np.random.Genera
     return BudgetStep(name, rms, ci95, parts)
 
 
-def _floor(result: Calibration) -> tuple[float | None, str]:
+def _floor(result: FoundFit) -> tuple[float | None, str]:
     observed = result.observations
     parts = result.residual.reshape(-1, observed.size)[:, :3]
     square, dof = pure_error(observed.place, parts)

@@ -1,0 +1,388 @@
+"""A fit with knowledge: constraints and a prior beside the readings, intervals that keep them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg, special
+
+from elastocal.errors import ElastocalError, InsufficientDataError, option, require
+from elastocal.identification.constrained import Minimum, Reduced
+from elastocal.identification.knowledge import Constraints, GaussianPrior, share_of_prior
+from elastocal.identification.least_squares import (
+    LEVEL,
+    Covariance,
+    Fit,
+    Objective,
+    PriorRows,
+    t_quantile,
+)
+from elastocal.identification.least_squares import fit as least_squares
+from elastocal.identification.options import FunctionPrior, MethodResult, Options
+from elastocal.identification.residuals import held_out_by_parts
+from elastocal.identification.solve import (
+    WORTH_A_COLUMN,
+    Reduction,
+    Solution,
+    reduce,
+    residual_sigma,
+)
+from elastocal.identification.weighted_problem import RFactor, evaluate
+from elastocal.text import listed, quoted
+from elastocal.units import Array, IntArray, Progress
+
+# A fit with knowledge: where its constraints let it go, and how far.
+
+PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
+
+
+@dataclass(frozen=True)
+class KnownFit:
+    """A fit at its minimum with what is known, beside rows of noise `sigma`: the linear problem of
+    the step δ (columns,) from there, |e − B δ|² + |lack − P δ|², and its minimum δ = 0."""
+
+    fit: Fit
+    known: PriorRows
+    sigma: float
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        assert self.known.system is not None
+        x, rows = self.fit.x[self.fit.columns], self.fit.r_factor.augmented
+        J, lack = np.vstack([rows[:, :-1], self.known.P]), self.known.target - self.known.P @ x
+        limits = self.known.system.moved(x, np.ones(len(x)))
+        return Reduced.of(J, np.concatenate([rows[:, -1], lack]), limits)
+
+    @cached_property
+    def best(self) -> Minimum:
+        return self.reduced.minimum(self.known.system)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.reduced.system.names
+
+    @property
+    def objective(self) -> float:
+        return float(self.reduced.t @ self.reduced.t)
+
+    @cached_property
+    def face(self) -> Array:
+        """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
+        return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
+
+    @cached_property
+    def cofactor(self) -> Array:
+        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
+        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
+
+    @cached_property
+    def on_face(self) -> Array:
+        """The same with every active constraint taken for an equality."""
+        return self._pinned(self.face)
+
+    @property
+    def covariance(self) -> Array:
+        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
+        return self.sigma**2 * self.cofactor
+
+    @property
+    def prior_share(self) -> Array:
+        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
+        return share_of_prior(self.cofactor, self.known.P)
+
+    @property
+    def effective(self) -> float:
+        """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
+        return self.face.shape[1] - float(((self.known.P @ self.face) ** 2).sum())
+
+    def _pinned(self, half: Array) -> Array:
+        fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
+        half = np.where(fixed[:, None], 0.0, half)
+        return np.asarray(half @ half.T)
+
+
+# Ends of profile intervals: how far a parameter can move before the fit becomes too bad.
+#
+# With S(v) the least objective where the parameter is held at v and the others are refitted, and Ŝ
+# its minimum, the interval is {v: S(v) − Ŝ ≤ rise} (Bates and Watts 1988, chapter 6): in a linear
+# model the t interval, and the same under any transformation of the parameter.
+
+PRECISION = 1e-7  # of an interval: a step that short is the last
+MOST_STEPS = 40
+ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
+ENDLESS = 1000.0  # times as far as in the linear model: there is no end
+
+
+def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
+    """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
+    nonlinear objective at most `rise` above its minimum; infinite where there is no end.
+
+    Each step goes to that end of the model linearised where the last one ended, and is halved
+    until the objective there is near what is allowed.  An end may also be where poses have no
+    equilibrium any more.  Steps that do not settle lead to none.
+    """
+    fit, limit, size = found.fit, found.objective + rise, found.fit.sizes[found.fit.columns]
+    objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
+    assert objective.limits is not None
+    far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
+    u = np.zeros(len(size))
+    at = objective.evaluate(u)
+    for _ in range(MOST_STEPS):
+        A, b = objective.rows(u, at)
+        reduced = Reduced.of(A, b, objective.limits.moved(u, np.ones(len(u))))
+        best = reduced.minimum()
+        step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
+        while True:
+            try:
+                at = objective.evaluate(u + step)
+                if objective.cost(u + step, at) <= limit + ASTRAY * rise:
+                    break
+            except ElastocalError:
+                pass  # no equilibrium so far out
+            step = step / 2
+        u = u + step
+        if np.linalg.norm(A @ step) <= PRECISION * np.sqrt(rise):
+            return float(objective.values(u)[fit.columns[index]])
+        if abs(size[index] * u[index]) > far:
+            break
+    return side * np.inf
+
+
+# The fit of a method again, under constraints and with a prior.
+
+# Which parameters a fit with constraints and a prior has.
+
+
+def fitted_columns(
+    solution: Solution, constraints: Constraints, prior: GaussianPrior | None, sigma: float
+) -> IntArray:
+    """Indices of the parameters to fit under the constraints and the prior, ascending.
+
+    These are the kept parameters of the solution; the free ones that the prior or an equality
+    names, for that is knowledge of themselves; and what else the choice of the kept parameters
+    finds worth a column with the prior and the equalities as further rows: with a prior on k,
+    readings of k + d are knowledge of d.  Bounds and matrices make nothing known: they act on the
+    fitted parameters, with all others held where the fit held them.
+
+    Raises InputError for a name that is no parameter, or a prior on a parameter that is held fixed;
+    InsufficientDataError where an equality names a parameter that stays undetermined.
+    """
+    problem, kept, model = solution.problem, solution.reduction.kept, solution.problem.model
+    names, free, A = model.names, problem.free, constraints.resolve(model.names).A
+    P = np.zeros((0, len(names))) if prior is None else sigma * prior.rows(names)[0]
+    known, tied = (np.flatnonzero(rows.any(axis=0)) for rows in (P, A))
+    fixed = [quoted(names[c]) for c in np.setdiff1d(known, free)]
+    require(
+        not fixed,
+        f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
+    )
+    named = np.intersect1d(np.union1d(known, tied), free)
+    R = evaluate(problem.model, problem.parts, solution.fit.x, free).r_factor.R
+    # An equality is exact: it counts as much as the most that anything else tells.
+    A = A[:, free][A[:, free].any(axis=1)]
+    most = np.linalg.norm(np.vstack([R, P[:, free]]) * solution.sizes[free], axis=0).max()
+    A = A * most / np.linalg.norm(A * solution.sizes[free], axis=1)[:, None]
+    rank = np.where(np.isin(free, kept), 0, np.where(np.isin(free, named), 1, 2))
+    rows = np.vstack([R, P[:, free], A])
+    told = free[reduce(rows, solution.sizes[free], (), sigma, WORTH_A_COLUMN, rank).kept]
+    unknown = [quoted(names[c]) for c in np.setdiff1d(np.intersect1d(tied, named), [*told, *known])]
+    if unknown:
+        raise InsufficientDataError(
+            f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
+            f"names; hold it ({option('fixed')}) or state a prior for it, or drop the equality"
+        )
+    return np.unique(np.concatenate([kept, named, told]))
+
+
+# Intervals of a fit under constraints or with a prior.
+#
+# At a bound the estimate is not normal and the likelihood ratio not χ²: where the truth lies on one
+# bound, it is the mixture ½χ²₀ + ½χ²₁ (Chernoff 1954; Self and Liang 1987), whose 95 % point is
+# 2.71.  The intervals here keep the quantile of an interior truth, 3.84.  Away from bounds they are
+# exact for a linear model with normal noise of known size; at and near one bound they are
+# conservative (97.5 % for 95 %).  With the truth on two bounds at once the mixture depends on the
+# angle α > 90° between the two whitened columns of B: they then hold 97.5 % − 14.65 % (α −
+# 90°)/360°, which is 95 % at 150° and 93.8 % in the limit of 180°, two columns that nearly cancel.
+
+ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
+
+
+def intervals_with_knowledge(
+    found: KnownFit, of_readings: Array, kind: str, many: set[str]
+) -> Covariance:
+    """95 % intervals of the constrained fit's columns, and their covariance.
+
+    auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
+    active; else the profile {v: S(v) − Ŝ ≤ t² σ²} of the linearised model under the constraints,
+    S(v) the least objective with the parameter at v.  profile: that of the nonlinear one.
+
+    The covariance takes equalities for exact and leaves inequalities out: knowing more than it
+    says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
+    Parameters that are `many`, those of smooth functions, have t intervals in any case.
+    """
+    known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
+    assert known.system is not None
+    # A posterior variance V moves with the noise's variance s² by the readings' share of it,
+    # d log V = (1 − share) d log s²: by Satterthwaite it has dof/(1 − share)² where s² has dof.
+    left = 1 - np.nan_to_num(found.prior_share, nan=1.0)
+    full = np.full(len(left), np.inf)
+    dof = np.divide(of_readings, left**2, out=full, where=left > 1e-6)
+    inside = not any(a.kind != "equality" for a in found.best.active)
+    plain = Covariance("t", matrix, dof, "").interval(x, LEVEL)
+    if kind == "auto" and inside:
+        name, text = ("t under constraints", "equalities taken for exact, bounds cut off")
+        if len(known.P):
+            name, text = ("posterior", "readings and prior together, the prior taken at its word")
+        lower, upper = known.system.lower[:, None], known.system.upper[:, None]
+        plain = np.clip(plain, lower, upper)
+        return Covariance(name, matrix, dof, f"{text}; assumes normal noise", ends=plain)
+    ends = np.repeat(x[:, None], 2, axis=1)
+    of_functions = np.array([name in many for name in found.names])
+    ends[of_functions] = plain[of_functions]
+    # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
+    rises = (found.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
+    for k, name in enumerate(found.names):
+        for end, side in enumerate((-1, 1)) if name not in many else ():
+            rise = float(rises[k])
+            if kind == "profile":
+                ends[k, end] = profile_end(found, k, rise, side)
+            else:
+                ends[k, end] += found.reduced.farthest(k, found.best, rise, side)[k]
+    model = "nonlinear" if kind == "profile" else "linearised"
+    text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
+    return Covariance("constrained profile", matrix, dof, text, ends=ends)
+
+
+# The fit of a method, its knowledge added: one more step on the weights that the method ends with.
+
+NO_PART = 1e-9  # factors below this share of a typical size are no combination
+CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user knows
+
+
+def joined(stated: GaussianPrior | None, own: GaussianPrior | None) -> GaussianPrior | None:
+    """Both priors; of a parameter that both name, the stated one."""
+    if stated is None or own is None:
+        return own if stated is None else stated
+    rest = [k for k, name in enumerate(own.names) if name not in set(stated.names)]
+    return GaussianPrior(
+        (*stated.names, *(own.names[k] for k in rest)),
+        np.concatenate([stated.mean, own.mean[rest]]),
+        linalg.block_diag(stated.covariance, own.covariance[np.ix_(rest, rest)]),
+    )
+
+
+def fit_with_knowledge(
+    before: MethodResult, options: Options, progress: Progress, own: FunctionPrior | None = None
+) -> MethodResult:
+    """Minimise |W (y − h(X))|² + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
+
+    W and the readings are those that the method ended with `before`, σ the noise of a whitened row
+    under it.  `fitted_columns` says what is fitted, `intervals_with_knowledge` what the intervals
+    are; t intervals have the method's own degrees of freedom.  `own` is the prior of smooth
+    functions, which joins the stated one.
+
+    Raises InputError for constraints that contradict each other or held values and names that are
+    no parameters; InsufficientDataError where an equality names a parameter that readings, prior
+    and equalities do not determine.
+    """
+    solution = before.solution
+    problem, fit = solution.problem, solution.fit
+    if own is not None:
+        problem = replace(problem, free=np.union1d(problem.free, fit.columns))
+        solution = replace(solution, problem=problem)
+    constraints = options.constraints or Constraints()
+    prior = joined(options.prior, None if own is None else own.prior)
+    sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
+    columns = fitted_columns(solution, constraints, prior, sigma)
+    stated = PriorRows.stated(problem.model.names, columns, fit.x, constraints, prior, sigma)
+    progress("fitting under constraints" if prior is None else "fitting with the prior")
+    found = KnownFit(
+        least_squares(problem, columns, fit.x, solution.sizes, known=stated), stated, sigma
+    )
+    progress("intervals under constraints" if prior is None else "intervals with the prior")
+    told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
+    spare = own.dof if own else min(told.values())
+    dof = np.array([spare if own else told.get(c, spare) for c in columns.tolist()])
+    many = set() if own is None else set(own.prior.names)
+    spread = intervals_with_knowledge(found, dof, options.intervals, many)
+    # Of smooth functions' parameters, which are many, nobody asks.
+    shares = {} if prior is None else {
+        name: float(share)
+        for c, name, share in zip(columns, found.names, found.prior_share, strict=True)
+        if np.isfinite(share) and not problem.model.shrunk[c]
+    }  # fmt: skip
+    fitted = _as_fit(found)
+    # Linearised, with the active constraints kept active: directions of the face are orthonormal by
+    # the rows of readings and prior together.
+    heldout, leverage = held_out_by_parts(
+        problem.model, problem.parts, found.fit.x, columns, found.face
+    )
+    known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
+    doubts = _contradiction(solution, before.spread, found, own)
+    return replace(
+        before, method="constrained", solution=known, spread=spread,
+        active=found.best.active, prior_share=shares, effective=round(found.effective),
+        leverage=leverage, warnings=(*before.warnings, *doubts),
+        smooth=tuple(part.refitted(fitted.x, columns, spread.matrix) for part in before.smooth),
+    )  # fmt: skip
+
+
+def _contradiction(
+    solution: Solution, before: Covariance, found: KnownFit, own: FunctionPrior | None
+) -> tuple[str, ...]:
+    """A sentence where the objective grew by more than noise explains (F-test).
+
+    Rows of the prior and active constraints count as degrees of freedom, less the parameters they
+    made estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious.
+    """
+    rows = len(found.known.P) - (0 if own is None else len(own.prior.names))
+    stated = rows + len(found.best.active) - (len(found.names) - len(solution.fit.columns))
+    if stated < 1:
+        return ()
+    grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
+    dof = max(float(before.dof.min()), 1.0)
+    if own is not None:
+        grown, dof = grown - own.stands, own.dof
+    F = max(grown, 0.0) / (stated * found.sigma**2)
+    known = np.isinf(dof)
+    p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
+    if p > CONTRADICTED:
+        return ()
+    what = [f"'{a.label}'" for a in found.best.active]
+    what += ["the prior"] if rows else []
+    return (
+        f"The readings contradict {listed(what, 6)}: without, they are fitted better than noise "
+        f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "
+        "names, units and signs of what is stated, and whether the model lacks an effect.",
+    )
+
+
+def _as_fit(found: KnownFit) -> Fit:
+    """As the fit of a method; its R factor has prior and equalities as further rows.
+
+    Without them a parameter that no reading shows would leave it singular; equalities weigh as
+    much as the readings of a parameter do.
+    """
+    reduced = found.reduced
+    A = reduced.system.A * reduced.unit
+    equalities = A / np.linalg.norm(A, axis=1)[:, None] / reduced.unit
+    rows = np.vstack([reduced.J, equalities])
+    return replace(found.fit, r_factor=RFactor.of(rows, np.append(reduced.t, np.zeros(len(A)))))
+
+
+def _reduction(solution: Solution, found: KnownFit) -> Reduction:
+    """What is fitted, what is held, and how a held parameter's error would move the estimates.
+
+    A parameter that an active constraint holds back does not move: it stands for itself.
+    """
+    before, problem = solution.reduction, solution.problem
+    columns, k = found.fit.columns, len(found.fit.columns)
+    dropped = np.setdiff1d(before.dropped, columns)
+    both = np.concatenate([columns, dropped])
+    R = evaluate(problem.model, problem.parts, found.fit.x, both).r_factor.R
+    mixing = found.on_face @ (R[:, :k].T @ R[:, k:])
+    share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
+    mixing[share < NO_PART] = 0.0
+    return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
