@@ -11,14 +11,13 @@ from typing import Any
 
 import numpy as np
 from draw import World
-from skeleton import Array
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 
@@ -56,14 +55,19 @@ def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> li
         others = tuple(e for e in world.effects if e is not effect)
         v = whole - replace(world, effects=others).noise_free(world.visits)
         data = replace(scene.data, r=scene.blocks.pack(v.reshape(-1, 3, 1))[:, :, 0])
-        for e in others:
-            data = _beside(scene, data, known[e.name, e.where], e.settings)
+        for e in others:  # there too: its columns beside the data
+            h = known[e.name, e.where]
+            C = scene.packed(h, np.array([e.settings[s.key] for s in h.settings]))
+            data = data.with_columns(C, np.full(C.shape[2], h.scales.max() ** -2.0))
         at = project(data, noise)
         grams = Grams(scene, data, at)
         alone = float((data.r * at.u).sum())
         taken = {(e.name, e.where) for e in world.effects}
         rivals = {k: h for k, h in known.items() if k not in taken and h.name not in without}
-        left = {key: alone - _explained(grams, h) for key, h in rivals.items()}
+        left = {
+            key: alone - float(grams.of(h).explained(float(h.scales.max())).max())
+            for key, h in rivals.items()
+        }
         rival = min(left, key=left.__getitem__)
         nothing, nearest = (float(np.sqrt(max(d, 0.0))) for d in (alone, left[rival]))
         out.append({
@@ -71,18 +75,6 @@ def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> li
             "rival": ":".join(rival), "distance": min(nothing, nearest),
         })  # fmt: skip
     return out
-
-
-def _explained(grams: Grams, h: Hypothesis) -> float:
-    return float(grams.of(h).explained(float(h.scales.max())).max())
-
-
-def _beside(
-    scene: DiagnosisData, data: NoisyData, h: Hypothesis, settings: dict[str, float]
-) -> NoisyData:
-    """The data with the columns of an effect that is there too."""
-    C = scene.packed(h, np.array([settings[s.key] for s in h.settings]))
-    return data.with_columns(C, np.full(C.shape[2], h.scales.max() ** -2.0))
 
 
 def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh: Path) -> float:
@@ -97,10 +89,7 @@ def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh
     x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
     after = fit_baseline(model, base.observed.table, x0=x0)
     table = read(base.model, fresh)
-    e0, e1 = (_error(fit.model, fit.x, table) for fit in (base, after))
-    return 1 - e1 / e0
-
-
-def _error(model: Model, x: Array, table: Measurements) -> float:
     assert table.position is not None
-    return float(np.sqrt(np.mean((model.predict(table, x) - table.position.ravel()) ** 2)))
+    off = (fit.model.predict(table, fit.x) - table.position.ravel() for fit in (base, after))
+    e0, e1 = (float(np.sqrt(np.mean(each**2))) for each in off)
+    return 1 - e1 / e0

@@ -11,15 +11,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "kr270_reproduction"))
 
-from campaign import DEMO, campaign
+from campaign import campaign
 
-from elastocal.cell.work_cell import read_cell
-from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.noise_structure import Readings
-from elastocal.measurements import read_measurements
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
-from elastocal.simulation import expand_plan, values_from
 
 EFFECT = 80e-6  # m, configuration effect in each direction
 OUTLIERS = 0.05, 1e-3, 1e-2  # share of readings, least and largest error in m
@@ -70,7 +65,7 @@ class Setting:
         self.group = base.group[rows]
         n = len(self.configuration)
         self.marker = np.tile(np.arange(3), n // 3)
-        position = _positions()[keep] - TRACKER
+        position = base.position[keep] - TRACKER
         self.sight, self.reach = polar_axes(position), np.linalg.norm(position, axis=1)
         if scenario.noise == "polar":
             along = RANGE[0] + RANGE[1] * self.reach
@@ -132,13 +127,3 @@ class Setting:
 
 
 setting = lru_cache(maxsize=2)(Setting)  # chunks of one scenario follow each other
-
-
-def _positions() -> np.ndarray:
-    """Where the markers of the 270 readings stand (N, 3) in m in the robot's frame, loaded."""
-    cell = read_cell(DEMO / "cell.toml")
-    model = Model(cell)
-    plan = read_measurements(DEMO / "plan.csv", joint_kinds=model.chain.kinds, observe="plan")
-    rows = expand_plan(plan, tuple(cell.tool.markers), 6, np.array(LOAD_N))
-    loaded = rows.take(np.any(rows.force != 0, axis=1))
-    return model.target_poses(loaded, values_from(model, published_compliances(DEMO)[0]))[1]

@@ -139,7 +139,7 @@ def recheck(feasibility: Feasibility, free: np.ndarray, loaded: bool) -> tuple[i
     """Poses looked at on free moves, and those of them in which a margin is broken."""
     judge = mujoco(feasibility, -TOLERANCE)
     poses = [pose for move in free for pose in dense(move)]
-    return len(poses), sum(judge.touches(pose, loaded) for pose in poses)
+    return len(poses), sum(bool(judge.contacts(pose, loaded)) for pose in poses)
 
 
 if __name__ == "__main__":

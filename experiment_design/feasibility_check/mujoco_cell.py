@@ -43,10 +43,6 @@ class MujocoCell:
         self.data.mocap_pos[0] = self.data.site("load_point").xpos if loaded else AWAY
         mujoco.mj_kinematics(self.model, self.data)
 
-    def touches(self, q: np.ndarray, loaded: bool) -> bool:
-        """Some pair is nearer than its margin + slack."""
-        return bool(self.contacts(q, loaded))
-
     def contacts(self, q: np.ndarray, loaded: bool) -> list[tuple[str, str, float]]:
         """Pairs nearer than margin + slack, and their distances in m."""
         self.place(q, loaded)

@@ -107,11 +107,6 @@ def realised(study: Study, q: np.ndarray, campaigns: int, jobs: int) -> np.ndarr
     return np.concatenate(parts)
 
 
-def _some(name: str, q: np.ndarray, seeds: list) -> np.ndarray:
-    study, tool = _instruments(name)
-    return np.array([_one(study, tool, q, seed) for seed in seeds])
-
-
 @cache
 def _instruments(name: str) -> tuple[Study, Tool]:
     """Each process has its own: symbolic models do not pickle."""
@@ -119,16 +114,16 @@ def _instruments(name: str) -> tuple[Study, Tool]:
     return study, Tool(study)
 
 
-def _one(study: Study, tool: Tool, q: np.ndarray, seed: np.random.SeedSequence) -> float:
-    model, truth = study.model, tool.truth
-    rows = rows_of(q, study.forces, tuple(study.cell.tool.markers))
+def _some(name: str, q: np.ndarray, seeds: list) -> np.ndarray:
+    study, tool = _instruments(name)
     repeats = study.cell.design.repeats
+    rows = rows_of(q, study.forces, tuple(study.cell.tool.markers))
     n = len(rows)
     table = rows.take(np.repeat(np.arange(n), repeats))
     table = replace(table, repeat=np.tile(np.arange(repeats), n), row=np.arange(n * repeats) + 2)
-    data = simulate(model, table, truth, np.random.default_rng(seed))
     options = Options(method="wls", faulty="keep", fixed=("joint1.compliance",))
-    return tool.remaining(identify(model, data, options).x)
+    data = (simulate(study.model, table, tool.truth, np.random.default_rng(s)) for s in seeds)
+    return np.array([tool.remaining(identify(study.model, d, options).x) for d in data])
 
 
 class Tool:

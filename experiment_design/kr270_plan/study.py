@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from compared import Study, realised, table_2
 
-from elastocal.planning.plan import Plan, write_plan
+from elastocal.planning.plan import write_plan
 from elastocal.report.arm_view import write_plan_picture
 
 HERE = Path(__file__).parent
@@ -39,7 +39,8 @@ def _of_cell(study: Study, asked: argparse.Namespace) -> list[str]:
     started = time.perf_counter()
     ours = study.planned("test_pose", asked.effort, asked.jobs)
     took = time.perf_counter() - started
-    _keep(study, ours, study.name)
+    write_plan(HERE / f"plan_{study.name}.csv", *ours.rows, forces=ours.stated_forces is not None)
+    write_plan_picture(HERE / f"poses_{study.name}.png", ours)
     print(f"{study.name}: D-optimal", flush=True)
     by_determinant = study.planned("D", "normal", asked.jobs)
     random = study.at_random()
@@ -50,11 +51,13 @@ def _of_cell(study: Study, asked: argparse.Namespace) -> list[str]:
         "random (one of them)": study.pool.q[study.random_plan(np.random.default_rng(1))],
     }
     bound = float(ours.bound_reported or np.nan)
+    removed = [f"{rule} {n}" for rule, n in ours.candidates.removed_by.items() if n]
+    by_rules = f" (removed by {', '.join(removed)})" if removed else ""
     lines = [
         f"## {study.cell.name}",
         "",
         f"{ours.candidates.feasible} feasible candidates of {ours.candidates.tried} tried"
-        f"{_removed(ours)}; pool of {ours.certificate.pool} after {asked.effort} search, "
+        f"{by_rules}; pool of {ours.certificate.pool} after {asked.effort} search, "
         f"{took:.0f} s with {asked.jobs} process(es).",
         "",
         f"Bound on the pool: ρ₀ ≥ {bound:.3f} µm. Efficiency of our plan: "
@@ -86,16 +89,6 @@ def _of_cell(study: Study, asked: argparse.Namespace) -> list[str]:
         "",
     ]
     return lines
-
-
-def _removed(plan: Plan) -> str:
-    removed = [f"{rule} {n}" for rule, n in plan.candidates.removed_by.items() if n]
-    return f" (removed by {', '.join(removed)})" if removed else ""
-
-
-def _keep(study: Study, plan: Plan, name: str) -> None:
-    write_plan(HERE / f"plan_{name}.csv", *plan.rows, forces=plan.stated_forces is not None)
-    write_plan_picture(HERE / f"poses_{name}.png", plan)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,8 @@ DEMO = Path(str(files("elastocal.demo")))
 class Campaign:
     """Linearised at the truth: B (810, 9), exact deflections (810,), σ (810,) in m.
 
-    `group` (810,) numbers configuration × direction, `configuration` (810,) 0 to 14.
+    `group` (810,) numbers configuration × direction, `configuration` (810,) 0 to 14; `position`
+    (270, 3) m: where the markers stand when loaded, in the robot's frame.
     """
 
     names: tuple[str, ...]
@@ -32,6 +33,7 @@ class Campaign:
     sigma: np.ndarray
     group: np.ndarray
     configuration: np.ndarray
+    position: np.ndarray
 
     def draw(self, seed: list[int], configuration_effect: float = 0.0) -> np.ndarray:
         """Δp (810,) less what B does not explain: B·truth + noise, eq. (4).
@@ -68,4 +70,5 @@ def campaign() -> Campaign:
         sigma=deflection_sigma[configuration, direction],
         group=configuration * 3 + direction,
         configuration=configuration,
+        position=model.target_poses(rows.take(np.any(rows.force != 0, axis=1)), x)[1],
     )

@@ -119,8 +119,8 @@ def without_faulty(run: Run, table: Path) -> Path:
     return clean
 
 
-def mm(micrometres: float) -> str:
-    return f"{micrometres / 1e3:.3f}"
+def mm(micrometres: float | None) -> str:
+    return "–" if micrometres is None else f"{micrometres / 1e3:.3f}"
 
 
 def chance(p: float) -> str:
@@ -189,7 +189,7 @@ def diagnose(run: Run, data: Path) -> None:
 def row(run: Run, found: dict[str, Any], measured: dict[str, Any]) -> str:
     earlier = "–" if run.earlier is None else f"{run.earlier:.3f}"
     fitted = read(OUT / f"{run.stem}_after.json")["test"]
-    mean = mm(fitted["mean_um"]) if fitted else "–"
+    mean = mm((fitted or {}).get("mean_um"))
     mean += f" ({run.published:.3f})" if run.published else ""
     values = (
         run.label, found["verdict"], "test" if run.test else "held out", mm(measured["nominal"]),

@@ -18,7 +18,7 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
-from diagnose import OUT, elastocal, identified, read
+from diagnose import OUT, elastocal, identified, mm, read
 from prepare import HERE, prepare
 
 FAULTY = (142, 507)  # lines of the cable's table: README.md
@@ -102,16 +102,14 @@ def measure(split: Split, data: Path) -> dict[str, float]:
 
 
 def row(split: Split, found: dict[str, float]) -> str:
-    def mm(key: str) -> str:
-        return f"{found[key] / 1e3:.3f}"
-
-    ratio = {w: found[f"{w}_found"] / found[f"{w}_promised"] for w in ("before", "after")}
-    values = (
-        split.arm, f"{split.way} {split.seed}", str(found["verdict"]), mm("before_promised"),
-        mm("before_found"), f"{ratio['before']:.2f}", mm("diagnosed"), mm("after_promised"),
-        mm("after_found"), f"{ratio['after']:.2f}",
-    )  # fmt: skip
-    return f"| {' | '.join(values)} |"
+    before, after = (
+        (mm(said), mm(true), f"{true / said:.2f}")
+        for said, true in (
+            (found[f"{w}_promised"], found[f"{w}_found"]) for w in ("before", "after")
+        )
+    )
+    values = f"{split.way} {split.seed}", str(found["verdict"]), *before, mm(found["diagnosed"])
+    return f"| {' | '.join((split.arm, *values, *after))} |"
 
 
 HEAD = (

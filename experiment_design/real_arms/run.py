@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from diagnose import OUT, identified
+from diagnose import OUT, identified, mm
 from prepare import HERE, prepare
 
 KEEP, DROP = ("--outliers", "keep"), ("--outliers", "drop")
@@ -26,10 +26,6 @@ HEADER = (
     "| run | fitted | nominal rms | fit rms | held-out rms | test mean | test max | left out |\n"
     "|---|---|---|---|---|---|---|---|"
 )
-
-
-def mm(value: float | None) -> str:
-    return "–" if value is None else f"{value / 1e3:.3f}"
 
 
 def main() -> None:

@@ -40,8 +40,8 @@ def test_poses_in_contact_are_in_contact_and_free_ones_free(rules, force):
     q = poses(rules, 800)
     hit = Collisions(rules.kinematics, rules.pairs).hits(rules.kinematics.poses(q, force))
     strict, lenient = judge(rules, -TOLERANCE), judge(rules, 1e-3)
-    assert not any(strict.touches(pose, loaded) for pose in q[~hit])
-    assert all(lenient.touches(pose, loaded) for pose in q[hit])
+    assert not any(strict.contacts(pose, loaded) for pose in q[~hit])
+    assert all(lenient.contacts(pose, loaded) for pose in q[hit])
     assert 150 < hit.sum() < 750
 
 
