@@ -55,6 +55,15 @@ def microns(metres: float | None) -> float | None:
     return None if metres is None or not math.isfinite(metres) else metres * 1e6
 
 
+def pose_at(position: object, rotation: Array | None = None) -> Array:
+    """T (4, 4) of a position (3,) in m and a rotation (3, 3), None for none."""
+    T = np.eye(4)
+    T[:3, 3] = np.asarray(position)
+    if rotation is not None:
+        T[:3, :3] = rotation
+    return T
+
+
 def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
     """Rz(yaw) Ry(pitch) Rx(roll), (3, 3), of angles in rad: the URDF's convention."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)

@@ -50,7 +50,7 @@ from elastocal.errors import require
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, is_label, listed, quoted
-from elastocal.units import Array, rotation_from_rpy
+from elastocal.units import Array, pose_at, rotation_from_rpy
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]
@@ -123,10 +123,9 @@ class Solid:
         size = table.get("scale", np.ones(3))
         if shape != "mesh":
             size = np.hstack([table[name] for name in needed])
-        T = np.eye(4)
-        T[:3, :3] = rotation_from_rpy(np.radians(table.get("rpy_deg", (0, 0, 0))))
-        T[:3, 3] = table.get("position_m", (0, 0, 0))
-        return {"size": size, "placement": T}
+        turned = rotation_from_rpy(np.radians(table.get("rpy_deg", (0, 0, 0))))
+        placement = pose_at(table.get("position_m", (0, 0, 0)), turned)
+        return {"size": size, "placement": placement}
 
 
 @record

@@ -23,7 +23,7 @@ from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, transform
 from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile, comment, element
 from elastocal.text import listed
-from elastocal.units import Array
+from elastocal.units import Array, pose_at
 
 # Each joint is a hinge or slide that a position actuator drives: its control is the commanded
 # joint value, its gain kp = 1/k the identified stiffness, so that at rest q − q_commanded = k τ.
@@ -68,9 +68,7 @@ def calibrated_mjcf(
         integrator="implicitfast",
     )  # fmt: skip
     world = ET.SubElement(root, "worldbody")
-    tracker = np.eye(4)
-    tracker[:3, :3] = R
-    ET.SubElement(world, "site", placed_body("tracker_axes", tracker))
+    ET.SubElement(world, "site", placed_body("tracker_axes", pose_at(np.zeros(3), R)))
     actuators = ET.Element("actuator")
     body = _body(world, "base", pieces.T_tracker_base if base_frame else np.eye(4))
     _passive(body, pieces.springs_at("base"))
@@ -173,10 +171,9 @@ def _motor(
 def _sites_and_load(flange: ET.Element, actuators: ET.Element, pieces: ExportNumbers) -> None:
     """Flange, load point and markers; forces in N along the tracker's axes, which keep their
     direction while the arm moves."""
-    load = np.eye(4)
-    load[:3, 3] = pieces.load_point
-    placed = {f"marker_{name}": T for name, T in pieces.markers.items()}
-    for name, T in {"flange": np.eye(4), "load_point": load, **placed}.items():
+    placed = {"flange": np.eye(4), "load_point": pose_at(pieces.load_point)}
+    placed |= {f"marker_{name}": T for name, T in pieces.markers.items()}
+    for name, T in placed.items():
         ET.SubElement(flange, "site", placed_body(name, T))
     for axis, unit in zip("xyz", np.eye(3, 6), strict=True):
         ET.SubElement(

@@ -21,7 +21,7 @@ from elastocal.model.mjcf import parsed
 from elastocal.model.urdf import tree_of, urdf_file
 from elastocal.model.xml_file import Tag, XmlFile, comment, element
 from elastocal.tables import csv_text
-from elastocal.units import Array
+from elastocal.units import Array, pose_at
 
 # The calibrated arm as URDF: the user's own file with corrected joint origins.
 #
@@ -105,9 +105,7 @@ def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
         while name in frames:  # "A B" beside "A_B"
             name += "_"
         frames[name] = T
-    load = np.eye(4)
-    load[:3, 3] = pieces.load_point
-    return frames | {LOAD_POINT: load}
+    return frames | {LOAD_POINT: pose_at(pieces.load_point)}
 
 
 def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
@@ -417,10 +415,10 @@ def _decompose(
     `keep_last`: the last row changes in θ and d alone, the rest is the flange's.  Its z is often
     in line with the last axis, where a row of its own would turn any way.
     """
-    turned = []
-    for joint in chain.joints:  # rotations whose z column is the axis
-        turned.append(np.eye(4))
-        turned[-1][:3, :3] = np.column_stack([*transverse_axes(joint.axis), joint.axis])
+    turned = [  # rotations whose z column is the axis
+        pose_at(np.zeros(3), np.column_stack([*transverse_axes(joint.axis), joint.axis]))
+        for joint in chain.joints
+    ]
     ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
     starts = [np.eye(4), *turned]
     rows: list[Array] = []

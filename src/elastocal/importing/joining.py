@@ -175,9 +175,8 @@ def with_joints(
             f"{int(wrong[0][1:]) - 1}; joints are numbered from 1 without gaps"
         )
     taken = _order(where, records, joints, model_names, len(stems))
-    values = list(records.q[np.arange(len(records))[:, None], taken].T)
     units = [records.units[stems[j]] for j in taken[0]]
-    n = len(values)
+    n = len(units)
     for key in ("sign", "offset_deg", "offset_mm"):
         given = getattr(joints, key)
         if given is not None and len(given) != n:
@@ -187,10 +186,10 @@ def with_joints(
             )
     for value in joints.sign or ():
         require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
-    for j, unit in enumerate(units):
-        given = joints.offset_deg if unit == "deg" else joints.offset_mm
-        values[j] = values[j] * (joints.sign or [1] * n)[j] + (given or [0.0] * n)[j]
-    before = list(values)
+    none = [0.0] * n
+    offset = np.where(np.array(units) == "deg", joints.offset_deg or none, joints.offset_mm or none)
+    before = np.take_along_axis(records.q, taken, axis=1) * (joints.sign or [1.0] * n) + offset
+    q = before.copy()
     for k, coupling in enumerate(joints.coupling):
         for name in ("joint", "of"):
             number = getattr(coupling, name)
@@ -205,13 +204,13 @@ def with_joints(
                 f"{where}: [joints] coupling no. {k + 1} joins a revolute and a prismatic joint; "
                 "give the factor in other units outside the mapping"
             )
-        values[j] = values[j] + coupling.factor * before[i]
+        q[:, j] += coupling.factor * before[:, i]
     numbers = {s: v for s, v in records.numbers.items() if s not in stems}
     own = {s: u for s, u in records.units.items() if s not in stems}
     made = [f"q{j + 1}" for j in range(n)]
     return replace(
         records,
-        numbers=numbers | dict(zip(made, values, strict=True)),
+        numbers=numbers | dict(zip(made, q.T, strict=True)),
         units=own | dict(zip(made, units, strict=True)),
     )
 

@@ -40,7 +40,7 @@ from elastocal.tables import (
     read_table,
 )
 from elastocal.text import did_you_mean, listed, nearest, quoted
-from elastocal.units import Array, rotation_from_rpy
+from elastocal.units import Array, pose_at, rotation_from_rpy
 
 Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -495,7 +495,6 @@ def _of_origins(path: Path, text: str) -> Chain:
             raise InputError(f"{path}: kinematics.{of_link} needs {', '.join(ORIGIN)}")
         numbers = [_number(f"{path}: kinematics.{of_link}.{key}", origin[key]) for key in ORIGIN]
         check_angles(f"{path}: kinematics.{of_link}", tuple(numbers[3:]), "the file is in rad")
-        T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_from_rpy(numbers[3:]), numbers[:3]
+        T = pose_at(numbers[:3], rotation_from_rpy(numbers[3:]))
         joints.append(Joint(name, "revolute", T, np.array([0.0, 0.0, 1.0])))
     return Chain(path.stem, tuple(joints), np.eye(4))

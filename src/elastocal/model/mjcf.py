@@ -32,7 +32,7 @@ from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.urdf import FileJoint, Tree
 from elastocal.model.xml_file import XmlFile, check_bounds
 from elastocal.text import listed, printable
-from elastocal.units import Array
+from elastocal.units import Array, pose_at
 
 WORLD = 0  # MuJoCo's number of the world body
 # Springs that `elastocal export` adds; they are held at zero, so the nominal arm has none.
@@ -272,7 +272,7 @@ def _tree(
             child = f"{bodies[b]} after joint {j}"
             links[child] = LinkMass(0.0, np.zeros(3))
             joints.append(_joint(model, j, parent, child, T))
-            parent, T = child, shift(-model.jnt_pos[j])
+            parent, T = child, pose_at(-model.jnt_pos[j])
         joints.append(FileJoint("", "fixed", parent, bodies[b], T, np.zeros(3)))
         mass = 0.0 if b in unweighed else float(model.body_mass[b])
         links[bodies[b]] = LinkMass(mass, np.array(model.body_ipos[b]))
@@ -313,7 +313,7 @@ def joints_of(model: Any, body: int) -> list[int]:
 def before(model: Any, j: int) -> Array:
     """X (4, 4): the frame of joint j at zero in its body's, Trans(p) J(a, −r)."""
     turned = rigid.moved(motion_of(model, j), model.jnt_axis[j], -_ref(model, j))
-    return shift(model.jnt_pos[j]) @ turned
+    return pose_at(model.jnt_pos[j]) @ turned
 
 
 def _ref(model: Any, j: int) -> float:
@@ -325,13 +325,7 @@ def transform(position: Sequence[float] | Array, quaternion: Sequence[float] | A
     from scipy.spatial.transform import Rotation
 
     w, x, y, z = quaternion
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.from_quat([x, y, z, w]).as_matrix(), position
-    return T
-
-
-def shift(position: Sequence[float] | Array) -> Array:
-    return transform(position, (1.0, 0.0, 0.0, 0.0))
+    return pose_at(position, Rotation.from_quat([x, y, z, w]).as_matrix())
 
 
 def import_mujoco(what: str = "a MuJoCo model") -> Any:

@@ -33,7 +33,7 @@ from elastocal.model.chain import (
 )
 from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile
 from elastocal.text import did_you_mean, listed
-from elastocal.units import Array, rotation_from_rpy
+from elastocal.units import Array, pose_at, rotation_from_rpy
 
 Vector = tuple[float, float, float]
 MOVING = ("revolute", "continuous", "prismatic")
@@ -457,15 +457,12 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
         limit = None if kind == "continuous" else (lower, upper)
     mimic, rpy = tag.first("mimic"), _vector(where, tag, "origin", "rpy")
     check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
-    origin = np.eye(4)
-    origin[:3, :3] = rotation_from_rpy(rpy)
-    origin[:3, 3] = _vector(where, tag, "origin", "xyz")
     return FileJoint(
         name,
         kind,
         parent=_end(where, tag, "parent", links),
         child=_end(where, tag, "child", links),
-        origin=origin,
+        origin=pose_at(_vector(where, tag, "origin", "xyz"), rotation_from_rpy(rpy)),
         axis=axis / length if length else axis,
         limit=limit,
         follows=None if mimic is None else mimic.get("joint"),

@@ -17,7 +17,7 @@ from elastocal.errors import InputError, require
 from elastocal.files import check_regular, check_size
 from elastocal.model.chain import Chain
 from elastocal.text import did_you_mean, listed
-from elastocal.units import Array
+from elastocal.units import Array, pose_at
 
 # What a solid is to geometry: its hull, its support function and its coal shape.
 
@@ -71,11 +71,9 @@ def touches(solid: Solid, point: Array, within: float) -> bool:
 def capsule_between(name: str, a: Array, b: Array, radius: float) -> Solid:
     """The capsule with cap centres a and b (3,); a sphere where they coincide."""
     length = float(np.linalg.norm(b - a))
-    placement = np.eye(4)
-    placement[:3, 3] = (a + b) / 2
     if length < 1e-9:
-        return Solid(name, "sphere", np.array([radius]), placement)
-    placement[:3, :3] = rotation_to((b - a) / length)
+        return Solid(name, "sphere", np.array([radius]), pose_at((a + b) / 2))
+    placement = pose_at((a + b) / 2, rotation_to((b - a) / length))
     return Solid(name, "capsule", np.array([radius, length]), placement)
 
 
@@ -239,12 +237,9 @@ class Body:
 
 def data_base(cell: Cell) -> Array:
     """T_data_base (4, 4) of the nominal cell."""
-    nominal, T = cell.model.nominal, np.eye(4)
-    if nominal.base_rotation is not None:
-        T[:3, :3] = nominal.base_rotation
-    if nominal.base_position is not None:
-        T[:3, 3] = nominal.base_position
-    return T
+    nominal = cell.model.nominal
+    position = np.zeros(3) if nominal.base_position is None else nominal.base_position
+    return pose_at(position, nominal.base_rotation)
 
 
 def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
@@ -328,8 +323,7 @@ def hanging(load: HangingLoad) -> Iterator[Body]:
     if load.rope > 0:
         foot = np.array([0.0, 0.0, -load.rope])
         yield Body(capsule_between("rope", np.zeros(3), foot, load.rope_radius), HANGING, "rope")
-    lowered = np.eye(4)
-    lowered[2, 3] = -load.rope - support(load.solid, UP)
+    lowered = pose_at([0.0, 0.0, -load.rope - support(load.solid, UP)])
     yield Body(_moved(lowered, load.solid), HANGING, "load")
 
 
@@ -427,9 +421,8 @@ def _outline(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> Iterator[Bod
         yield from skeleton(chain, (THIN,), data_base(cell), cell.name)
     tool = {f"marker {name}": p for name, p in cell.tool.markers.items()}
     for name, point in {"load point": cell.tool.load_point, **tool}.items():
-        T = np.eye(4)
-        T[:3, 3] = point
-        solid = Solid(name, "sphere", np.array([THIN]), chain.flange_placement @ T)
+        placement = chain.flange_placement @ pose_at(point)
+        solid = Solid(name, "sphere", np.array([THIN]), placement)
         yield Body(solid, chain.n_joints - 1, "carried")
 
 

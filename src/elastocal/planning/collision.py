@@ -30,7 +30,7 @@ from elastocal.planning.bodies import (
     rotation_to,
     touches,
 )
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, pose_at
 
 # Where everything stands in a batch of poses, from the chain's one symbolic description.
 
@@ -155,9 +155,8 @@ def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
         placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
         moving = unaligned[joint.kind](np.array(joint.axis))
         parent = model.addJoint(parent, moving, _se3(placement), f"joint{i + 1}")
-    load_point = np.eye(4)
-    load_point[:3, 3] = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
-    model.addJoint(parent, pin.JointModelSpherical(), _se3(load_point), "hanging")
+    load_point = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
+    model.addJoint(parent, pin.JointModelSpherical(), _se3(pose_at(load_point)), "hanging")
     for i in range(free):
         model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
     return model
