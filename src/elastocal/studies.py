@@ -18,8 +18,6 @@ import importlib
 import json
 import logging
 import math
-import os
-import queue
 import re
 import shutil
 import signal
@@ -29,6 +27,7 @@ import threading
 import time
 import tomllib
 import traceback
+import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -111,6 +110,9 @@ class StudyTask:
             "task": self.index, "task_hash": self.hash, "values": json.loads(self.text),
             "rows": [], "task_seconds": 0.0, "elastocal": __version__, "task_error": None,
         }  # fmt: skip
+
+    def failed(self, told: str) -> Row:
+        return self.line() | {"task_error": told, "trace": f"{told}\n"}
 
     def rng(self) -> np.random.Generator:
         """Child `index` of SeedSequence(seed), whoever computes it and however many there are."""
@@ -469,91 +471,8 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
 
 ANSWER = 10.0  # s in which a scheduler answers
 MOST_PEM_BYTES = 1_000_000
-# What limits threads of linear algebra: the processes share the cores.
-THREADS = (
-    "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS",
-)  # fmt: skip
-
-
-class Processes:
-    """A process of joblib's for each task that is out, which takes one after the other."""
-
-    tries = 3  # of a task whose process dies
-
-    def __init__(self, number: int) -> None:
-        from joblib import cpu_count
-
-        self.places = number
-        self._pools, self._free = list[Any](), list[Any]()
-        threads = str(max(cpu_count() // number, 1))
-        self._env = {name: os.environ.get(name, threads) for name in THREADS}
-
-    def submit(self, *call: Any) -> Any:
-        from joblib.externals.loky import ProcessPoolExecutor
-
-        if not self._free:
-            ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
-            self._pools.append(ProcessPoolExecutor(1, initializer=ignore, env=self._env))
-            self._free.append(self._pools[-1])
-        pool = self._free.pop()
-        future = pool.submit(*call)
-
-        def ended(future: Any) -> None:
-            if not future.cancelled() and future.exception() is None:  # the process lives
-                self._free.append(pool)
-
-        future.add_done_callback(ended)
-        return future
-
-    def deaths(self, error: Exception) -> int:
-        return int(isinstance(error, BrokenProcessPool))
-
-    def close(self, out: list[Any]) -> None:
-        for pool in self._pools:
-            pool.shutdown(kill_workers=bool(out))
-
-
-class DaskWorkers:
-    """The workers of a Dask cluster, which gives the tasks of a dead one to another, and gives up a
-    task that killed more than the cluster allows (distributed.scheduler.allowed-failures)."""
-
-    tries = 1
-
-    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
-        self._client, self._tell, self._told = client, tell, False
-
-    @property
-    def places(self) -> int:
-        if self._client.status != "running":
-            raise self._lost()
-        try:
-            threads = sum(self._client.nthreads(callback_timeout=6 * ANSWER).values())
-        except OSError:  # it went away while it was asked: without a limit that waits for ever
-            raise self._lost() from None
-        if not threads and not self._told:
-            self._tell("the cluster has no worker; waiting for one")
-        self._told = not threads
-        return threads
-
-    def submit(self, *call: Any) -> Any:
-        return self._client.submit(*call, pure=False)  # no other call may answer for this one
-
-    def deaths(self, error: Exception) -> int:
-        if isinstance(error, CancelledError | OSError):
-            raise self._lost() from None
-        return int(getattr(error, "allowed_failures", -1)) + 1  # as a KilledWorker has
-
-    def close(self, out: list[Any]) -> None:
-        if out and self._client.status == "running":
-            self._client.cancel(out, force=True)
-        self._client.close()
-
-    def _lost(self) -> ClusterLostError:
-        return ClusterLostError(
-            f"the scheduler at {self._client.scheduler.address} went away or cancelled the tasks; "
-            "what was done is kept, and the same command goes on with the rest"
-        )
+TRIES = 3  # of a task whose process dies
+DIED = "its worker process died {} times (out of memory, killed, or crashed in a library)"
 
 
 class ClusterLostError(ElastocalError):
@@ -562,58 +481,94 @@ class ClusterLostError(ElastocalError):
     exit_code = 1
 
 
-def hand_out(
-    crew: Processes | DaskWorkers, study: Study, tasks: Sequence[StudyTask], stop: StudyStop
-) -> Lines:
-    """Lines of results as they come, none twice; none new begins once `stop` is asked for.
+def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop) -> Lines:
+    """Lines of results as joblib has them, none twice; none new begins once `stop` is asked for.
+
+    Where a process dies joblib ends them all: what ran is repeated, one task after the other, so
+    that it is known whose process dies each time.
+    """
+    import joblib
+
+    jobs = max(min(jobs or joblib.cpu_count(), len(tasks)), 1)
+    waiting, died, out = deque(tasks), Counter[int](), dict[int, StudyTask]()
+
+    def handed_out(most: int) -> Iterator[Any]:
+        while waiting and most and not stop.asked:
+            task, most = waiting.popleft(), most - 1
+            out[task.index] = task
+            yield joblib.delayed(execute)(study.sources, task)
+
+    ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
+    threads = max(joblib.cpu_count() // jobs, 1)
+    with joblib.parallel_config("loky", inner_max_num_threads=threads, initializer=ignore):
+        while waiting and not stop.asked:
+            suspect = died[waiting[0].index] > 0
+            pool = joblib.Parallel(
+                max(jobs, 2) if suspect else jobs, return_as="generator_unordered",
+                pre_dispatch="n_jobs", batch_size=1,
+            )  # fmt: skip
+            lines = pool(handed_out(1 if suspect else len(waiting)))
+            try:
+                for line in lines:
+                    del out[line["task"]]
+                    yield line
+            except BrokenProcessPool:
+                lost = list(out.values())
+                out.clear()
+                died.update(task.index for task in lost)
+                waiting.extendleft(task for task in lost if died[task.index] < TRIES)
+                for task in (task for task in lost if died[task.index] >= TRIES):
+                    yield task.failed(DIED.format(TRIES))
+            finally:
+                with warnings.catch_warnings(action="ignore"):  # joblib's, of tasks ended early
+                    lines.close()
+
+
+def run_on_cluster(
+    client: Any, study: Study, tasks: Sequence[StudyTask], stop: StudyStop,
+    tell: Callable[[str], None],
+) -> Lines:  # fmt: skip
+    """The same of a Dask cluster's workers, which gives the tasks of a dead one to another, and
+    gives up a task that killed more than it allows (distributed.scheduler.allowed-failures).
 
     No task waits at a worker: what is out is what is waited for on Ctrl-C.
     """
-    waiting, out = deque(tasks), dict[Any, StudyTask]()
-    ended, died = queue.SimpleQueue[Any](), Counter[int]()
+    from distributed import as_completed
+
+    waiting, out, ended = deque(tasks), dict[Any, StudyTask](), as_completed(loop=client.loop)
+
+    def hand_out() -> None:
+        # Without a limit a scheduler that goes away while it is asked is waited for for ever.
+        threads = sum(client.nthreads(callback_timeout=6 * ANSWER).values())
+        if not threads:
+            tell("the cluster has no worker; waiting for one")
+        while waiting and not stop.asked and len(out) < max(threads, 1):
+            task = waiting.popleft()
+            # No other call may answer for this one.
+            future = client.submit(execute, study.sources, task, pure=False)
+            out[future] = task
+            ended.add(future)
+
     try:
-        while out or (waiting and not stop.asked):
-            while waiting and not stop.asked and len(out) < crew.places:
-                task = waiting.popleft()
-                future = crew.submit(execute, study.sources, task)
-                out[future] = task
-                future.add_done_callback(ended.put)
-            try:
-                future = ended.get(timeout=1.0 if out else 0.1)
-            except queue.Empty:
-                continue
+        hand_out()
+        for future in ended:
             task = out.pop(future)
             try:
-                line = future.result()
+                yield future.result()
+            except (CancelledError, OSError):
+                raise
             except Exception as error:  # execute() returns what a task raises
-                deaths = crew.deaths(error)
-                died[task.index] += deaths
-                if deaths and died[task.index] < crew.tries:
-                    waiting.appendleft(task)
-                    continue
+                deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
                 told = f"the worker could not run it: {type(error).__name__}: {error}"
-                if deaths:
-                    told = (
-                        f"its worker process died {died[task.index]} times (out of memory, killed, "
-                        "or crashed in a library)"
-                    )
-                line = task.line() | {"task_error": told, "trace": f"{told}\n{error}\n"}
-            yield line
+                yield task.failed(told if deaths is None else DIED.format(deaths + 1))
+            hand_out()
+    except (CancelledError, OSError):
+        raise ClusterLostError(
+            f"the scheduler at {client.scheduler.address} went away or cancelled the tasks; "
+            "what was done is kept, and the same command goes on with the rest"
+        ) from None
     finally:
-        crew.close(list(out))
-
-
-def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop) -> Lines:
-    import joblib
-
-    jobs = min(jobs or joblib.cpu_count(), len(tasks))
-    if jobs > 1:
-        yield from hand_out(Processes(jobs), study, tasks, stop)
-        return
-    for task in tasks:
-        if stop.asked:
-            return
-        yield execute(study.sources, task)
+        client.close()
 
 
 def _security(
@@ -722,8 +677,7 @@ def run_study(
         runner = partial(run_local, study, left, jobs, stop)
         if cluster is not None and left:
             # Before results are discarded: one that cannot be reached must not cost them.
-            crew = DaskWorkers(connect(cluster, **way), tell)
-            runner = partial(hand_out, crew, study, left, stop)
+            runner = partial(run_on_cluster, connect(cluster, **way), study, left, stop, tell)
         for name in OURS if restart else ():
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line

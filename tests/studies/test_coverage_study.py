@@ -4,6 +4,7 @@
 
 import sys
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -30,7 +31,7 @@ NAMES = {s.key: s for s in scenarios.SCENARIOS}
 def test_the_study_estimates_what_the_tool_does():
     """The study works on the model linearised at the truth; the same campaign through `identify`
     gives the same estimates and intervals within a small part of a standard deviation."""
-    demo = scenarios.DEMO
+    demo = Path(str(files("elastocal.demo")))
     cell = read_cell(demo / "cell.toml")
     model = Model(cell)
     setting = scenarios.Setting(NAMES["table1_6_effect"])

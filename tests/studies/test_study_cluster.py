@@ -10,12 +10,11 @@ from support.study_folders import numbers, run_study, write_study
 from elastocal.errors import InputError
 from elastocal.studies import (
     ClusterLostError,
-    DaskWorkers,
     StudyStop,
     _security,
     connect,
-    hand_out,
     read_results,
+    run_on_cluster,
 )
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
@@ -74,8 +73,8 @@ def marked(tmp_path, lethal=None, count=12, sleep=0.02):
 
 
 def at(address):
-    crew = DaskWorkers(connect(address), print)
-    return lambda study: lambda tasks: hand_out(crew, study, tasks, StudyStop())
+    client = connect(address)
+    return lambda study: lambda tasks: run_on_cluster(client, study, tasks, StudyStop(), print)
 
 
 def begun(marks):
