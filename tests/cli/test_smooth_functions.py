@@ -67,6 +67,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
+def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
+    (folder / "far.csv").write_text(
+        "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n"
+        "0.5,-1.0,1.0,0.1,0.5,0.1\n2.5,-1.0,1.0,0.1,0.5,0.1\n"
+    )
+    out = folder / "far_commands.csv"
+    done = run(
+        "compensate", folder / "cell.toml", folder / "result.json", folder / "far.csv", "-o", out
+    )
+    assert "joint1 stands outside -85.9° to 85.9°" in done.output
+    near, far = (float(row["std_um"]) for row in csv.DictReader(out.open()))
+    assert far > 2 * near
+
+
 def test_export_writes_them_as_corrections(folder: Path) -> None:
     out = folder / "corrections.csv"
     done = run(

@@ -81,6 +81,11 @@ TABLE = (
             "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"),
     Mistake("metres named millimetres", FIT, "placed.csv", "x_m,y_m,z_m", "x_mm,y_mm,z_mm"),
     Mistake("columns swapped", FIT, "placed.csv", "x_m,y_m,z_m", "z_m,y_m,x_m"),
+    Mistake("no unloaded reading", DEFLECT, "data.csv", "",
+            "configuration,marker,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,"
+            "force_x_N,force_y_N,force_z_N,x_m,y_m,z_m\n"
+            + "".join(f"{k},M1,{9 * k},10,-20,-80,{k},0,0,0,{force},0.1,-1,1.2\n"
+                      for k in range(9) for force in (0, -98) if force or k != 7)),
     Mistake("deflections without a load", DEFLECT, "data.csv", "force_z_N", "note_z"),
 )  # fmt: skip
 CELL = (

@@ -182,6 +182,20 @@ def test_a_block_of_lines_is_one_finding():
     assert 5 < largest.sigmas < 100
 
 
+def test_a_marker_that_is_read_aside_is_one_finding():
+    """Though none of its readings is beyond the noise; not the configurations that it was in."""
+    markers = MARKERS | {"M3": np.array([-0.1, 0.05, 0.1]), "M4": np.array([0.0, -0.1, 0.05])}
+    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    model = Model.assembled(planar_chain(), cell_of(("base_frame",), markers, tracker))
+    rng = np.random.default_rng(0)
+    plan = table_at(random_poses(model.chain, 60, 0), markers=tuple(markers))
+    table = measured(model, plan, true_values(model, rng), SIGMA, rng)
+    aside = shifted(table, table.marker == 1, [0.0, 1.2 * SIGMA, 0.0])
+    report = identify(model, aside, Options(faulty="keep", noise="axis")).faulty_report
+    (found,) = report.findings
+    assert (found.level, found.name, len(found.lines)) == ("marker", "M2", 60)
+
+
 def test_a_third_of_the_table_that_one_shift_explains_is_set_apart_and_named():
     """Unlike errors of as many would be kept; kept readings are reported alike."""
     model, table, _ = campaign(3)

@@ -16,7 +16,7 @@ from support.cells import random_poses
 
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.identification.outliers import blocks
+from elastocal.identification.outliers import blocks, kept_of, rejection_point
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
@@ -73,3 +73,23 @@ def test_stated_sigmas_count():
     position[20] = exact.position[20] + [1e-3, 0, 0]
     result = identify(model, replace(exact, sigma=sigma, position=position))
     assert rows_of(result.faulty).tolist() == [20]
+
+
+@pytest.mark.parametrize("dof", [3, 8])
+def test_what_setting_far_readings_apart_makes_of_a_mean(dof):
+    """Means of readings of which those beyond the rejection point are set apart, as identification
+    does it: of the variance, and the size of what is kept, that are said."""
+    rng, readings, draws = np.random.default_rng(4), 180, 600
+    z = rng.standard_t(dof, size=(draws, readings, 3)) * np.sqrt(1 - 2 / dof)
+    kept = np.ones(z.shape[:2], dtype=bool)
+    for _ in range(8):
+        count = kept.sum(axis=1)[:, None]
+        mean = (z * kept[..., None]).sum(axis=1) / count
+        off = z - mean[:, None]
+        sigma = np.sqrt((off**2 * kept[..., None]).sum(axis=(1, 2)) / (3 * (count[:, 0] - 1)))
+        kept = (np.abs(off) < rejection_point(3 * readings) * sigma[:, None, None]).all(axis=2)
+    said = kept_of(dof, 3 * readings, 3)
+    assert readings * np.mean(mean**2) == pytest.approx(said.variance, rel=0.1)
+    assert np.sqrt(np.mean(sigma**2)) == pytest.approx(said.sigma, rel=0.03)
+    # No estimate knows more than the Fisher information of t, (dof + 1)/(dof + 3) over its scale.
+    assert said.variance > (1 - 2 / dof) * (dof + 3) / (dof + 1)

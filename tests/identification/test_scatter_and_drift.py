@@ -11,6 +11,7 @@ from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
+from elastocal.identification.noise_structure import in_random_order
 from elastocal.identification.options import Options
 from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
@@ -102,6 +103,17 @@ def test_how_long_a_drift_lasts_is_not_taken_for_known_unless_the_cell_states_it
     assert at.dof[0] < 20
     normal = replace(at, dof=np.full(1, np.inf))
     assert (at.half_axes() > 1.1 * normal.half_axes()).all()
+
+
+def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of_poses():
+    told = identified(drift=DRIFT, timed=False).finding("drift")
+    assert told is not None and told.numbers["by"] == "order of the rows"
+    assert "record times" in told.remedy
+    along = identified(drift=DRIFT, timed=False, ordered=True, stated=False)
+    assert along.finding("drift") is None
+    assert not in_random_order(along.observations.table)
+    # Whoever states one knows that it is there.
+    assert identified(drift=DRIFT, timed=False, ordered=True).finding("drift") is not None
 
 
 def test_the_stated_noise_is_all_that_the_cell_states():

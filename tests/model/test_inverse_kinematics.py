@@ -60,6 +60,16 @@ def test_whatever_the_arm_reaches_is_reached(name: str, oriented: bool) -> None:
     check(chain, found, position, wanted)
 
 
+def test_the_nearest_posture_comes_first() -> None:
+    chain, near = kr270_chain(), random_poses(kr270_chain(), 1, seed=77)[0]
+    place = places(chain, random_poses(chain, 6, seed=1))
+    found = inverse_kinematics(chain, place[0], limits(chain), rotation=place[1], near=near,
+                               point=POINT)  # fmt: skip
+    for q, reached in zip(found.q, found.reached, strict=True):
+        away = np.linalg.norm(q[reached] - near, axis=1)
+        assert len(away) > 1 and (np.diff(away) >= 0).all()
+
+
 @pytest.mark.parametrize("far", [5.0, 1e4, 1e300])
 def test_what_is_out_of_reach_is_told_with_its_distance(far: float) -> None:
     """No drawn posture gets nearer, save for a hundred-thousandth of the distance."""
