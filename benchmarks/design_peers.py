@@ -52,7 +52,7 @@ def beside_figaroh(python: Path, folder: Path) -> None:
     def problem(poses: int) -> DesignProblem:
         criterion, group = DeterminantCriterion(np.eye(p)), np.zeros(POOL, dtype=np.int64)
         shares = np.array([poses])
-        return balanced(DesignProblem(R / columns, np.zeros((p, p)), group, shares, criterion))[0]
+        return balanced(DesignProblem(R / columns, np.zeros((p, p)), group, shares, criterion))
 
     print(f"\n## UR10: {POOL} poses, {p} parameters, regressor of FIGAROH")
     # FIGAROH's weights of sum 1 have no upper limit, as those of a plan of one pose.

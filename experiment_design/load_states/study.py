@@ -107,7 +107,7 @@ def unequal(cell: Cell, poses: int, times: int = 3) -> float:
     q = draw(cell, model.chain, plan_forces(cell), rules, 1000, 0)
     setup = set_up(model, q.q, poses, test_poses(cell, model.chain, rules, 0), Known())
     setup = replace(setup, ways=single_ways(setup.information))
-    problem, _ = balanced(setup.problem(setup.pool(q.q, q.group), np.array([poses])))
+    problem = balanced(setup.problem(setup.pool(q.q, q.group), np.array([poses])))
     once = relax(problem, 1e-3)
     some = problem.restricted(np.argsort(-once.weights)[:400])
     blocks, group = np.tile(some.blocks, (times, 1, 1)), np.tile(some.group, times)

@@ -75,7 +75,7 @@ def by_cone(problem, name):
 def test_the_relaxed_optimum_is_that_of_a_cone_solver(name, prior):
     for seed in range(2):
         problem = problem_of(name, seed, N=30, n=7, prior=prior)
-        found = relax(balanced(problem)[0], 1e-5)
+        found = relax(balanced(problem), 1e-5)
         expected = by_cone(problem, name)
         assert found.value == pytest.approx(expected, rel=1e-4)
         assert found.bound == pytest.approx(expected, rel=1e-4)
@@ -90,7 +90,7 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
     for seed in range(2):
         problem = problem_of(name, seed, prior=0.2 * (seed % 2))
         values = all_values(problem)
-        turned, _ = balanced(problem)
+        turned = balanced(problem)
         relaxed = relax(turned)
         assert relaxed.bound <= values.min() * (1 + 1e-8)
         plan, value = exact_plan(turned, relaxed, starts=20)
@@ -100,7 +100,7 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
 
 
 def test_an_exchange_ends_where_no_single_pose_has_a_better_one():
-    problem, _ = balanced(problem_of("test_pose", 4, N=40, n=6))
+    problem = balanced(problem_of("test_pose", 4, N=40, n=6))
     rng = np.random.default_rng(0)
     for _ in range(3):
         plan, value = exchange(problem, random_plan(problem, rng))
@@ -124,7 +124,7 @@ def test_the_same_plan_in_parameters_of_any_scale():
     other = in_terms(problem, np.diag(np.logspace(-6, 6, 5)))
     plans = []
     for one in (problem, other):
-        turned, _ = balanced(one)
+        turned = balanced(one)
         plans.append(exact_plan(turned, relax(turned))[0].tolist())
     assert plans[0] == plans[1]
 
@@ -148,5 +148,5 @@ def test_sizes_fall_with_the_number_of_poses_and_bounds_tell_where_a_target_may_
     assert all(bound <= value for value, bound in found.values())
     first = first_allowed(of, values[1] * 1.05, 3, 20)
     assert first <= 6
-    assert first == 3 or relax(balanced(of(first - 1))[0], 1e-3).bound > values[1] * 1.05
+    assert first == 3 or relax(balanced(of(first - 1)), 1e-3).bound > values[1] * 1.05
     assert first_allowed(of, values[2] / 100, 3, 20) == 21

@@ -52,12 +52,12 @@ def test_the_share_is_the_largest_that_the_cap_allows_and_no_plan_beats_the_boun
     pool = setup.pool(Q, np.zeros(60, dtype=np.int64))
     share = share_within(setup, pool, six, 0.05, lambda message: None)
     assert 0.02 < share < 0.9
-    own, least = setup.criterion, relax(balanced(setup.problem(pool, six))[0]).value
+    own, least = setup.criterion, relax(balanced(setup.problem(pool, six))).value
 
     def price(share: float) -> float:
         """How much more error at the test poses the relaxed optimum leaves."""
         problem = replace(setup, share=share).problem(pool, six)
-        turned, _ = balanced(problem)
+        turned = balanced(problem)
         relaxed = relax(turned)
         assert relaxed.bound <= exact_plan(turned, relaxed)[1]
         return float(np.sqrt(own.of_information(problem.at(relaxed.weights)) / least) - 1)

@@ -243,7 +243,7 @@ class Choice:
                 ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
                 setup = replace(setup, ways=ways)
             pool = setup.pool(drawn.q, drawn.group)
-            relaxed = relax(balanced(setup.problem(pool, shares))[0], GAIN / 10)
+            relaxed = relax(balanced(setup.problem(pool, shares)), GAIN / 10)
         except ElastocalError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)
@@ -363,7 +363,7 @@ def _fitting(
         return []
     problem = point.setup.problem(point.pool, shares_of(point.cell))
     check_enough(problem)
-    chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
+    chosen, phi = exact_plan(balanced(problem), point.relaxed)
     took = _minutes(point.cell, point.pool.q[chosen], point.pool.readings[chosen])
     # Where a load is not hung there is time for more; Φ goes about as one over their number.
     more = max(int(poses * minutes / took), 1) / poses
@@ -433,7 +433,7 @@ def chosen_states(
 
     def relaxed(ways: IntArray) -> tuple[float, Array]:
         own = replace(setup, ways=ways)
-        problem, _ = balanced(own.problem(own.pool(q[few], group[few]), shares))
+        problem = balanced(own.problem(own.pool(q[few], group[few]), shares))
         weights = prospects(problem, GAIN / 3).weights
         value = float(problem.criterion.of_information(problem.at(weights)))
         return value, weights.reshape(len(ways), -1).sum(axis=1)

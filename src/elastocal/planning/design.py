@@ -424,10 +424,9 @@ class _Design:
         spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, seek.shares)
         M = setup.gathered(blocks)
-        when = execution.times(len(q), len(self.forces))
-        noise, alias = model.cell.noise, found.alias
-        left = M if alias is None or not noise.drift else alias.information(M, when, noise)
-        phi = np.sort(np.asarray(setup.criterion.of_information(drawn), dtype=np.float64))
+        noise, alias, left = model.cell.noise, found.alias, M
+        if alias is not None and noise.drift:
+            left = alias.information(M, execution.times(len(q), len(self.forces)), noise)
         seen, numbers = setup.information.seen(q), setup.information.numbers(q, readings)
         numbers += 0 if known.done is None else known.done.numbers
         R, gain = setup.target_rows, None
@@ -464,7 +463,7 @@ class _Design:
             made_for="" if known.done is None else known.done.note,
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(found),
-            chance=Chance.of(phi, found.value, setup.criterion),
+            chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=Everywhere.of(
                 R, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
             ),

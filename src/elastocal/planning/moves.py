@@ -280,7 +280,8 @@ class Moves:
 
     def settle(self) -> None:
         """Check the ways between all visits: many at once take less time than a few again and
-        again."""
+        again, 75 s of CPU instead of 270 for 30 poses where nine of ten moves are blocked under the
+        load (experiment_design/kr270_plan/crowded.toml)."""
         for roadmap in self.maps:
             here = self.loaded[self.load] | (not roadmap.loaded)
             home = [] if self.home is None or roadmap.loaded else [self.home]

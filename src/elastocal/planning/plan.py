@@ -121,17 +121,7 @@ def plan_table(
     and 7-.  With `seen`, which markers are read of each pose in each load state (N, L), there is a
     row for each; with `counts` (N, L) note_readings says how often each is read.
     """
-    visits: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
-    for place, stop in enumerate(execution.stops, start=1):
-        load = -1 if forces is None else stop.load
-        key = (stop.again > 0, stop.pose, stop.again, stop.side, load)
-        visits.setdefault(key, []).append((place, stop))
-    rows = [visits[key] for key in sorted(visits)]
-    marker = np.zeros(len(rows), dtype=np.int64)
-    if seen is not None:
-        read = [[each[stop.pose, stop.load] for each in seen.values()] for (_, stop), *_ in rows]
-        of, marker = np.nonzero(np.array(read))
-        rows = [rows[k] for k in of]
+    rows, marker = _rows(execution, forces is not None, seen)
     first, n = [row[0][1] for row in rows], len(rows)
     two = execution.motion.both_directions or any(stop.side for stop in execution.stops)
     names = [stop.name(configurations) + ("+", "-")[stop.side] * two for stop in first]
@@ -169,6 +159,23 @@ def plan_table(
             name = "note_load" + (f"_{i + 1}" if i else "")
             beside[name] = nth(lambda _, stop: hung[stop.load], i)
     return table, beside
+
+
+def _rows(
+    execution: Execution, by_load: bool, seen: Mapping[str, BoolArray] | None
+) -> tuple[list[list[tuple[int, Stop]]], IntArray]:
+    """The stops of each row, with their places in the order, and its marker (rows,)."""
+    visits: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
+    for place, stop in enumerate(execution.stops, start=1):
+        load = stop.load if by_load else -1
+        key = (stop.again > 0, stop.pose, stop.again, stop.side, load)
+        visits.setdefault(key, []).append((place, stop))
+    rows = [visits[key] for key in sorted(visits)]
+    if seen is None:
+        return rows, np.zeros(len(rows), dtype=np.int64)
+    read = [[each[stop.pose, stop.load] for each in seen.values()] for (_, stop), *_ in rows]
+    of, marker = np.nonzero(np.array(read))
+    return [rows[k] for k in of], marker
 
 
 def load_name(force: Array) -> str:
@@ -251,7 +258,9 @@ class Chance:
     efficiency: float | None
 
     @classmethod
-    def of(cls, values: Array, value: float, criterion: ScenarioCriterion) -> Chance:
+    def of(cls, drawn: Array, value: float, criterion: ScenarioCriterion) -> Chance:
+        """Of random plans' information (n, p, p), and the plan's Φ, `value`."""
+        values = np.sort(criterion.of_information(drawn))
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
         median, best, worst = (criterion.figure(v) if np.isfinite(v) else None for v in phi)
         counts = criterion.certifiable and median is not None

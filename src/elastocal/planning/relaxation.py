@@ -152,9 +152,8 @@ def in_terms(problem: DesignProblem, T: Array, ridge: float = 0.0) -> DesignProb
     )
 
 
-def balanced(problem: DesignProblem) -> tuple[DesignProblem, Array]:
-    T = balancing(problem)
-    return in_terms(problem, T, RIDGE), T
+def balanced(problem: DesignProblem) -> DesignProblem:
+    return in_terms(problem, balancing(problem), RIDGE)
 
 
 def check_enough(problem: DesignProblem) -> None:
@@ -535,7 +534,7 @@ def sized_plans(
     for n in sorted(numbers):
         whole = problem_of(n)
         check_enough(whole)
-        problem, _ = balanced(whole)
+        problem = balanced(whole)
         relaxed = prospects(problem, start=weights)
         chosen, _ = exact_plan(problem, relaxed, warm=chosen, seed=seed)
         value, weights = whole.value(chosen), relaxed.weights
@@ -552,7 +551,7 @@ def first_allowed(
     high + 1 where there is none."""
     return low + bisect_left(
         range(low, high + 1), True,
-        key=lambda n: prospects(balanced(problem_of(n))[0], 1e-3).bound <= target,
+        key=lambda n: prospects(balanced(problem_of(n)), 1e-3).bound <= target,
     )  # fmt: skip
 
 
