@@ -65,8 +65,8 @@ class Study:
 
     def rho(self, q: np.ndarray) -> float:
         """Predicted ρ₀ in µm of the poses q (N, n)."""
-        value = self.setup.value(q)
-        return self.setup.criterion.figure(value)
+        M = self.setup.gathered(self.setup.information.blocks(q))
+        return self.setup.criterion.figure(float(self.setup.criterion.of_information(M)))
 
     def allowed(self, q: np.ndarray) -> np.ndarray:
         """(N,) poses that the cell allows in every load state."""
