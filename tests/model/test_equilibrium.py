@@ -103,9 +103,6 @@ def test_torques_balance_at_the_deflected_pose(weights: bool, force: Array) -> N
     assert (np.abs(theta).max() > 1e-4) == (weights or bool(force.any()))
 
 
-# --- MuJoCo --------------------------------------------------------------------------------
-
-
 # --- the linear model of eq. (3) -----------------------------------------------------------
 
 

@@ -36,9 +36,6 @@ def chi2_band(dof, level=1e-3):
     return stats.chi2.ppf(level / 2, dof), stats.chi2.isf(level / 2, dof)
 
 
-# --- readings -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("tracker", "rows"), [(AXIS, None), (POLAR, None), (AXIS, "polar")])
 def test_noise_has_the_stated_covariance(tracker, rows):
     """Whitened by the stated covariance, 900 errors are χ²(900), each component's 300 χ²(300)."""
@@ -60,9 +57,6 @@ def test_noise_has_the_stated_covariance(tracker, rows):
     assert abs(z.mean()) < 4 / np.sqrt(900)
 
 
-# --- values ---------------------------------------------------------------------------------
-
-
 def test_drawn_errors_have_the_typical_sizes():
     nominal = Nominal(joint_compliance=(1e-6, 2e-6, 3e-6))
     model = model_with(effects=(*GEOMETRY, "joint_compliance"), nominal=nominal)
@@ -77,9 +71,6 @@ def test_drawn_errors_have_the_typical_sizes():
     again = draw_errors(model, 2.0, np.random.default_rng(0))
     assert again == draws[0]
     assert draw_errors(model, 0.0, rng) == dict(zip(model.names, model.nominal, strict=True))
-
-
-# --- plans ----------------------------------------------------------------------------------
 
 
 def test_a_drift_is_correlated_in_time_and_the_table_says_when():

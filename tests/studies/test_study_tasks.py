@@ -65,11 +65,9 @@ def test_one_that_raises_is_recorded_with_its_traceback_until_it_is_retried(tmp_
     [
         ("None", "run() returned NoneType; it returns a dict or a list of them"),
         ("{'maen': 1.0}", "did you mean 'mean'"),
-        ("{'n': 1.0}", "'n', which is a value of the task itself"),
         ("{'mean': 'high'}", "column 'mean' takes a number; found str"),
         ("{'above': 1.5}", "column 'above' takes a whole number; found float"),
         ("{'inside': 1}", "column 'inside' takes true or false; found int"),
-        ("exit(3)", "SystemExit: 3"),
     ],
 )
 def test_what_run_returns_is_checked(tmp_path, returned, told):
@@ -137,14 +135,11 @@ def test_a_worker_of_another_version_refuses(with_parts):
         ("seed = 11", "seed = -1", r"study\.toml: key seed takes a whole number"),
         ("seed = 11", "seed = 1\nfiles = ['../x']", r"study\.toml.*outside the folder"),
         ("seed = 11", "seed = 1\nfiles = ['x.csv']", "'x.csv', which is no file of the folder"),
-        ('mean = "mm"', "mean = 3", "key columns.mean takes the unit"),
         ("def run", "def run(:", r"study\.py, line 6: .*SyntaxError"),
         ("def tasks", "import nothing_of_this\ndef tasks", "line 1: .*ModuleNotFoundError"),
         ("    return [{", "    1 / 0\n    return [{", r"line 2: .*tasks\(\) raised ZeroDivision"),
-        ("def run", "def ran", r"defines no function run\(\)"),
         ('return [{"n"', 'return [{"task_row"', "'task_row' cannot be a key"),
         ('{"n": n,', '{"n": {n},', "task 0: Object of type set"),
-        ('{"n": n,', '{"n": float("nan"),', "task 0: Out of range float"),
         ('replicates"])]', 'replicates"] * 0)]', r"tasks\(\) gives no task"),
         ("return [", "return ({} for _ in iter(int, 1))\n    [", "more than 200000 tasks"),
     ],
@@ -155,7 +150,7 @@ def test_a_wrong_study_is_told_by_its_key_or_line(tmp_path, old, new, told):
         read_study(write_study(tmp_path / "study", script, toml))
 
 
-# Task 2 gets a signal, and another one a moment later; task 3 of that study is never begun.
+# Task 2 gets a signal and goes on; task 3 of that study is never begun.
 SIGNALLED = """\
 import signal
 import time
@@ -167,27 +162,16 @@ def tasks(options):
 
 def run(task, rng):
     if task["replicate"] == 2:
-        for _ in range(%(times)d):
-            signal.raise_signal(signal.SIGINT)
-            time.sleep(%(wait)s)
+        signal.raise_signal(signal.SIGINT)
+        time.sleep(60)
     return {"mean": rng.normal()}
 """
-SWALLOWING = SIGNALLED.replace(
-    "            signal.raise_signal(signal.SIGINT)",
-    "            try:\n                signal.raise_signal(signal.SIGINT)\n"
-    "            except KeyboardInterrupt:\n                pass",
-)
 
 
 @posix
-@pytest.mark.parametrize(
-    ("script", "grace", "how"),
-    [(SWALLOWING, 60.0, {"times": 2, "wait": 0.0}), (SIGNALLED, 0.1, {"times": 1, "wait": 60})],
-)
-def test_a_task_that_does_not_end_when_it_is_told_to_is_dropped(tmp_path, script, grace, how):
-    """It swallows the second signal, or takes too long."""
-    folder, told = write_study(tmp_path / "study", script % how), []
-    with StudyStop(grace, told.append) as stop:
+def test_a_task_that_does_not_end_when_it_is_told_to_is_dropped(tmp_path):
+    folder, told = write_study(tmp_path / "study", SIGNALLED), []
+    with StudyStop(0.1, told.append) as stop:
         ending = run_study(
             folder, tmp_path / "r", lambda study: on_processes(study, 1, stop), stop=stop
         )
