@@ -499,8 +499,7 @@ def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: 
             yield joblib.delayed(execute)(study.sources, task)
 
     ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
-    threads = max(joblib.cpu_count() // jobs, 1)
-    with joblib.parallel_config("loky", inner_max_num_threads=threads, initializer=ignore):
+    with joblib.parallel_config("loky", initializer=ignore):
         while waiting and not stop.asked:
             suspect = died[waiting[0].index] > 0
             pool = joblib.Parallel(
