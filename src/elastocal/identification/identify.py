@@ -1,4 +1,8 @@
-"""From a model and a table to calibrated parameters: the whole identification, step by step."""
+"""From a model and a table to calibrated parameters: the whole identification, step by step.
+
+First the course and its result, then the methods: noise estimated from the residuals, equal or
+stated weights, the published ones.
+"""
 
 from __future__ import annotations
 

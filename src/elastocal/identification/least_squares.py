@@ -3,7 +3,8 @@
     |W (y − h(X))|² + |target − P X|²   over X[columns],   lower ≤ X ≤ upper,  A X = b,  M(X) ⪰ 0
 
 A weak tie to the start, the prior of random coefficients and stated knowledge are all of them rows
-P; every fit is the same descent by Levenberg and Marquardt on R factors.
+P; every fit is the same descent by Levenberg and Marquardt on R factors.  Then the covariance of
+its estimates, under different assumptions on the errors.
 """
 
 from __future__ import annotations

@@ -113,9 +113,7 @@ SENTENCES = {
         "Impossible values: {parameters} beyond a physical bound by more than 5 standard "
         "deviations."
     ),
-    "load_unit": "{remedy}",
-    "exchanged_markers": "{remedy}",
-    "scatter_not_counted": "{remedy}",
+    **dict.fromkeys(("load_unit", "exchanged_markers", "scatter_not_counted"), "{remedy}"),
     "not_converged": "The fit did not converge: {reason}. {remedy}",
     "few_degrees_of_freedom": (
         "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
