@@ -336,13 +336,16 @@ def _pieces(
         steps[0].heldout_rms, first[-1].heldout_rms, named[-1].heldout_rms, floor,
         answer.unexplained,
     )  # fmt: skip
+    location = answer.location(tests)
+    if location is None and gap.open:
+        location = answer.supported.location(tests)
     return {
         "verdict": "unknown_effect" if gap.open else answer.verdict,
         "gap": gap,
         "budget": (*steps, BudgetStep("noise_floor", floor, (floor, floor))),
         "effects": beside_unknown(answer.effects) if gap.open else answer.effects,
         "indistinguishable": answer.indistinguishable,
-        "location": answer.location(tests),
+        "location": location,
         "noise": noise_floor(answer.dataset, answer.found.data, answer.found.noise),
         "probability_unknown": max(answer.unnamed_probability, gap.open * (1 - FALSE_SMOOTH)),
         "curves": answer.curves(),

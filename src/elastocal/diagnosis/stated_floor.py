@@ -3,6 +3,7 @@ out of the fit."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +12,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.baseline import Blocks
-from elastocal.diagnosis.diagnosis import FaultyReading, NearRepeats, NoiseFloor
+from elastocal.diagnosis.diagnosis import (
+    FaultyReading,
+    Location,
+    NearRepeats,
+    NoiseFloor,
+    StructureTest,
+)
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import ModelSet
@@ -229,14 +236,47 @@ CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted no
 UPPER = 1.96
 MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREAD, JOINT_SPREAD)))
 MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
+PROBABLE = 0.5
+
+
+def most_scatter(joint: Array) -> Array:
+    """Scatter (joints,) that each joint may have where the others have theirs, `joint` (joints,).
+
+    Their logarithms spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its own
+    spread, so that the others tell what one is to be expected of; beyond its limit any joint of an
+    arm is with a chance of FALSE_SMOOTH.
+    """
+    J, usual = len(joint), np.log(REPEATABILITY)
+    off = np.log(joint) - usual
+    told = (J - 1) / JOINT_SPREAD**2
+    known = told + 1 / REPEATABILITY_SPREAD**2
+    others = (off.sum() - off) / JOINT_SPREAD**2 / known
+    spread = np.sqrt(JOINT_SPREAD**2 + 1 / known)
+    limit = np.exp(usual + others - float(special.ndtri(FALSE_SMOOTH / J)) * spread)
+    return np.minimum(limit, MOST_SCATTER)
 
 
 @dataclass(frozen=True)
 class SupportedFloor:
-    """3-D rms (m) that is `noise`, and the rest of the fitted noise, which is `unexplained`."""
+    """3-D rms (m) that is `noise`, and the rest of the fitted noise, which is `unexplained`; the
+    mean squares (m²) of it that each of the `joints` and the `instrument` has."""
 
     noise: float
     unexplained: float
+    joints: Array
+    instrument: float
+
+    def location(self, tests: Sequence[StructureTest]) -> Location | None:
+        """Where what is unexplained lies, each joint by its share; None where not in joints."""
+        share = self.joints / max(self.joints.sum() + self.instrument, 1e-300)
+        if share.sum() < PROBABLE:
+            return None
+        order = np.argsort(-share, kind="stable")
+        places = {f"joint{j + 1}": float(share[j]) for j in order if share[j] > 0}
+        where, likely = next(iter(places.items()))
+        shown = {t.driver: t.p_value for t in tests}
+        stages: dict[str, float] = {"transmission": float(share.sum())}
+        return Location("transmission", where, likely, stages, places, shown)
 
 
 def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
@@ -270,11 +310,12 @@ def supported_floor(
     smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
     above = 0.0
     if data.stated:  # else what joints do and what the instrument does are not to be told apart
-        smooth = np.maximum(smooth, scatter - MOST_SCATTER**2)
+        smooth = np.maximum(smooth, scatter - most_scatter(noise.joint) ** 2)
         above = max(noise.factor**2 - MOST_STATED**2, 0.0)
     stated = np.diagonal(data.covariance, axis1=1, axis2=2)
-    beyond = _per_reading(data, (data.G**2) @ smooth + above * stated)
-    variance = max(fitted**2 - beyond, 0.0)
+    joints = np.array([_per_reading(data, g) for g in np.moveaxis(data.G**2 * smooth, 2, 0)])
+    instrument = _per_reading(data, above * stated)
+    variance = max(fitted**2 - joints.sum() - instrument, 0.0)
     total, dof = repeats(dataset, come_back=True)
     near = near_repeats(dataset, data, at)
     if near is not None:
@@ -287,7 +328,8 @@ def supported_floor(
         if shown < low * fitted**2 or shown > high * variance:
             variance = shown
     floor = min(float(np.sqrt(variance)), fitted)
-    return SupportedFloor(floor, float(np.sqrt(max(fitted**2 - floor**2, 0.0))))
+    unexplained = float(np.sqrt(max(fitted**2 - floor**2, 0.0)))
+    return SupportedFloor(floor, unexplained, joints, instrument)
 
 
 # Errors on configurations, or blocks of time, left out of the fit, in closed form.

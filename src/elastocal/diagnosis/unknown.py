@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.hypotheses import SCALES, EntryKey, recorded
+from elastocal.diagnosis.hypotheses import UNSIZED_SCALES, EntryKey, recorded
 from elastocal.model.arm import Setting
 from elastocal.model.effects.base import Stage
 from elastocal.units import Array
@@ -107,23 +107,29 @@ def _of_stiffness(
             yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
 
 
-def wrenches(dataset: DiagnosisData) -> Iterator[tuple[Array, Array]]:
-    """The load's force and moment (C, v, 3) at each link's end along its axes, largest 1.
+def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Array]]:
+    """Places that the load bends, the base and each link's end, with the entry that moves them and
+    the load's force and moment (C, v, 3) there along their axes, largest 1.
 
-    A link's end moved by e moves every marker by R e, so the columns of its frame are R; and
-    turned about e they move a marker by R e × lever, whose product with the force is the moment
-    about e, the load taken at the marker.
+    A frame moved by e moves every marker by R e, so the columns of its frame are R; and turned
+    about e they move a marker by R e × lever, whose product with the force is the moment about e,
+    the load taken at the marker.
     """
     if not recorded(dataset.table, "load"):
         return
-    for k in range(dataset.table.q.shape[1]):
-        E = dataset.columns.entry(("link_frame", (f"link{k + 1}",)))
+    n = dataset.table.q.shape[1]
+    links = [(f"link{k + 1}", ("link_frame", (f"link{k + 1}",))) for k in range(n)]
+    for place, key in [("base", ("base_motion", ("base",))), *links]:
+        E = dataset.columns.entry(key)
         if E.shape[1] < 3:
             return
         wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
         wrench = dataset.places.gather(wrench[dataset.lead])
         force, moment = wrench[:, :, :3], wrench[:, :, 3:]
-        yield force / max(np.abs(force).max(), 1e-12), moment / max(np.abs(moment).max(), 1e-12)
+        # Beyond the last link there is only the tool and its markers.
+        where = "tool" if place == f"link{n}" else place
+        largest = (max(np.abs(part).max(), 1e-12) for part in (force, moment))
+        yield where, key, force / next(largest), moment / next(largest)
 
 
 def waves(x: Array, present: NDArray[np.bool_], count: int) -> Array:
@@ -175,7 +181,7 @@ class Generic:
     columns: Array | None = None
     source: Covariate | None = None
 
-    scales: ClassVar[Array] = SCALES
+    scales: ClassVar[Array] = UNSIZED_SCALES
     known: ClassVar[bool] = False
     settings: ClassVar[tuple[Setting, ...]] = ()
 
@@ -235,16 +241,12 @@ def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
 
 
 def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
-    for k, (force, moment) in enumerate(wrenches(dataset)):
+    for where, key, force, moment in wrenches(dataset):
         direction = np.zeros((*force.shape[:2], 6, 18))
         for a in range(3):
             direction[:, :, a, 3 * a : 3 * a + 3] = MOTION * force
             direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = MOTION * moment
-        link = f"link{k + 1}"
-        # Beyond the last link there is only the tool and its markers.
-        where = "tool" if k == dataset.base.model.chain.n_joints - 1 else link
-        yield Generic("force", f"force at {where}", where, "compliance", ("link_frame", (link,)),
-                      direction)  # fmt: skip
+        yield Generic("force", f"force at {where}", where, "compliance", key, direction)
 
 
 def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:

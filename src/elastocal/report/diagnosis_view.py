@@ -243,7 +243,8 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
         told = [f"{say.driver_name(t.driver)} ({say.size_of(t.p_family)})" for t in d.dependences]
         more = len(told) - MOST_NAMED
         named = say.together(told[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-        named = named or "no single driver that was tested shows it; see the curves for its shape"
+        shape = "; see the curves for its shape" if d.curves else ""
+        named = named or f"no single driver that was tested shows it{shape}"
         yield "Depends on", f"{named}."
     chance = " after correction for all candidates."
     if not d.effects and d.p_value > STRUCTURE:
