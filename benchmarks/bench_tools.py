@@ -53,19 +53,15 @@ def where() -> str:
     """When, at which commit (+: files differ from it), on which machine, under which load."""
     describe = ["git", "describe", "--always", "--dirty=+", "--exclude=*"]
     done = subprocess.run(describe, cwd=HERE, capture_output=True, text=True)
+    cpuinfo = Path("/proc/cpuinfo")
+    told = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    models = [x.partition(":")[2].strip() for x in told if x.startswith("model name")]
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return (
         f"{time.strftime('%Y-%m-%d %H:%M')}, commit {done.stdout.strip() or '–'}, "
-        f"{_processor()}, {cores} cores, {platform.system()}, Python {platform.python_version()}; "
-        f"load average {os.getloadavg()[0]:.1f}"
+        f"{[*models, platform.machine()][0]}, {cores} cores, {platform.system()}, "
+        f"Python {platform.python_version()}; load average {os.getloadavg()[0]:.1f}"
     )
-
-
-def _processor() -> str:
-    cpuinfo = Path("/proc/cpuinfo")
-    text = cpuinfo.read_text() if cpuinfo.exists() else ""
-    models = [x for x in text.splitlines() if x.startswith("model name")]
-    return models[0].partition(":")[2].strip() if models else platform.machine()
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,13 @@ class Worker:
         """Run `elastocal ARGUMENTS` in the visible folder."""
         if self._process is None or self._served >= RENEWED_AFTER:
             self.close()
-            self._process = _started()
+            environment = {key: os.environ[key] for key in KEPT if key in os.environ}
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", str(SCRIPT)], stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
+                env=environment | {"OPENBLAS_NUM_THREADS": "1"}, cwd=tempfile.gettempdir(),
+                start_new_session=True,  # an interrupted study is no failure of the command
+            )  # fmt: skip
         process, self._served = self._process, self._served + 1
         assert process.stdin is not None and process.stdout is not None
         asked = json.dumps({"folder": str(folder), "arguments": arguments})
@@ -70,13 +76,3 @@ class Worker:
             self._process.kill()
             self._process.communicate()
         self._process, self._served = None, 0
-
-
-def _started() -> subprocess.Popen[str]:
-    environment = {key: os.environ[key] for key in KEPT if key in os.environ}
-    environment["OPENBLAS_NUM_THREADS"] = "1"
-    return subprocess.Popen(
-        [sys.executable, "-I", str(SCRIPT)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL, text=True, env=environment, cwd=tempfile.gettempdir(),
-        start_new_session=True,  # an interruption of the study is no failure of the command
-    )  # fmt: skip

@@ -248,7 +248,12 @@ def load(sources: Sources) -> ModuleType:
     with _LOCK:
         if _here is None or _here[0] != sources.digest:
             if _here is not None:
-                _forget(_here[1])
+                # A worker outlives a study, and two may have a scenarios.py.
+                for name, module in list(sys.modules.items()):
+                    if Path(getattr(module, "__file__", None) or "/").is_relative_to(_here[1]):
+                        del sys.modules[name]
+                sys.path[:] = [place for place in sys.path if place != str(_here[1])]
+                importlib.invalidate_caches()
             folder = _standing(sources)
             sys.path.insert(0, str(folder))
             name = f"elastocal_study_{sources.digest[:16]}"
@@ -275,15 +280,6 @@ def _standing(sources: Sources) -> Path:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(data)
     return folder
-
-
-def _forget(folder: Path) -> None:
-    """Drop what an earlier study imported: a worker outlives it; two may have a scenarios.py."""
-    for name, module in list(sys.modules.items()):
-        if Path(getattr(module, "__file__", None) or "/").is_relative_to(folder):
-            del sys.modules[name]
-    sys.path[:] = [place for place in sys.path if place != str(folder)]
-    importlib.invalidate_caches()
 
 
 def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:

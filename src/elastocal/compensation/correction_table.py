@@ -80,17 +80,6 @@ class CorrectionTable:
     warnings: tuple[str, ...] = ()
 
 
-def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> CorrectionGrid:
-    """`counts` levels per joint (one for all) over the joint limits; one level: the middle."""
-    chain = arm.model.chain
-    n = chain.n_joints
-    counts = _counts(counts, n, f"one number, or one per joint ({n})")
-    low, high = finite_ranges(chain, *joint_limits(arm.model.cell, chain))
-    return CorrectionGrid(
-        tuple(_levels(a, b, k) for a, b, k in zip(low, high, counts, strict=True)), True
-    )
-
-
 def box_grid(
     lower: Array, upper: Array, counts: tuple[int, ...], rotation: Array | None
 ) -> CorrectionGrid:
@@ -326,8 +315,15 @@ def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
 def grid_of(
     arm: CalibratedArm, counts: tuple[int, ...], box: str | None, rotation: str | None
 ) -> CorrectionGrid:
+    """`counts` levels (one for all) of each joint over its limits, or of x, y and z in a box; one
+    level: the middle."""
+    chain = arm.model.chain
     if box is None:
-        return joint_grid(arm, counts)
+        n = chain.n_joints
+        counts = _counts(counts, n, f"one number, or one per joint ({n})")
+        ends = finite_ranges(chain, *joint_limits(arm.model.cell, chain))
+        axes = tuple(_levels(a, b, k) for a, b, k in zip(*ends, counts, strict=True))
+        return CorrectionGrid(axes, True)
     corners = numbers(option("box"), box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
     turned = None
     if rotation is not None:
