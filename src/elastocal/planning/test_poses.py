@@ -6,10 +6,10 @@ from collections.abc import Callable, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
-import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.plan_wishes import TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.config import place
@@ -17,20 +17,19 @@ from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.identification.prediction import NewPoses
 from elastocal.identification.solve import Reduction
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
-from elastocal.model import rigid
-from elastocal.model.arm import LEVEL_TOLERANCE, row_inputs
+from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
-from elastocal.model.symbolic import SymbolicArm, Total
 from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import sobol, told
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, why
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
 from elastocal.text import listed, quoted
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
 
@@ -382,34 +381,46 @@ OUTSIDE = 1e-6
 def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool = False) -> Array:
     """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
 
-    The position is that of the test point under load in the data's frame, and not as an instrument
-    that distorts would read it.  Where the markers' own places are fitted and no point was stated,
-    it is that of the M markers, each divided by √M, as only they can be known.  A stated point may
-    be `carried` by the markers, as a body that they are fixed to, instead of the flange.
+    The position is that of the test point under load in the data's frame, as the instrument reads
+    it: where it distorts, no plan could tell where the tool is besides, as its scale and the arm's
+    lengths move readings in the same way.  Where the markers' own places are fitted and no point
+    was stated, it is that of the M markers, each divided by √M, as only they can be known.  A
+    stated point may be `carried` by the markers, as a body that they are fixed to, instead of the
+    flange.
     """
-    symbolic, fitted = SymbolicArm(model.chain, model.cell), fitted_markers(model)
-    arm, place, T = symbolic.arm, ca.SX.sym("place", 3), len(targets.q)
-    points = [place, *(arm.markers.values() if fitted else ())]
-    moving = ca.vertcat(*(rigid.point(arm.T_tracker_flange, point) for point in points))
-    # The arm as it is at first, its joints come from either side.
-    table = Measurements.of_poses(
-        "test poses", targets.q, targets.force, next(iter(arm.markers)),
-        rotation=np.zeros((T, 3)), time=np.zeros(T), approach=np.zeros(targets.q.shape),
-    )  # fmt: skip
-    A = Total(symbolic, moving, symbolic.p, (place,))(
-        row_inputs(arm, table), x, (targets.point,)
-    )[1].reshape(T, len(points), 3, -1)  # fmt: skip
-    lone, of_markers = A[:, :1].copy(), A[:, 1:]
-    if carried:
-        own = targets.stated
-        R = model.flange_poses(table, x)[own, None, :3, :3]
-        J = R @ _carrying(model.cell, targets.point[own]) @ R.swapaxes(-1, -2)
-        lone[own, 0] = np.einsum("tmij,tmjp->tip", J, of_markers[own])
-    by_marker = ~targets.stated & fitted
-    if by_marker.any():
-        lone = np.pad(lone, [(0, 0), (0, len(points) - 2), (0, 0), (0, 0)])
-        lone[by_marker] = of_markers[by_marker] / np.sqrt(len(points) - 1)
-    return np.asarray(lone.reshape(T, -1, A.shape[-1]))
+    by_marker = ~targets.stated & fitted_markers(model)
+    bodies = targets.stated & carried
+    lone = ~by_marker & ~bodies
+    own, T = len(model.cell.tool.markers), len(targets.q)
+    points, code = np.unique(targets.point[lone], axis=0, return_inverse=True)
+    arm = _with_points(model, points)
+
+    def table(which: BoolArray, marker: IntArray) -> Measurements:
+        pose = np.repeat(np.flatnonzero(which), len(marker) // which.sum())
+        n, names = len(pose), tuple(arm.cell.tool.markers)
+        # The arm as it is at first, its joints come from either side.
+        return Measurements.of_poses(
+            "test poses", targets.q[pose], targets.force[pose], marker=marker, marker_names=names,
+            position=np.zeros((n, 3)), rotation=np.zeros((n, 3)), time=np.zeros(n),
+            approach=np.zeros((n, targets.q.shape[1])),
+        )  # fmt: skip
+
+    A = np.zeros((T, own if by_marker.any() else 1, 3, len(model.parameters)))
+    if lone.any():
+        rows = arm.regressor(table(lone, own + code.ravel()), x).B
+        A[lone, 0] = rows.reshape(lone.sum(), 3, -1)
+    for which in (by_marker, bodies):
+        if not which.any():
+            continue
+        every = table(which, np.tile(np.arange(own), which.sum()))
+        B = arm.regressor(every, x).B.reshape(which.sum(), own, 3, -1)
+        if which is by_marker:
+            A[which] = B / np.sqrt(own)
+        else:
+            R = arm.flange_poses(every, x)[::own, None, :3, :3]
+            J = R @ _carrying(model.cell, targets.point[which]) @ R.swapaxes(-1, -2)
+            A[which, 0] = np.einsum("tmij,tmjp->tip", J, B)
+    return A.reshape(T, -1, len(model.parameters))
 
 
 def fitted_markers(model: Model) -> bool:
@@ -436,6 +447,25 @@ def _carrying(cell: Cell, point: Array) -> Array:
     cross = np.cross(np.eye(3)[None], (point - places.mean(axis=0))[:, None])  # [s]×
     turned = np.linalg.inv(inertia) @ np.cross(np.eye(3)[None], -r[:, None])
     return np.eye(3) / len(places) + cross[:, None] @ turned[None]
+
+
+def _with_points(model: Model, points: Array) -> Model:
+    """The same arm with test points (k, 3) as markers whose place on the flange is known."""
+    cell = model.cell
+    # Effects act where they do on the model as it is, without the test points.
+    effects = tuple(
+        EffectChoice(choice.name, where)
+        for choice in cell.model.effects
+        for where in (
+            CATALOGUE[choice.name].places(model.chain, cell)
+            if choice.where is None
+            else (choice.where,)
+        )
+    )
+    spec = replace(cell.model, effects=effects, observe="position")
+    named = {f"test point {k + 1}": point for k, point in enumerate(points)}
+    tool = replace(cell.tool, markers=cell.tool.markers | named)
+    return Model.assembled(model.chain, replace(cell, model=spec, tool=tool))
 
 
 def known_rows(
