@@ -80,26 +80,6 @@ class CorrectionTable:
     warnings: tuple[str, ...] = ()
 
 
-def box_grid(
-    lower: Array, upper: Array, counts: tuple[int, ...], rotation: Array | None
-) -> CorrectionGrid:
-    """`counts` levels of x, y, z in a box of the base frame from `lower` to `upper` (3,) m."""
-    if not (lower <= upper).all():
-        raise InputError(
-            f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
-        )
-    counts = _counts(counts, 3, "one number, or one each for x, y and z")
-    flat = [name for name, a, b, k in zip("xyz", lower, upper, counts, strict=True)
-            if k > 1 and b - a < LEAST_STEP * k]  # fmt: skip
-    if flat:
-        raise InputError(
-            f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
-            f"level there by {option('grid')}"
-        )
-    axes = tuple(_levels(a, b, k) for a, b, k in zip(lower, upper, counts, strict=True))
-    return CorrectionGrid(axes, False, rotation)
-
-
 def _counts(counts: tuple[int, ...], n: int, what: str) -> tuple[int, ...]:
     told = ",".join(map(str, counts))
     if len(counts) not in (1, n) or min(counts) < 1:
@@ -325,13 +305,27 @@ def grid_of(
         axes = tuple(_levels(a, b, k) for a, b, k in zip(*ends, counts, strict=True))
         return CorrectionGrid(axes, True)
     corners = numbers(option("box"), box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
+    lower, upper = corners[:3], corners[3:]
     turned = None
     if rotation is not None:
         vector = numbers(
             option("rotation"), rotation, (3,), "a rotation vector rx,ry,rz in degrees"
         )
         turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
-    return box_grid(corners[:3], corners[3:], counts, turned)
+    if not (lower <= upper).all():
+        raise InputError(
+            f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
+        )
+    counts = _counts(counts, 3, "one number, or one each for x, y and z")
+    flat = [name for name, a, b, k in zip("xyz", lower, upper, counts, strict=True)
+            if k > 1 and b - a < LEAST_STEP * k]  # fmt: skip
+    if flat:
+        raise InputError(
+            f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
+            f"level there by {option('grid')}"
+        )
+    axes = tuple(_levels(a, b, k) for a, b, k in zip(lower, upper, counts, strict=True))
+    return CorrectionGrid(axes, False, turned)
 
 
 def summary_and_csv(
