@@ -113,6 +113,7 @@ def test_nothing_is_claimed_on_an_arm_without_faults_though_all_is_tried() -> No
     assert len(set(tried)) == len(tried)
 
 
+@pytest.mark.long
 def test_two_effects_are_both_named() -> None:
     names = ("gear_eccentricity:joint4", "marker_slip:marker:M2")
     d = diagnosed(*names)
@@ -168,6 +169,7 @@ def test_the_readings_tell_the_backlash_model(side: str) -> None:
     assert play.key in named(d) and d.model_keys.get("play_side", "load") == side
 
 
+@pytest.mark.long
 def test_hysteresis_without_loads_shrinks_the_gap() -> None:
     """Of an arm whose motors' ratings nobody states: friction that grows with the load has no
     size and no column."""

@@ -73,6 +73,7 @@ def test_too_few_configurations_are_refused_with_what_to_measure() -> None:
         ec.diagnose(model, table.take(np.arange(20)))
 
 
+@pytest.mark.long
 def test_missing_readings_and_unequal_repeats() -> None:
     model, table = campaign("encoder_scale:joint3")
     rng = np.random.default_rng(0)
