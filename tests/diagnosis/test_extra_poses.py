@@ -154,6 +154,8 @@ def test_a_horizontal_pull_is_advised_where_it_helps() -> None:
     low, high = map(float, re.findall(r"from (0\.\d+) to (0\.\d+)", more)[0])
     assert more.startswith("pull horizontally: 2 poses") and high > low + 0.1
     assert not told(SCALE, ECCENTRIC)
+    # More readings tell more, whatever the pull: what no load moves needs none.
+    assert not told(("encoder_scale", "joint2"), ("encoder_scale", "joint3"))
 
 
 def test_a_cell_without_room_says_which_rule_is_in_the_way(narrow) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count, islice
@@ -293,7 +294,14 @@ def _pull_notes(
     wide = visit_pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
     pulled = discriminations_of(base, wide, suspects, seed)
     still = judged(pulled)[1] if pulled else hopeless
-    apart = ", ".join(" and ".join(pair) for pair in hopeless if pair not in still)
+    # As many readings more under the loads that there are would help too: d² by their number.
+    more = len(forces) / len(pool.forces)
+    within = pairs_of(pulled, range(len(wide)))
+    reach = {(pair.first, pair.second): pair.distance_after for pair in within}
+    apart = ", ".join(
+        " and ".join(pair) for pair, d in hopeless.items()
+        if pair not in still and reach.get(pair, 0.0) > d * math.sqrt(more)
+    )  # fmt: skip
     if apart:
         notes.append(
             f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a "
@@ -303,7 +311,8 @@ def _pull_notes(
         same = [replace(p, classes=c.classes) for p, c in zip(pulled, tasks, strict=True)]
         chosen = fewest(same, n)
         reached = expected(same, chosen)
-        if reached > after + GAIN:
+        as_many = expected(tasks, fewest(tasks, math.ceil(more * n)))
+        if reached > max(after, as_many) + GAIN:
             poses = counted(len(chosen), "pose")
             notes.append(
                 f"pull horizontally: {poses}, measured also under {newton:.3g} N along x and "
