@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -479,10 +479,7 @@ class SumAnswer:
         chosen = (unknown and self._unnamed) or range(len(self.found.components))
         largest = max(chosen, key=lambda k: float(np.median(self.squares([k]))))
         c = self.found.components[largest]
-        return Location(
-            _stage_of(c), c.where, places[c.where], _falling(stages), _falling(places),
-            {t.driver: t.p_value for t in tests}, _falling(shares),
-        )  # fmt: skip
+        return Location.of(_stage_of(c), c.where, stages, places, tests, shares)
 
     @property
     def verdict(self) -> Verdict:
@@ -677,10 +674,6 @@ def _stage_of(c: Component) -> Stage:
         return c.effect.stage
     stages: dict[str, Stage] = {"joint": "transmission", "link": "geometry", "base": "tracker"}
     return next((s for kind, s in stages.items() if c.where.startswith(kind)), "tool")
-
-
-def _falling(values: Mapping[Any, float]) -> dict[str, float]:
-    return {str(key): v for key, v in sorted(values.items(), key=lambda item: -item[1])}
 
 
 def _kind(c: Component) -> str:

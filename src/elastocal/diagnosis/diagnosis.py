@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -263,6 +263,18 @@ class Location:
     places: dict[str, float]
     drivers: dict[str, float]
     shares: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, stage: Stage, where: str, stages: Mapping[str, float], places: Mapping[str, float],
+        tests: Sequence[StructureTest], shares: Mapping[str, float] | None = None,
+    ) -> Location:  # fmt: skip
+        """Of the probabilities of stages and places, and shares: the largest of each first."""
+        each = (stages, places, shares or {})
+        ordered = (dict(sorted(one.items(), key=lambda item: -item[1])) for one in each)
+        by_stage, by_place, of_stages = ordered
+        shown = {t.driver: t.p_value for t in tests}
+        return cls(stage, where, places.get(where, 0.0), by_stage, by_place, shown, of_stages)
 
 
 @dataclass(frozen=True)

@@ -402,6 +402,7 @@ def _posterior_draws(
 
 # A pair that all candidates together would not tell apart with this probability is inseparable.
 HOPE = 0.9
+APART_AT_LAST = 2 * float(special.ndtri(HOPE))  # the distance that it takes
 
 
 def discriminations_of(
@@ -423,7 +424,7 @@ def judged(
     out, hopeless = [], {}
     for c in tasks:
         d = c.distances(c.squared(c.gram(range(len(c.pool)))))
-        near = d < 2 * float(special.ndtri(HOPE))
+        near = d < APART_AT_LAST
         classes = connected_components(near, directed=False)[1].astype(np.int64)
         out.append(replace(c, classes=classes))
         names = c.rivals.names

@@ -12,6 +12,7 @@ import numpy as np
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
 from elastocal.diagnosis.discrimination import (
+    APART_AT_LAST,
     Discrimination,
     VisitPool,
     discriminations_of,
@@ -293,14 +294,13 @@ def _pull_notes(
     forces, table = np.vstack([pool.forces, newton * np.eye(3)[:2]]), base.observed.table
     wide = visit_pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
     pulled = discriminations_of(base, wide, suspects, seed)
-    still = judged(pulled)[1] if pulled else hopeless
     # As many readings more under the loads that there are would help too: d² by their number.
     more = len(forces) / len(pool.forces)
     within = pairs_of(pulled, range(len(wide)))
     reach = {(pair.first, pair.second): pair.distance_after for pair in within}
     apart = ", ".join(
         " and ".join(pair) for pair, d in hopeless.items()
-        if pair not in still and reach.get(pair, 0.0) > d * math.sqrt(more)
+        if reach.get(pair, 0.0) > max(APART_AT_LAST, d * math.sqrt(more))
     )  # fmt: skip
     if apart:
         notes.append(

@@ -236,7 +236,6 @@ CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted no
 UPPER = 1.96
 MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREAD, JOINT_SPREAD)))
 MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
-PROBABLE = 0.5
 
 
 def most_scatter(joint: Array) -> Array:
@@ -268,15 +267,14 @@ class SupportedFloor:
 
     def location(self, tests: Sequence[StructureTest]) -> Location | None:
         """Where what is unexplained lies, each joint by its share; None where not in joints."""
-        share = self.joints / max(self.joints.sum() + self.instrument, 1e-300)
-        if share.sum() < PROBABLE:
+        if self.joints.sum() <= self.instrument:
             return None
-        order = np.argsort(-share, kind="stable")
-        places = {f"joint{j + 1}": float(share[j]) for j in order if share[j] > 0}
-        where, likely = next(iter(places.items()))
-        shown = {t.driver: t.p_value for t in tests}
-        stages: dict[str, float] = {"transmission": float(share.sum())}
-        return Location("transmission", where, likely, stages, places, shown)
+        share = self.joints / (self.joints.sum() + self.instrument)
+        places = {f"joint{j + 1}": float(p) for j, p in enumerate(share) if p > 0}
+        where = max(places, key=lambda name: places[name])
+        return Location.of(
+            "transmission", where, {"transmission": float(share.sum())}, places, tests
+        )
 
 
 def noise_rms(data: NoisyData, noise: NoiseValues) -> float:

@@ -125,11 +125,10 @@ def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Arr
             return
         wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
         wrench = dataset.places.gather(wrench[dataset.lead])
-        force, moment = wrench[:, :, :3], wrench[:, :, 3:]
+        parts = wrench[:, :, :3], wrench[:, :, 3:]
+        force, moment = (part / max(np.abs(part).max(), 1e-12) for part in parts)
         # Beyond the last link there is only the tool and its markers.
-        where = "tool" if place == f"link{n}" else place
-        largest = (max(np.abs(part).max(), 1e-12) for part in (force, moment))
-        yield where, key, force / next(largest), moment / next(largest)
+        yield "tool" if place == f"link{n}" else place, key, force, moment
 
 
 def waves(x: Array, present: NDArray[np.bool_], count: int) -> Array:

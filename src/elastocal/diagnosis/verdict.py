@@ -161,14 +161,10 @@ def location(found: SelectedEffects, tests: Sequence[StructureTest]) -> Location
         stages[item.what.stage] += float(p)
         places[item.what.where] += float(p)
     what = items[own].what
-    shown = {t.driver: t.p_value for t in tests}
-    return Location(
-        what.stage, what.where, places.get(what.where, 0.0), _sorted(stages), _sorted(places), shown
+    by_stage, by_place = (
+        {key: p for key, p in each.items() if p > 1e-6} for each in (stages, places)
     )
-
-
-def _sorted(shares: dict[str, float]) -> dict[str, float]:
-    return {k: v for k, v in sorted(shares.items(), key=lambda kv: -kv[1]) if v > 1e-6}
+    return Location.of(what.stage, what.where, by_stage, by_place, tests)
 
 
 # The shape of a dependence that has no name: the motion as a function of the covariate.
