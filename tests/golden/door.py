@@ -40,6 +40,43 @@ def spoil_three(folder: Path) -> None:
     path.write_text("\n".join(",".join(r) for r in (header, *rows)) + "\n", encoding="utf-8")
 
 
+def curved(folder: Path) -> None:
+    """curved.toml: the placed arm with error curves of two joints and unknown link weights, poses
+    to measure it at, and what is known of it besides."""
+    text = (folder / "placed.toml").read_text(encoding="utf-8")
+    more = ('"joint_curve:joint1", "joint_curve:joint2", "link_weights", "marker_position"]',)
+    text = text.replace('"marker_position"]', *more)
+    for joint, low, high, length in ((1, -1.5, 1.5, 0.5), (2, -1.8, -0.4, 0.4)):
+        text += f"""
+[model.nominal.settings.joint{joint}]
+curve_size_rad = 4e-4
+curve_length_rad = {length}
+curve_low_rad = {low}
+curve_high_rad = {high}
+"""
+    (folder / "curved.toml").write_text(text, encoding="utf-8")
+    limits = np.array([[-1.5, -1.8, 0.2, -2.0, -1.5, -2.0], [1.5, -0.4, 2.0, 2.0, 1.5, 2.0]])
+    q = np.random.default_rng(5).uniform(*limits, (45, 6))
+    header = ",".join(f"q{i}_rad" for i in range(1, 7))
+    np.savetxt(folder / "turns.csv", q, "%.6f", delimiter=",", header=header, comments="")
+    stated = (
+        '[prior."joint2.compliance"]\nmean = 2.9e-7\nstd = 2e-8\n'
+        '[[bounds]]\nparameter = "joint3.offset"\nlower = 0.0\n'
+    )
+    (folder / "curved_knowledge.toml").write_text(stated, encoding="utf-8")
+
+
+def spoil_two(folder: Path) -> None:
+    """Two faulty readings in curved.csv, as far off as its curves move the arm."""
+    path = folder / "curved.csv"
+    with open(path, newline="", encoding="utf-8") as handle:
+        header, *rows = csv.reader(handle)
+    for row, name in ((12, "x_m"), (61, "z_m")):
+        k = header.index(name)
+        rows[row][k] = f"{float(rows[row][k]) + 4e-4:.8f}"
+    path.write_text("\n".join(",".join(r) for r in (header, *rows)) + "\n", encoding="utf-8")
+
+
 def equal_noise(folder: Path) -> None:
     """noise.csv: 10 µm of noise on every direction of the deflections of data.csv."""
     with open(folder / "data.csv", newline="", encoding="utf-8") as handle:

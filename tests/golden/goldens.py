@@ -29,6 +29,7 @@ TRUTH = " ".join(
 MEASURED = f"simulate cell.toml {{}}.csv -o {{}}.csv --seed {{}} --load {{}} --repeats 3 {TRUTH}"
 DOWN = "0 0 -98"
 PLACED = "identify placed.toml placed.csv -q"
+CURVED = "identify curved.toml curved.csv -q"
 DEFLECTED = "identify deflecting.toml data.csv -q"
 
 
@@ -82,6 +83,19 @@ GOLDENS: dict[str, Golden] = {
         f"{DEFLECTED} --physical --method ols -o physical.json",
         f"{PLACED} --bounded -o bounded.json",
         f"{DEFLECTED} --knowledge knowledge.toml --method ols -o ols.json",
+    ), engine=True),
+    "identify_smooth": Golden(CAMPAIGN, (
+        door.curved,
+        "simulate curved.toml turns.csv -o curved.csv --seed 6 --draw 1 --load 0 0 -2000",
+        f"{CURVED} -o result.json --details",
+        f"{CURVED} -o ols.json --method ols",
+        f"{CURVED} -o known.json --knowledge curved_knowledge.toml",
+        f"{CURVED} -o profile.json --method wls --intervals profile --physical",
+        f"{CURVED} --method huber",
+        f"{CURVED} --intervals cr2",
+        f"{CURVED} --intervals cr2 --physical",
+        door.spoil_two,
+        f"{CURVED} -o faulty.json",
     ), engine=True),
     "identify_limits": Golden(CAMPAIGN, (
         f"{PLACED} --test june.csv --require heldout=1e6 --require test=1e6",
