@@ -15,8 +15,7 @@ from elastocal.config import read_toml
 from elastocal.errors import InputError
 from elastocal.files import (
     DEEPEST,
-    atomic_write_bytes,
-    atomic_write_text,
+    atomic_write,
     atomic_writer,
     check_exists,
     read_bytes,
@@ -104,13 +103,13 @@ def test_a_folder_or_a_path_through_a_file_cannot_be_written(tmp_path):
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "file" / "a.txt", tmp_path / ("x" * 5000), "a\0b"):
         with pytest.raises(InputError):
-            atomic_write_text(path, "")
+            atomic_write(path, "")
 
 
 def test_a_link_keeps_pointing_at_its_target(tmp_path):
     (tmp_path / "target").write_text("old")
     (tmp_path / "link").symlink_to(tmp_path / "target")
-    atomic_write_text(tmp_path / "link", "new")
+    atomic_write(tmp_path / "link", "new")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "target").read_text() == "new"
 
@@ -119,7 +118,7 @@ def test_a_pipe_or_device_is_written_to_not_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     reader = os.open(tmp_path / "pipe", os.O_RDONLY | os.O_NONBLOCK)
     try:
-        atomic_write_text(tmp_path / "pipe", "text")
+        atomic_write(tmp_path / "pipe", "text")
         assert os.read(reader, 10) == b"text"
     finally:
         os.close(reader)
@@ -129,15 +128,15 @@ def test_a_pipe_or_device_is_written_to_not_replaced(tmp_path):
 def test_what_replaces_a_file_is_as_secret_as_it_was(tmp_path):
     (tmp_path / "a.txt").write_text("old")
     (tmp_path / "a.txt").chmod(0o600)
-    atomic_write_text(tmp_path / "a.txt", "new")
+    atomic_write(tmp_path / "a.txt", "new")
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o600
 
 
 WRITER = """
 import os, sys
-from elastocal.files import atomic_writer, atomic_write_text, together
-with together(sys.argv[1:]):
-    atomic_write_text(sys.argv[1], "half")
+from elastocal.files import atomic_writer, atomic_write, together
+with together():
+    atomic_write(sys.argv[1], "half")
     with atomic_writer(sys.argv[2]) as handle:
         handle.write("half")
         print(flush=True)
@@ -162,36 +161,35 @@ def test_what_a_killed_process_left_goes_when_the_output_is_written_again(tmp_pa
         return len([n for n in os.listdir(tmp_path) if n.startswith((".a", ".b"))]) - 2
 
     for output in outputs:
-        atomic_write_text(output, "new")
+        atomic_write(output, "new")
     assert unfinished() == 2
     writer.kill()
     writer.communicate()
     for output, left in zip(outputs, (1, 0), strict=True):
-        atomic_write_text(output, "newer")
+        atomic_write(output, "newer")
         assert unfinished() == left and output.read_text() == "newer"
     assert all(path.read_text() == "of the user" for path in others)
 
 
 def test_files_written_together_appear_at_the_end(tmp_path):
-    first, second, other = (tmp_path / name for name in ("a.txt", "b.bin", "cache"))
+    first, second = tmp_path / "a.txt", tmp_path / "b.bin"
     first.write_text("old")
-    with together([first, second]):
-        atomic_write_text(first, "new")
-        atomic_write_bytes(second, b"new")
-        atomic_write_text(other, "at once")
-        assert (first.read_text(), second.exists(), other.exists()) == ("old", False, True)
+    with together():
+        atomic_write(first, "new")
+        atomic_write(second, b"new")
+        assert (first.read_text(), second.exists()) == ("old", False)
     assert (first.read_text(), second.read_bytes()) == ("new", b"new")
-    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin", "cache"]
-    atomic_write_text(first, "later")
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.bin"]
+    atomic_write(first, "later")
     assert first.read_text() == "later"
 
 
 @pytest.mark.parametrize("failure", [RuntimeError, KeyboardInterrupt])
 def test_of_files_written_together_none_appears_where_one_fails(tmp_path, failure):
     (tmp_path / "a.txt").write_text("old")
-    with pytest.raises(failure), together([tmp_path / "a.txt", tmp_path / "b.txt"]):
-        atomic_write_text(tmp_path / "a.txt", "new")
-        atomic_write_text(tmp_path / "b.txt", "new")
+    with pytest.raises(failure), together():
+        atomic_write(tmp_path / "a.txt", "new")
+        atomic_write(tmp_path / "b.txt", "new")
         raise failure
     assert (tmp_path / "a.txt").read_text() == "old"
     assert os.listdir(tmp_path) == ["a.txt"]
@@ -208,9 +206,9 @@ def test_an_interrupt_between_files_written_together_waits_for_the_last(tmp_path
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     monkeypatch.setattr(os, "replace", interrupted)
     try:
-        with pytest.raises(KeyboardInterrupt), together([first, second]):
-            atomic_write_text(first, "new")
-            atomic_write_text(second, "new")
+        with pytest.raises(KeyboardInterrupt), together():
+            atomic_write(first, "new")
+            atomic_write(second, "new")
         assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         signal.signal(signal.SIGINT, before)

@@ -14,10 +14,10 @@ import secrets
 import signal
 import stat
 import threading
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, TextIO
+from typing import Any, BinaryIO
 
 from elastocal.errors import InputError, require
 from elastocal.text import SHOWN
@@ -36,8 +36,8 @@ _DOTTED = re.compile(
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
-def check_regular(path: str | Path, what: str) -> int:
-    """The size in bytes of an existing regular file; `what` names it in messages."""
+def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> int:
+    """The size of an existing regular file of at most `max_bytes`; `what` names it in messages."""
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
@@ -45,7 +45,8 @@ def check_regular(path: str | Path, what: str) -> int:
         require(kind != FOLDER, f"{path}: is a directory; give the {what} itself")
         told = f"is {kind}, not a regular file; save the {what} to disk first"
         require(not kind, f"{path}: {told}")
-        return found.st_size
+    check_size(path, what, found.st_size, max_bytes)
+    return found.st_size
 
 
 # What is read by place → endings that tell of a file in another's place.
@@ -65,20 +66,9 @@ def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Ite
             f"{path}: ends in {ending}, where the {what} is to stand; the cell file (.toml) comes "
             "first, tables and results after it"
         )
-    check_size(path, what, check_regular(path, what), max_bytes)
+    check_regular(path, what, max_bytes)
     with _read_errors(path, what), open(path, "rb") as handle:
         yield handle
-
-
-def check_ending(path: Path, endings: Collection[str]) -> None:
-    """Raise InputError where a file to write has the ending of something else; a name without one
-    may stand for anything."""
-    ending = path.suffix.lower()
-    if ending and ending not in endings:
-        raise InputError(
-            f"{path}: ends in {ending}; this output is written as {' or '.join(endings)}, "
-            "name it so"
-        )
 
 
 def check_size(path: str | Path, what: str, size: int, max_bytes: int | None) -> None:
@@ -205,41 +195,99 @@ def _check_path(path: str | Path) -> None:
         raise InputError(f"{str(path)!r}: no file can have this name; check the path")
 
 
+def check_output(path: str | Path, endings: Collection[str] = ()) -> None:
+    """Raise InputError where no file can be written under `path`, or its ending is that of
+    something else; a name without one may stand for anything."""
+    _check_path(path)
+    folder, ending = Path(path).absolute().parent, Path(path).suffix.lower()
+    require(not os.path.isdir(path), f"{path} is a directory; name a file to write")
+    if not _is_device(path):
+        told = f"{path}: the folder {folder} does not exist; create it first"
+        require(os.path.isdir(folder), told)
+        require(os.access(folder, os.W_OK), f"{path}: no permission to write in {folder}")
+    if ending and endings and ending not in endings:
+        raise InputError(
+            f"{path}: ends in {ending}; this output is written as {' or '.join(endings)}, "
+            "name it so"
+        )
+
+
+def _is_device(path: str | Path) -> bool:
+    return os.path.exists(path) and not os.path.isfile(path)
+
+
+# What is written within `together`, by its temporary file; None outside.
+_written: list[tuple[Path, Path]] | None = None
+
+
 @contextmanager
-def atomic_writer(path: str | Path) -> Iterator[TextIO]:
-    """A text handle (UTF-8) whose content appears under `path` only when all of it is written.
-
-    Raises InputError where the folder is missing or not writable; whatever fails within the
-    `with` block leaves no temporary file and the old content of `path` untouched.
-    """
-    with _atomic(path, "", encoding="utf-8", newline="\n") as handle:
-        yield handle
-
-
-# While `together` runs: the files that it holds back, and what is written of them so far.
-_held: set[Path] = set()
-_written: list[tuple[Path, Path]] = []
-
-
-@contextmanager
-def together(paths: Iterable[str | Path]) -> Iterator[None]:
-    """Files under `paths` that are written in the `with` block appear at its end, all of them.
+def together() -> Iterator[None]:
+    """Files that are written in the `with` block appear at its end, all of them.
 
     Where the block fails none does, and what stood there before is untouched.
     """
-    _held.update(_final(path) for path in paths)
+    global _written
+    _written = written = []
     try:
         yield
         with _undisturbed():
-            for temporary, target in _written:
+            for temporary, target in written:
                 with _write_errors(target):
                     os.replace(temporary, target)
     finally:
-        for temporary, _ in _written:
+        _written = None
+        for temporary, _ in written:
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
+    """A handle (text in UTF-8) whose content appears under `path` only when all of it is written.
+
+    Raises InputError as `check_output` does; whatever fails within the `with` block leaves no
+    temporary file and the old content of `path` untouched.
+    """
+    check_output(path)
+    mode, how = ("b", {}) if binary else ("", {"encoding": "utf-8", "newline": "\n"})
+    target = Path(os.path.realpath(path))  # a link keeps pointing to what it points to
+    with _write_errors(path):
+        if _is_device(path):  # renaming over /dev/stdout or /dev/null would replace the device
+            with open(path, f"w{mode}", **how) as device:
+                yield device
+            return
+        with suppress(OSError):
+            remove_abandoned(target.parent, re.escape(target.name[:40]))
+        own = f"{os.getpid()}-{secrets.token_hex(4)}"
+        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
+        try:
+            with open(temporary, f"x{mode}", **how) as handle:
+                if target.exists():  # what others may not read they may not read afterwards
+                    os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
+                yield handle
+                handle.flush()
+                os.fsync(handle.fileno())
+            if _written is None:
+                os.replace(temporary, target)
+            else:
+                _written.append((temporary, target))
+        except BaseException:
             with suppress(OSError):
                 temporary.unlink()
-        _held.clear()
-        _written.clear()
+            raise
+
+
+@contextmanager
+def _write_errors(path: str | Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from None
+
+
+def atomic_write(path: str | Path, content: str | bytes) -> None:
+    """Write text (as UTF-8) or bytes under `path`, whole or not at all."""
+    with atomic_writer(path, isinstance(content, bytes)) as handle:
+        handle.write(content)
 
 
 @contextmanager
@@ -277,67 +325,3 @@ def _runs(process: int) -> bool:
     except (OSError, OverflowError):  # somebody else's
         return True
     return True
-
-
-def _final(path: str | Path) -> Path:
-    return Path(os.path.realpath(path))  # a link keeps pointing to what it points to
-
-
-@contextmanager
-def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
-    _check_path(path)
-    target = Path(path)
-    with _write_errors(target):
-        if target.is_dir():
-            raise InputError(f"{target}: is a directory; name a file to write")
-        if target.exists() and not target.is_file():
-            # Renaming over /dev/stdout or /dev/null would replace the device itself.
-            with open(target, f"w{binary}", **options) as device:
-                yield device
-            return
-        target = _final(target)
-        with suppress(OSError):
-            remove_abandoned(target.parent, re.escape(target.name[:40]))
-        own = f"{os.getpid()}-{secrets.token_hex(4)}"
-        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
-        try:
-            with open(temporary, f"x{binary}", **options) as handle:
-                if target.exists():  # what others may not read they may not read afterwards
-                    os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
-                yield handle
-                handle.flush()
-                os.fsync(handle.fileno())
-            if target in _held:
-                _written.append((temporary, target))
-            else:
-                os.replace(temporary, target)
-        except BaseException:
-            with suppress(OSError):
-                temporary.unlink()
-            raise
-
-
-@contextmanager
-def _write_errors(target: Path) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise InputError(
-            f"{target}: the folder {target.parent} does not exist; create it first"
-        ) from None
-    except PermissionError:
-        raise InputError(f"{target}: no permission to write in {target.parent}") from None
-    except OSError as error:
-        raise InputError(f"{target}: cannot be written ({error.strerror or error})") from None
-
-
-def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 under `path`, whole or not at all."""
-    with atomic_writer(path) as handle:
-        handle.write(text)
-
-
-def atomic_write_bytes(path: str | Path, data: bytes) -> None:
-    """The same for bytes."""
-    with _atomic(path, "b") as handle:
-        handle.write(data)

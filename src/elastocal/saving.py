@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
 from elastocal.errors import InputError, option, require
-from elastocal.files import atomic_write_text, read_json
+from elastocal.files import atomic_write, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, read_calibrated
@@ -53,7 +53,7 @@ def save(result: Any, path: str | Path, **how: Any) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    atomic_write_text(path, json_text(content) + "\n")
+    atomic_write(path, json_text(content) + "\n")
 
 
 def save_published(result: Any, path: Path) -> None:
@@ -62,7 +62,7 @@ def save_published(result: Any, path: Path) -> None:
 
 def save_residuals(fit: Calibration, path: Path) -> None:
     rows = fit.residual_table()
-    atomic_write_text(path, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
+    atomic_write(path, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
 
 
 def beside(path: Path) -> Path:
@@ -136,7 +136,7 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
 
     if not partial:
         check_reached(found)
-    atomic_write_text(path, commands_csv(found, found.chain.kinds))
+    atomic_write(path, commands_csv(found, found.chain.kinds))
 
 
 def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:

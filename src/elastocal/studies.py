@@ -49,7 +49,7 @@ from pydantic import Field
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.files import atomic_write_text, read_bytes, read_json, read_text
+from elastocal.files import atomic_write, read_bytes, read_json, read_text
 from elastocal.screen import StudyStop, shown
 from elastocal.text import did_you_mean, json_text, listed, printable, quoted
 
@@ -428,7 +428,7 @@ def write_statement(folder: Path, study: Study) -> None:
         "columns": dict(study.sources.columns), "sources": study.sources.digests,
         "elastocal": __version__,
     }  # fmt: skip
-    atomic_write_text(folder / STATEMENT, json_text(statement) + "\n")
+    atomic_write(folder / STATEMENT, json_text(statement) + "\n")
 
 
 def statement_of(folder: Path) -> dict[str, Any]:
@@ -676,7 +676,7 @@ def run_study(
         for name in OURS if restart else ():
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
-            atomic_write_text(folder / RESULTS, "".join(map(as_text, kept)))
+            atomic_write(folder / RESULTS, "".join(map(as_text, kept)))
         write_statement(folder, study)
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task.index, False) for task in wanted)
@@ -740,5 +740,5 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    atomic_write_text(page, "\n".join(lines) + "\n")
+    atomic_write(page, "\n".join(lines) + "\n")
     return text

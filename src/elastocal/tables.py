@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO
 import numpy as np
 
 from elastocal.errors import InputError
-from elastocal.files import atomic_write_bytes, check_size, decoded, open_input
+from elastocal.files import atomic_write, check_size, decoded, open_input
 from elastocal.text import (
     cell_meaning,
     cell_text,
@@ -619,7 +619,7 @@ def write_parquet(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
         raise InputError(
             f"{path}: writing Parquet needs pyarrow; run 'pip install pyarrow', or save it .csv"
         ) from None
-    atomic_write_bytes(path, packed.getvalue())
+    atomic_write(path, packed.getvalue())
 
 
 def csv_text(

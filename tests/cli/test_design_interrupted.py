@@ -39,7 +39,7 @@ def whole(tmp_path_factory):
 
 def interrupt_after(monkeypatch, saves):
     """Ctrl-C right after so many states were saved."""
-    save, count = checkpoint.atomic_write_bytes, [0]
+    save, count = checkpoint.atomic_write, [0]
 
     def saving(path, state):
         save(path, state)
@@ -47,7 +47,7 @@ def interrupt_after(monkeypatch, saves):
         if count[0] == saves:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(checkpoint, "atomic_write_bytes", saving)
+    monkeypatch.setattr(checkpoint, "atomic_write", saving)
 
 
 @pytest.mark.parametrize("edited", [False, True])

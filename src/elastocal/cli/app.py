@@ -41,7 +41,7 @@ from elastocal.errors import (
     options_as_flags,
     require,
 )
-from elastocal.files import check_ending, together
+from elastocal.files import check_output, together
 from elastocal.screen import complain, interrupts, progress_line, safe_console, say
 from elastocal.text import json_text
 
@@ -256,16 +256,8 @@ class Run:
         """The outputs asked for, each with the endings that it may have, between blanks; one that
         cannot be written, or is named as something else, is refused before the work starts."""
         for path, endings in asked:
-            if path is None:
-                continue
-            folder = path.absolute().parent
-            require(not path.is_dir(), f"{path} is a directory; name a file to write")
-            told = f"{path}: the folder {folder} does not exist; create it first"
-            require(folder.is_dir(), told)
-            told = f"{path}: no permission to write in {folder}"
-            require(os.access(folder, os.W_OK), told)
-            if endings:
-                check_ending(path, endings.split())
+            if path is not None:
+                check_output(path, endings.split())
         self.written = [path for path, _ in asked if path is not None]
 
     def reads(self, *paths: Path | None, cell: Cell | None = None) -> list[Path]:
@@ -286,7 +278,7 @@ class Run:
 
     def write(self, *asked: tuple[Path | None, Callable[[Path], Any]]) -> None:
         """The outputs asked for, each by the function beside it: all of them or none."""
-        with together(self.written):
+        with together():
             for path, write in asked:
                 if path is not None:
                     write(path)

@@ -197,9 +197,10 @@ def design(
         picture: Picture of the poses to write (PNG, SVG).
         cell_out: Cell file to write, with what [design.choose] has chosen.
     """
-    from elastocal.files import atomic_write_text, together
+    from elastocal.files import atomic_write
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.candidates import plan_and_names
+    from elastocal.report.arm_view import write_plan_picture
     from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan
 
@@ -217,6 +218,11 @@ def design(
             check()
             tell(message)
 
+        def chosen(path: Path) -> None:
+            from elastocal.diagnosis.diagnose import write_extended_cell
+
+            write_extended_cell(cell, path, (), keys=plan.chosen.keys if plan.chosen else {})
+
         progress("reading")
         wanted, options = verbs.design_request(cell_of(cell, run.plugins), **asked)
         _programs(programs, wanted)
@@ -228,22 +234,16 @@ def design(
         stated = [asked.get(name) for name in ("augment", "knowledge")]
         files = run.reads(cell, *stated, *pinned, *files_of(wanted))
         plan, checkpoint = _resumed(wanted, options, output, files, asked, check, progress)
-        with together(run.written):
-            save_plan(plan, output, repeated())
-            for path, text in _programs(programs, plan.model.cell, plan).items():
-                atomic_write_text(path, text)
-            if picture is not None:
-                from elastocal.report.arm_view import write_plan_picture
-
-                write_plan_picture(picture, plan)
-            if cell_out is not None:
-                from elastocal.diagnosis.diagnose import write_extended_cell
-
-                keys = plan.chosen.keys if plan.chosen else {}
-                write_extended_cell(cell, cell_out, (), keys=keys)
-            if report is not None:
-                progress("writing the report")
-                plan.report(report, inputs=list(dict.fromkeys(files)), command=repeated())
+        progress("writing")
+        texts = _programs(programs, plan.model.cell, plan)
+        page = partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())
+        run.write(
+            (output, lambda path: save_plan(plan, path, repeated())),
+            *((path, partial(atomic_write, content=text)) for path, text in texts.items()),
+            (picture, lambda path: write_plan_picture(path, plan)),
+            (cell_out, chosen),
+            (report, page),
+        )
         checkpoint.clear()
     if run.json:
         say(summary.read_text(encoding="utf-8"), end="")
@@ -406,7 +406,7 @@ def demo(
     with run.progress() as progress:
         done = run_demo(folder, seed, progress)
         inputs = [done.cell, done.plan, done.data]
-        with together([result, report]):
+        with together():
             done.result.save(result)
             write_page(done.result, report, inputs, repeated(), seed, truth=done.truth,
                        published=done.published)  # fmt: skip
@@ -459,7 +459,7 @@ def import_(
         angle_unit: Unit of angles where a file does not say: deg, rad, gon.
     """
     from elastocal.cell.work_cell import read_cell
-    from elastocal.files import atomic_write_text
+    from elastocal.files import atomic_write
     from elastocal.importing.assemble import import_files
     from elastocal.importing.exports import likely_presets
     from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping, with_units
@@ -496,7 +496,7 @@ def import_(
         for line in (*(f"Warning: {warning}" for warning in found.warnings), *left_out(found)):
             say(line, error=True)
     require(not found.refused, found.refused)
-    run.write((output, partial(atomic_write_text, text=found.text)))
+    run.write((output, partial(atomic_write, content=found.text)))
     if output is not None and not run.json:
         n, configurations = len(found.table), len(found.table.configuration_labels)
         say(f"wrote {n} readings of {configurations} configurations to {output}")

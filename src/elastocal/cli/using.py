@@ -384,7 +384,7 @@ def compensate(
         posture_of,
         summary_and_csv,
     )
-    from elastocal.files import atomic_write_text
+    from elastocal.files import atomic_write
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated, tool_point
     from elastocal.report.renderers import print_blocks
@@ -417,8 +417,8 @@ def compensate(
             content["table"], corrections = summary_and_csv(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(
-            (output, lambda path: atomic_write_text(path, commands)),
-            (table, lambda path: atomic_write_text(path, corrections)),
+            (output, lambda path: atomic_write(path, commands)),
+            (table, lambda path: atomic_write(path, corrections)),
         )
     shown = run.answer(
         lambda: content.pop("commands", {}) | content,

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.errors import InputError
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_write
 from elastocal.identification.result import Calibration
 
 LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg
@@ -76,7 +76,7 @@ def _copy_example(folder: Path) -> tuple[Path, Path]:
         own = [path for path in source.iterdir() if path.suffix in (".toml", ".urdf", ".csv")]
         _check_own(folder, own)
         for path in own:
-            atomic_write_text(folder / path.name, path.read_text(encoding="utf-8"))
+            atomic_write(folder / path.name, path.read_text(encoding="utf-8"))
     return folder / "cell.toml", folder / "plan.csv"
 
 

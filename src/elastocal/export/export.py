@@ -26,7 +26,7 @@ from elastocal.export.exportable import (
     refitted,
 )
 from elastocal.export.mjcf_file import MujocoRest, NotInPlace
-from elastocal.files import atomic_write_text, together
+from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain
@@ -306,11 +306,11 @@ def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
     """The file, and where it is asked for its joint correction: both or none."""
-    with together([path] if correction is None else [path, correction]):
-        atomic_write_text(path, done.text)
+    with together():
+        atomic_write(path, done.text)
         if correction is not None:
             told = f"q_effective = q + the deltas of its joint, for {path.name}; SI: rad or m"
-            atomic_write_text(correction, done.correction.csv([told]))
+            atomic_write(correction, done.correction.csv([told]))
 
 
 # Each format written, and read back by the library that users read it with before it is kept.
@@ -341,7 +341,7 @@ def _accepted(distance: float, largest: float) -> float:
 def _read_back(text: str, ending: str, read: Callable[[Path], Chain]) -> Chain:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"written{ending}"
-        atomic_write_text(path, text)
+        atomic_write(path, text)
         return read(path)
 
 

@@ -333,8 +333,7 @@ class _Model:
         for each in [v for k, v in tag.stated.items() if k.startswith("file") and v]:
             for found in self._places(file, each):
                 try:
-                    size = check_regular(found, "file")
-                    check_size(found, "file", size, MOST_MESH_BYTES)
+                    size = check_regular(found, "file", MOST_MESH_BYTES)
                     self._bytes += size
                     require(
                         self._bytes <= MOST_FILES_BYTES,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError, require
-from elastocal.files import check_regular, check_size
+from elastocal.files import check_regular
 from elastocal.model.chain import Chain
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array, pose_at
@@ -115,7 +115,7 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
     from scipy.spatial import QhullError
 
     try:
-        check_size(path, "mesh", check_regular(path, "mesh"), MESH_BYTES)
+        check_regular(path, "mesh", MESH_BYTES)
     except InputError as error:
         raise InputError(f"mesh of body '{name}': {error}") from None
     try:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from elastocal import __version__
 from elastocal.errors import require
-from elastocal.files import atomic_write_bytes, open_input
+from elastocal.files import atomic_write, open_input
 
 State = Mapping[str, Any]  # arrays and numbers, which become arrays
 KEY = "elastocal"  # the array that says of which design a file is
@@ -80,7 +80,7 @@ class Checkpoint:
         self.kept.update({name + at: value for at, value in made.items()})
         text = io.BytesIO()
         np.savez(text, allow_pickle=False, **self.kept)
-        atomic_write_bytes(self.path, text.getvalue())
+        atomic_write(self.path, text.getvalue())
         return made
 
     def clear(self) -> None:

@@ -12,7 +12,7 @@ from scipy import linalg, special
 
 from elastocal.above import Result
 from elastocal.cell.plan_wishes import TEST_POSE
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_write
 from elastocal.measurements import (
     DEFAULT_MARKER,
     Measurements,
@@ -206,7 +206,7 @@ def write_plan(
             h: [repr(v) for v in own] for h, own in zip(heads, values.T.tolist(), strict=True)
         }
     columns |= more
-    atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
+    atomic_write(path, csv_text(columns, zip(*columns.values(), strict=True)))
 
 
 # The frozen result of a design: poses in order, what they promise, how far from the best.

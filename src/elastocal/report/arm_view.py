@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell, HalfSpace, Solid
 from elastocal.errors import ElastocalError, require
-from elastocal.files import atomic_write_bytes
+from elastocal.files import atomic_write
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -407,7 +407,7 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
     nothing = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}
     with style():
         figure.savefig(picture, format=suffix[1:], dpi=200, metadata=nothing, facecolor="white")
-    atomic_write_bytes(path, picture.getvalue())
+    atomic_write(path, picture.getvalue())
 
 
 def plan_figure(plan: Plan) -> Any:

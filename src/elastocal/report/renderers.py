@@ -32,7 +32,7 @@ from rich.text import Text
 
 from elastocal import __version__
 from elastocal.errors import InputError, option, require
-from elastocal.files import atomic_write_text, check_ending, open_input
+from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
@@ -185,10 +185,10 @@ def write_page(
         from elastocal.report.smaller_views import dcc_text
 
         fit: Any = result
-        return atomic_write_text(path, dcc_text(fit))
-    check_ending(path, (".html", ".htm"))
+        return atomic_write(path, dcc_text(fit))
+    check_output(path, (".html", ".htm"))
     inputs = sources(result) if inputs is None else inputs
-    atomic_write_text(path, page_of(result, inputs, command, seed, **told))
+    atomic_write(path, page_of(result, inputs, command, seed, **told))
 
 
 def page_of(
