@@ -33,15 +33,15 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cached_property, partial
-from importlib.machinery import ModuleSpec, SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
+from importlib.util import module_from_spec, spec_from_file_location
 from ipaddress import ip_address
 from itertools import islice
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -84,6 +84,7 @@ class Sources:
     folder: Path
     contents: Mapping[str, bytes]
     columns: Mapping[str, str]
+    seed: int
     version: str = __version__
 
     @cached_property
@@ -97,39 +98,16 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class StudyTask:
-    """One task: its place in the study, its values as JSON text, and what makes it the same."""
-
-    index: int
-    text: str
-    seed: int
-    hash: str
-
-    def line(self) -> Row:
-        return {
-            "task": self.index, "task_hash": self.hash, "values": json.loads(self.text),
-            "rows": [], "task_seconds": 0.0, "elastocal": __version__, "task_error": None,
-        }  # fmt: skip
-
-    def failed(self, told: str) -> Row:
-        return self.line() | {"task_error": told, "trace": f"{told}\n"}
-
-    def rng(self) -> np.random.Generator:
-        """Child `index` of SeedSequence(seed), whoever computes it and however many there are."""
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.index,)))
-
-
-@dataclass(frozen=True)
 class Study:
-    """A study ready to run, with seed and options settled and its tasks in their order."""
+    """A study ready to run, with options settled and its tasks in their order: what their lines of
+    results begin with (`task`, `task_hash`, `values`)."""
 
     folder: Path
     title: str
-    seed: int
     options: Mapping[str, Any]
     sources: Sources
     module: ModuleType
-    tasks: tuple[StudyTask, ...]
+    tasks: tuple[Row, ...]
 
 
 class StudyFile(Table):
@@ -157,11 +135,11 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
-    sources = Sources(whole, _contents(whole, stated, path), stated.columns)
-    seed = stated.seed if seed is None else seed
+    contents, seed = _contents(whole, stated, path), stated.seed if seed is None else seed
+    sources = Sources(whole, contents, stated.columns, seed)
     module = load(sources)
-    tasks = tuple(_tasks(folder, module, chosen, sources, seed))
-    return Study(folder, stated.title or whole.name, seed, chosen, sources, module, tasks)
+    tasks = tuple(_tasks(folder, module, chosen, sources))
+    return Study(folder, stated.title or whole.name, chosen, sources, module, tasks)
 
 
 def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
@@ -202,8 +180,8 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
 
 
 def _tasks(
-    folder: Path, module: ModuleType, options: Mapping[str, Any], sources: Sources, seed: int
-) -> Iterator[StudyTask]:
+    folder: Path, module: ModuleType, options: Mapping[str, Any], sources: Sources
+) -> Iterator[Row]:
     script = folder / "study.py"
     for name in ("tasks", "run"):
         told = f"defines no function {name}(); a study has tasks(options) and run(task, rng)"
@@ -226,9 +204,10 @@ def _tasks(
             )
             told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
             require(key not in sources.columns, told)
-        text = _json(where, dict(task))
-        whole = f"{sources.digest}\n{seed}\n{index}\n{json.dumps(json.loads(text), sort_keys=True)}"
-        yield StudyTask(index, text, seed, hashlib.sha256(whole.encode()).hexdigest())
+        values = json.loads(_json(where, dict(task)))
+        same = sources.digest, sources.seed, index, json.dumps(values, sort_keys=True)
+        digest = hashlib.sha256("\n".join(map(str, same)).encode()).hexdigest()
+        yield {"task": index, "task_hash": digest, "values": values}
 
 
 def _json(where: str, value: Any) -> str:
@@ -257,14 +236,14 @@ def load(sources: Sources) -> ModuleType:
             folder = _standing(sources)
             sys.path.insert(0, str(folder))
             name = f"elastocal_study_{sources.digest[:16]}"
-            loader = SourceFileLoader(name, str(folder / "study.py"))
-            module = module_from_spec(cast(ModuleSpec, spec_from_loader(name, loader)))
+            spec: Any = spec_from_file_location(name, folder / "study.py")
+            module = module_from_spec(spec)
             sys.modules[name] = module  # dataclasses and pickle look a class's module up there
             _here = sources.digest, folder, module
             # No bytecode in the user's folder: it would be left, half written, by a kill.
             before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
             try:
-                calling(folder, "importing study.py", lambda: loader.exec_module(module))
+                calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
             finally:
                 sys.dont_write_bytecode = before
         return _here[2]
@@ -300,23 +279,34 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
         ) from error
 
 
-def execute(sources: Sources, task: StudyTask) -> Row:
-    """The line of results that came of the task; of one that failed with its `trace`."""
-    line = task.line()
-    begun = time.perf_counter()
+def line_of(
+    task: Row, rows: Sequence[Row] = (), seconds: float = 0.0, error: str | None = None,
+    trace: str | None = None,
+) -> Row:  # fmt: skip
+    """The line of results of a task; of one that failed with its `trace`."""
+    told = {"task_error": error, "trace": trace or error}
+    return task | {"rows": rows, "task_seconds": seconds, "elastocal": __version__} | told
+
+
+def execute(sources: Sources, task: Row) -> Row:
+    """The line of results that came of the task.
+
+    Its draws are those of child `task` of SeedSequence(seed), whoever computes it and however many
+    there are.
+    """
+    begun, rows, error, trace = time.perf_counter(), list[Row](), None, None
+    draws = np.random.SeedSequence(sources.seed, spawn_key=(task["task"],))
     try:
         if sources.version != __version__:
             raise RuntimeError(
                 f"this worker has elastocal {__version__}, the study was started with "
                 f"{sources.version}; install the same there"
             )
-        found = load(sources).run(json.loads(task.text), task.rng())
-        line["rows"] = _checked_rows(found, sources.columns, line["values"])
+        found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
+        rows = _checked_rows(found, sources.columns, task["values"])
     except (Exception, SystemExit) as caught:
-        line["task_error"] = f"{type(caught).__name__}: {caught}"
-        line["trace"] = traceback.format_exc()
-    line["task_seconds"] = time.perf_counter() - begun
-    return line
+        error, trace = f"{type(caught).__name__}: {caught}", traceback.format_exc()
+    return line_of(task, rows, time.perf_counter() - begun, error, trace)
 
 
 def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row]:
@@ -391,7 +381,8 @@ def opened(folder: Path) -> Iterator[None]:
 def add_line(folder: Path, line: Row) -> None:
     if trace := line.pop("trace", None):
         with open(folder / FAILURES, "a", encoding="utf-8") as log:
-            log.write(shown(f"task {line['task']} {json.dumps(line['values'])}\n{trace}\n"))
+            told = f"task {line['task']} {json.dumps(line['values'])}\n{trace.rstrip()}\n\n"
+            log.write(shown(told))
     with open(folder / RESULTS, "a", encoding="utf-8") as handle:
         handle.write(as_text(line))
 
@@ -423,7 +414,7 @@ def result_lines(folder: Path) -> list[Row]:
 
 def write_statement(folder: Path, study: Study) -> None:
     statement = {
-        "schema": SCHEMA, "title": study.title, "seed": study.seed,
+        "schema": SCHEMA, "title": study.title, "seed": study.sources.seed,
         "options": dict(study.options), "tasks": len(study.tasks),
         "columns": dict(study.sources.columns), "sources": study.sources.digests,
         "elastocal": __version__,
@@ -477,7 +468,7 @@ class ClusterLostError(ElastocalError):
     exit_code = 1
 
 
-def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop) -> Lines:
+def run_local(study: Study, tasks: Sequence[Row], jobs: int | None, stop: StudyStop) -> Lines:
     """Lines of results as joblib has them, none twice; none new begins once `stop` is asked for.
 
     Where a process dies joblib ends them all: what ran is repeated, one task after the other, so
@@ -486,18 +477,18 @@ def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: 
     import joblib
 
     jobs = max(min(jobs or joblib.cpu_count(), len(tasks)), 1)
-    waiting, died, out = deque(tasks), Counter[int](), dict[int, StudyTask]()
+    waiting, died, out = deque(tasks), Counter[int](), dict[int, Row]()
 
     def handed_out(most: int) -> Iterator[Any]:
         while waiting and most and not stop.asked:
             task, most = waiting.popleft(), most - 1
-            out[task.index] = task
+            out[task["task"]] = task
             yield joblib.delayed(execute)(study.sources, task)
 
     ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
     with joblib.parallel_config("loky", initializer=ignore):
         while waiting and not stop.asked:
-            suspect = died[waiting[0].index] > 0
+            suspect = died[waiting[0]["task"]] > 0
             pool = joblib.Parallel(
                 max(jobs, 2) if suspect else jobs, return_as="generator_unordered",
                 pre_dispatch="n_jobs", batch_size=1,
@@ -508,19 +499,20 @@ def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: 
                     del out[line["task"]]
                     yield line
             except BrokenProcessPool:
-                lost = list(out.values())
-                out.clear()
-                died.update(task.index for task in lost)
-                waiting.extendleft(task for task in lost if died[task.index] < TRIES)
-                for task in (task for task in lost if died[task.index] >= TRIES):
-                    yield task.failed(DIED.format(TRIES))
+                while out:
+                    number, task = out.popitem()
+                    died[number] += 1
+                    if died[number] < TRIES:
+                        waiting.appendleft(task)
+                    else:
+                        yield line_of(task, error=DIED.format(TRIES))
             finally:
                 with warnings.catch_warnings(action="ignore"):  # joblib's, of tasks ended early
                     lines.close()
 
 
 def run_on_cluster(
-    client: Any, study: Study, tasks: Sequence[StudyTask], stop: StudyStop,
+    client: Any, study: Study, tasks: Sequence[Row], stop: StudyStop,
     tell: Callable[[str], None],
 ) -> Lines:  # fmt: skip
     """The same of a Dask cluster's workers, which gives the tasks of a dead one to another, and
@@ -530,7 +522,7 @@ def run_on_cluster(
     """
     from distributed import as_completed
 
-    waiting, out, ended = deque(tasks), dict[Any, StudyTask](), as_completed(loop=client.loop)
+    waiting, out, ended = deque(tasks), dict[Any, Row](), as_completed(loop=client.loop)
 
     def hand_out() -> None:
         # Without a limit a scheduler that goes away while it is asked is waited for for ever.
@@ -555,7 +547,7 @@ def run_on_cluster(
             except Exception as error:  # execute() returns what a task raises
                 deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
                 told = f"the worker could not run it: {type(error).__name__}: {error}"
-                yield task.failed(told if deaths is None else DIED.format(deaths + 1))
+                yield line_of(task, error=told if deaths is None else DIED.format(deaths + 1))
             hand_out()
     except (CancelledError, OSError):
         raise ClusterLostError(
@@ -668,7 +660,7 @@ def run_study(
         kept = [line for line in known if not (retry_failed and line["task_error"])]
         there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
-        left = [task for task in wanted if task.index not in there]
+        left = [task for task in wanted if task["task"] not in there]
         runner = partial(run_local, study, left, jobs, stop)
         if cluster is not None and left:
             # Before results are discarded: one that cannot be reached must not cost them.
@@ -679,7 +671,7 @@ def run_study(
             atomic_write(folder / RESULTS, "".join(map(as_text, kept)))
         write_statement(folder, study)
         total, before = len(wanted), len(wanted) - len(left)
-        ended, failed = before, sum(there.get(task.index, False) for task in wanted)
+        ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
         progress(total, ended, failed)
         try:
             with closing(runner()) as lines:
@@ -705,7 +697,7 @@ def _known(study: Study, folder: Path) -> list[Row]:
     lines = result_lines(folder)
     for line in lines:
         at = line["task"]
-        if at < len(study.tasks) and study.tasks[at].hash != line["task_hash"]:
+        if at < len(study.tasks) and study.tasks[at]["task_hash"] != line["task_hash"]:
             changes = _changes(study, before) or [f"task {at} was another one"]
             told = f"{folder}: holds results of another study: {'; '.join(changes)}"
             raise InputError(f"{told}. {here} to keep them")
@@ -718,8 +710,8 @@ def _changes(now: Study, before: dict[str, Any]) -> list[str]:
     changed = [n for n in sorted({*sources, *digests}) if sources.get(n) != digests.get(n)]
     if sources and changed:
         told.append(f"{', '.join(changed)} changed since")
-    if before.get("seed", now.seed) != now.seed:
-        told.append(f"the seed was {before['seed']}, now it is {now.seed}")
+    if before.get("seed", now.sources.seed) != now.sources.seed:
+        told.append(f"the seed was {before['seed']}, now it is {now.sources.seed}")
     options = before.get("options", {})
     for name, value in now.options.items():
         if options.get(name, value) != value:
