@@ -227,7 +227,7 @@ def together() -> Iterator[None]:
     Where the block fails none does, and what stood there before is untouched.
     """
     global _written
-    _written = written = []
+    _written = written = list[tuple[Path, Path]]()
     try:
         yield
         with _undisturbed():
@@ -248,7 +248,8 @@ def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
     temporary file and the old content of `path` untouched.
     """
     check_output(path)
-    mode, how = ("b", {}) if binary else ("", {"encoding": "utf-8", "newline": "\n"})
+    mode = "b" if binary else ""
+    how: dict[str, Any] = {} if binary else {"encoding": "utf-8", "newline": "\n"}
     target = Path(os.path.realpath(path))  # a link keeps pointing to what it points to
     with _write_errors(path):
         if _is_device(path):  # renaming over /dev/stdout or /dev/null would replace the device
