@@ -517,7 +517,6 @@ def identify(
         fixed=_names("fixed", fixed),
         faulty=outliers,
         seed=cast(int, seed),
-        jobs=jobs,
     )
     known = knowledge_of(knowledge, physical or bounded)
     tell = progress or _silent

@@ -5,6 +5,7 @@ import pytest
 from engine.dense import Dense
 from scipy import stats
 
+from elastocal.identification.least_squares import orthogonal
 from elastocal.identification.noise_choice import estimate_noise
 from elastocal.identification.noise_structure import Readings, VisitRecord
 
@@ -67,8 +68,8 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
     assert found.fit.log_likelihood == pytest.approx(whole.log_likelihood + shift, rel=1e-9)
     assert np.allclose(found.x, x, atol=1e-6 * np.sqrt(np.diag(Phi)).min())
     p = len(x)
-    plain = found.basis @ found.fit.state.Phi @ found.basis.T
-    assert np.allclose(plain[:p, :p], Phi, rtol=1e-6)
+    T = orthogonal(B).V
+    assert np.allclose(T @ found.fit.state.Phi[:p, :p] @ T.T, Phi, rtol=1e-6)
     # No other variances are likelier.
     assert np.abs(found.fit.model.objective(np.log(found.fit.theta))[1]).max() < 1e-2
 

@@ -548,7 +548,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "extra_plan": d.extra and _without(vars(d.extra), "plan"),
         "model_keys": d.model_keys,
         "warnings": d.warnings,
-        "findings": [f.to_json() for f in d.findings],
+        "findings": d.findings,
         "backend": model.backend_report(),
         "n_readings": d.n_readings,
         "n_configurations": d.n_configurations,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -59,7 +60,7 @@ class FaultyGroup:
     `p_value` is adjusted for all tests of the report; `p_left` is that of what one common shift
     leaves of the errors, by the noise of the others: 0 of a single reading.  `influence` is the
     largest change of a parameter, in its standard deviations, if the readings were fitted along,
-    and `column` that parameter.
+    and `moves_most` that parameter.
     """
 
     level: Level
@@ -72,7 +73,7 @@ class FaultyGroup:
     sigmas: float
     p_value: float
     influence: float
-    column: int
+    moves_most: str
     p_left: float = 0.0
 
     @property
@@ -90,7 +91,7 @@ class OutlierReport:
     """Findings, groups before readings and the largest first, and what is left without them.
 
     `sigma` is the noise of a whitened row.  `tests` says how many were made per level, `good` (n,)
-    which observations the fit rests on, `names` (p,) those of the parameters where they have any.
+    which observations the fit rests on.
     """
 
     findings: tuple[FaultyGroup, ...]
@@ -99,7 +100,6 @@ class OutlierReport:
     good: BoolArray
     tests: dict[Level, int]
     false_alarm: float = FALSE_ALARM
-    names: tuple[str, ...] = ()
 
     @property
     def shifted(self) -> list[FaultyGroup]:
@@ -107,19 +107,9 @@ class OutlierReport:
         return [f for f in self.findings if f.explained and 2 * f.beyond >= len(f.readings)]
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists; an unbounded influence is None."""
-        listed = [asdict(f) for f in self.findings]
-        for entry in listed:
-            entry |= {"readings": list(entry["readings"]), "lines": list(entry["lines"])}
-            if not np.isfinite(entry["influence"]):
-                entry["influence"] = None
-            if self.names:
-                entry["moves_most"] = self.names[entry.pop("column")]
-        return {
-            "findings": listed, "sigma": self.sigma, "dof": self.dof,
-            "readings_used": int(self.good.sum()), "tests": dict(self.tests),
-            "false_alarm": self.false_alarm,
-        }  # fmt: skip
+        """Its fields, but for how many readings were used instead of which."""
+        told = {k: v for k, v in vars(self).items() if k != "good"}
+        return told | {"readings_used": int(self.good.sum())}
 
 
 class Group(NamedTuple):
@@ -190,132 +180,122 @@ def _changed(fit: FitToGood, members: BoolArray, sign: int) -> tuple[float, floa
     return max(rss, 0.0), fit.dof + sign * e.size, G, c
 
 
-def groups_of(
-    level: Level, labels: NDArray[Any] | None, without_shift: Collection[str] = ()
-) -> list[Group]:
-    """Every group with more than one reading and less than half of them."""
-    if labels is None:
-        return []
-    names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
-    testable = np.flatnonzero((count > 1) & (2 * count < len(labels)))
-    return [Group(level, str(names[k]), code == k, names[k] not in without_shift) for k in testable]
+@dataclass(frozen=True)
+class _Judged:
+    """Readings y (n, size) ≈ B z, whitened, B (n, size, p) per prior deviation of the parameters
+    `names`; `off` (n, …) are their errors in m, `good` (n,) those to rely on.
 
-
-def _runs(
-    beyond: BoolArray, active: BoolArray, lines: IntArray, marker: NDArray[Any] | None
-) -> Iterator[Group]:
-    """Runs of active lines, of all markers and of each, at least half of whose readings lie
-    `beyond` the noise, and three or more."""
-    every = np.ones(len(lines), dtype=bool)
-    own = [] if marker is None else [(f" of {m}", marker == m) for m in np.unique(marker[beyond])]
-    for of, members in (("", every), *own):
-        order = np.flatnonzero(members)[np.argsort(lines[members], kind="stable")]
-        for first, last in blocks(np.flatnonzero(beyond[order]).tolist()):
-            run = np.zeros_like(every)
-            run[order[first : last + 1]] = True
-            run &= active
-            if (beyond & run).sum() >= max(SMALLEST_BLOCK, run.sum() / 2):
-                yield Group("block", f"{lines[order[first]]} to {lines[order[last]]}{of}", run)
-
-
-def _blamed(
-    fit: FitToGood, active: BoolArray, groups: list[Group], lines: IntArray,
-    marker: NDArray[Any] | None, adjust: dict[Level, int],
-) -> tuple[Group, float] | None:  # fmt: skip
-    """The group that explains most, with its adjusted p-value; None where none is beyond noise.
-
-    Tested is all that is active of a group where most of it is beyond the noise and that is no
-    chance, else what is not.
+    `groups` are those by name; for each of the `lines` (n,) there is a `marker`.
     """
-    beyond, found = active & ~fit.good, []
-    for group in (*groups, *_runs(beyond, active, lines, marker)):
-        present = active & group.members
-        inside, outside = int((beyond & present).sum()), int((beyond & ~present).sum())
-        count, others = int(present.sum()), int((active & ~present).sum())
-        rate = (outside + 1) / (others + 1)
-        chance = float(special.bdtrc(inside - 1, count, rate)) if inside else 1.0
-        whole = 2 * inside >= count and chance * adjust[group.level] < FALSE_ALARM
-        used = present if whole else present & fit.good
-        if used.sum() < 2 or (group.level == "block" and not whole):
-            continue
-        p, gain, *_ = group_test(fit, used, group.may_shift)
-        if p * adjust[group.level] < FALSE_ALARM:
-            gain /= WORTH_A_BLOCK if group.level == "block" else 1.0
-            own = group._replace(members=present)
-            found.append((gain, own, min(1.0, p * adjust[group.level])))
-    return max(found, key=lambda one: one[0])[1:] if found else None
 
+    B: Array
+    y: Array
+    off: Array
+    good: BoolArray
+    names: tuple[str, ...]
+    lines: IntArray
+    marker: NDArray[Any]
+    groups: list[Group]
 
-def outlier_report(
-    B: Array,
-    y: Array,
-    off: Array,
-    good: BoolArray,
-    lines: IntArray,
-    marker: NDArray[Any] | None = None,
-    configuration: NDArray[Any] | None = None,
-    fitted_markers: Collection[str] = (),
-) -> OutlierReport:
-    """What is wrong with the readings y (n, size) ≈ B z, whitened, B (n, size, p) per prior
-    deviation; `off` (n, …) are their errors in m.
+    @cached_property
+    def tests(self) -> dict[Level, int]:
+        """How many are made per level."""
+        tests: dict[Level, int] = {"reading": len(self.y)}
+        for group in self.groups:
+            tests[group.level] = tests.get(group.level, 0) + 1
+        lengths = [len(run) for _, run in self._ordered(self.marker)]
+        return tests | {"block": sum(k * (k + 1) // 2 for k in lengths)}
 
-    `good` (n,) says which observations to rely on; reported are the others, alone or as groups,
-    and groups of good ones that err together: one at a time, the one that explains most first, as
-    long as a majority is left.
+    def adjusted(self, p: float, level: Level) -> float:
+        return min(1.0, p * self.tests[level] * len(self.tests))
 
-    Markers whose positions are among the parameters, `fitted_markers`, have no common shift.
-    `marker` and `configuration` (n,) are labels, `lines` (n,) the line of each observation; a
-    level without labels is not tested, nor are groups of a single reading or of half the table.
-    """
-    n, size = y.shape
-    variance = max(median_scale(np.linalg.norm(y, axis=1), size) ** 2, TINY)
-    groups = groups_of("marker", marker, fitted_markers)
-    groups += groups_of("configuration", configuration)
-    tests: dict[Level, int] = {"reading": n}
-    for group in groups:
-        tests[group.level] = tests.get(group.level, 0) + 1
-    several = [] if marker is None else np.unique(marker, return_counts=True)[1].tolist()
-    tests["block"] = sum(k * (k + 1) // 2 for k in (n, *several))
-    adjust = {level: count * len(tests) for level, count in tests.items()}
-    active, accepted = np.ones(n, dtype=bool), []
-    while True:
-        fit = FitToGood(B, y, good & active, variance)
-        blamed = _blamed(fit, active, groups, lines, marker, adjust)
-        if blamed is None or 2 * (active & ~blamed[0].members).sum() <= n:
-            break
-        group, p = blamed
-        accepted.append((group, p, int((group.members & ~fit.good).sum())))
-        active = active & ~group.members
-    alone = fit.p_values(fit.T, fit.e, fit.good)
-    for i in np.flatnonzero(active & ~fit.good):
-        p = min(1.0, float(alone[i]) * adjust["reading"])
-        accepted.append((Group("reading", str(lines[i]), np.arange(n) == i), p, 1))
-    findings = [_finding(fit, group, off, lines, beyond, p) for group, p, beyond in accepted]
-    findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
-    sigma = float(np.sqrt(fit.variance))
-    return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, tests)
+    def report(self) -> OutlierReport:
+        """What is wrong: the readings that are not good, alone or as groups, and groups of good
+        ones that err together; one at a time, the one that explains most first, as long as a
+        majority is left."""
+        n, size = self.y.shape
+        variance = max(median_scale(np.linalg.norm(self.y, axis=1), size) ** 2, TINY)
+        active, accepted = np.ones(n, dtype=bool), []
+        while True:
+            fit = FitToGood(self.B, self.y, self.good & active, variance)
+            blamed = self._blamed(fit, active)
+            if blamed is None or 2 * (active & ~blamed[0].members).sum() <= n:
+                break
+            group, p = blamed
+            accepted.append((group, p, int((group.members & ~fit.good).sum())))
+            active = active & ~group.members
+        alone = fit.p_values(fit.T, fit.e, fit.good)
+        for i in np.flatnonzero(active & ~fit.good):
+            reading = Group("reading", str(self.lines[i]), np.arange(n) == i)
+            accepted.append((reading, self.adjusted(float(alone[i]), "reading"), 1))
+        findings = [self._finding(fit, *one) for one in accepted]
+        findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
+        sigma = float(np.sqrt(fit.variance))
+        return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, self.tests)
 
+    def _ordered(self, markers: NDArray[Any]) -> Iterator[tuple[str, IntArray]]:
+        """Readings in the order of their lines: all, and where there are several markers those of
+        each of `markers`."""
+        order = np.argsort(self.lines, kind="stable")
+        yield "", order
+        if (self.marker != self.marker[0]).any():
+            for m in np.unique(markers):
+                yield f" of {m}", order[self.marker[order] == m]
 
-def _finding(
-    fit: FitToGood, group: Group, off: Array, lines: IntArray, beyond: int, p: float
-) -> FaultyGroup:  # fmt: skip
-    """The group as it errs under the fit without any of the others."""
-    move = np.abs(_move(fit, group.members))
-    column = int(np.argmax(move))
-    chosen = np.flatnonzero(group.members)
-    shift, p_left = None, 0.0
-    if group.level != "reading":
-        *_, shift, p_left = group_test(fit, group.members, group.may_shift)
-    pattern: Pattern = "single" if group.level == "reading" else "scatter"
-    own, error = (float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, off))
-    if shift is not None:
-        pattern, own = "common", float(np.linalg.norm(shift))
-        error = float(np.linalg.norm(np.median(off[chosen], axis=0)))
-    return FaultyGroup(
-        group.level, group.name, pattern, tuple(chosen.tolist()), tuple(lines[chosen].tolist()),
-        beyond, error, own / float(np.sqrt(fit.variance)), p, float(move[column]), column,
-        p_left,
-    )  # fmt: skip
+    def _runs(self, beyond: BoolArray, active: BoolArray) -> Iterator[Group]:
+        """Runs of active lines, of all markers and of each, at least half of whose readings lie
+        `beyond` the noise, and three or more."""
+        for of, order in self._ordered(self.marker[beyond]):
+            for first, last in blocks(np.flatnonzero(beyond[order]).tolist()):
+                run = np.zeros_like(active)
+                run[order[first : last + 1]] = True
+                run &= active
+                if (beyond & run).sum() >= max(SMALLEST_BLOCK, run.sum() / 2):
+                    a, b = self.lines[order[[first, last]]]
+                    yield Group("block", f"{a} to {b}{of}", run)
+
+    def _blamed(self, fit: FitToGood, active: BoolArray) -> tuple[Group, float] | None:
+        """The group that explains most, with its adjusted p-value; None where none is beyond noise.
+
+        Tested is all that is active of a group where most of it is beyond the noise and that is no
+        chance, else what is not.
+        """
+        beyond, found = active & ~fit.good, []
+        for group in (*self.groups, *self._runs(beyond, active)):
+            present = active & group.members
+            inside, outside = int((beyond & present).sum()), int((beyond & ~present).sum())
+            count, others = int(present.sum()), int((active & ~present).sum())
+            rate = (outside + 1) / (others + 1)
+            chance = float(special.bdtrc(inside - 1, count, rate)) if inside else 1.0
+            whole = 2 * inside >= count and self.adjusted(chance, group.level) < FALSE_ALARM
+            used = present if whole else present & fit.good
+            if used.sum() < 2 or (group.level == "block" and not whole):
+                continue
+            p, gain, *_ = group_test(fit, used, group.may_shift)
+            if (p := self.adjusted(p, group.level)) < FALSE_ALARM:
+                gain /= WORTH_A_BLOCK if group.level == "block" else 1.0
+                found.append((gain, group._replace(members=present), p))
+        return max(found, key=lambda one: one[0])[1:] if found else None
+
+    def _finding(self, fit: FitToGood, group: Group, p: float, beyond: int) -> FaultyGroup:
+        """The group as it errs under the fit without any of the others."""
+        move, chosen = np.abs(_move(fit, group.members)), np.flatnonzero(group.members)
+        column = int(np.argmax(move))
+        pattern: Pattern = "single" if group.level == "reading" else "scatter"
+        own, error = (
+            float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, self.off)
+        )
+        shift, p_left = None, 0.0
+        if group.level != "reading":
+            *_, shift, p_left = group_test(fit, group.members, group.may_shift)
+        if shift is not None:
+            pattern, own = "common", float(np.linalg.norm(shift))
+            error = float(np.linalg.norm(np.median(self.off[chosen], axis=0)))
+        return FaultyGroup(
+            group.level, group.name, pattern, tuple(chosen.tolist()),
+            tuple(self.lines[chosen].tolist()), beyond, error,
+            own / float(np.sqrt(fit.variance)), p, float(move[column]), self.names[column], p_left,
+        )  # fmt: skip
 
 
 def _move(fit: FitToGood, members: BoolArray) -> Array:
@@ -371,16 +351,21 @@ def report_faulty(
         root = block_diagonal(inverse_factor(own))
         B, e = root @ B, root @ e
     lead, fitted = observed.lead, [problem.model.parameters[c] for c in columns]
-    marker = _labels(table.marker_names, table.marker[lead])
-    visited = _labels(table.configuration_labels, table.configuration[lead])
-    report = outlier_report(
+    own_places = {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
+    marker = np.array(table.marker_names)[table.marker[lead]]
+    visited = np.array(table.configuration_labels)[table.configuration[lead]]
+    groups = [*_groups("marker", marker, own_places), *_groups("configuration", visited)]
+    return _Judged(
         B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1), readings.e[:, :3], good,
-        table.row[lead], marker, None if shared else visited,
-        {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name},
-    )  # fmt: skip
-    return replace(report, names=tuple(p.name for p in fitted))
+        tuple(p.name for p in fitted), table.row[lead], marker,
+        [group for group in groups if not shared or group.level == "marker"],
+    ).report()  # fmt: skip
 
 
-def _labels(names: tuple[str, ...], codes: IntArray) -> NDArray[Any] | None:
-    """Labels (N,), None where all are the same."""
-    return np.array(names)[codes] if len(np.unique(codes)) > 1 else None
+def _groups(
+    level: Level, labels: NDArray[Any], without_shift: Collection[str] = ()
+) -> Iterator[Group]:
+    """Every group with more than one reading and less than half of them."""
+    names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
+    for k in np.flatnonzero((count > 1) & (2 * count < len(labels))):
+        yield Group(level, str(names[k]), code == k, names[k] not in without_shift)

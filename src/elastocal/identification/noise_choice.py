@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, special
+from scipy import sparse, special
 
 from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts, fit
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
@@ -249,6 +249,12 @@ class Fitted(MixedFit):
         """The kind without what was not found, with which it is the same model."""
         return self.noisy.kind.having(*(d.part for d, _ in self.found))
 
+    def estimate(self, T: Array) -> tuple[Array, Array, Array]:
+        """T x (p,) of the parameters x without the coefficients of a course in time, which come
+        last; its covariance by Kenward and Roger, and degrees of freedom."""
+        rows = np.pad(T, ((0, 0), (0, len(self.state.x) - len(T))))
+        return rows @ self.state.x, *self.kenward_roger(rows)
+
     def of(self, readings: Readings) -> list[tuple[Deviation, float]]:
         """The deviations that these readings share, be they those fitted or others."""
         known = {d.name: v for d, v in self.found}
@@ -395,9 +401,8 @@ class NoiseFit:
     """The noise model that was chosen, the estimate under it, and what else was tried.
 
     `x` (p,) is the generalised least-squares estimate of the readings' Δx, `covariance` that of
-    Kenward and Roger; `kind` is the name of a `Kind`.  `fit` is in orthonormal parameters: Δx =
-    basis · its x, which shifts all its log-likelihoods by one constant.  Where the noise has a
-    course in time, the basis (p + k, p + k) has the course's coefficients last.
+    Kenward and Roger; `kind` is the name of a `Kind`.  `fit` is in orthonormal parameters, which
+    shifts all its log-likelihoods by one constant.
     """
 
     kind: str
@@ -406,7 +411,6 @@ class NoiseFit:
     covariance: Covariance
     trials: tuple[Trial, ...]
     reason: str
-    basis: Array
     tests: tuple[NoiseTest, ...] = ()
     to_longest: float = 0.0  # log-likelihood that the longest time tried is short of the best
 
@@ -611,12 +615,10 @@ def _result(
     label: str, found: Fitted, T: Array, trials: tuple[Trial, ...], reason: str,
     tests: tuple[NoiseTest, ...] = (),
 ) -> NoiseFit:  # fmt: skip
-    p, x = len(T), found.state.x
-    basis = linalg.block_diag(T, np.eye(len(x) - p))
-    matrix, dof = found.kenward_roger(basis[:p])
+    x, matrix, dof = found.estimate(T)
     text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
     covariance = Covariance("kenward-roger", matrix, dof, text)
-    return NoiseFit(label, found, basis[:p] @ x, covariance, trials, reason, basis, tests)
+    return NoiseFit(label, found, x, covariance, trials, reason, tests)
 
 
 def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
@@ -637,9 +639,7 @@ def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
     level = np.array([one.log_likelihood for one in fits])
     longest = [v for one, v in zip(fits, level, strict=True) if one.lasting == LONGEST]
     weight = np.exp(level - level.max()) / np.exp(level - level.max()).sum()
-    rows = [np.pad(T, ((0, 0), (0, len(one.state.x) - len(T)))) for one in fits]
-    each = [one.kenward_roger(own) for one, own in zip(fits, rows, strict=True)]
-    matrices, dof = (np.array(part) for part in zip(*each, strict=True))
+    _, matrices, dof = map(np.array, zip(*(one.estimate(T) for one in fits), strict=True))
     among = tuple(zip(weight.tolist(), matrices, strict=True))
     mean = replace(found.covariance, matrix=np.tensordot(weight, matrices, 1), among=among)
     between = 1 / replace(mean, dof=np.full(len(T), np.inf)).tails(np.eye(len(T))[:, None])[0]

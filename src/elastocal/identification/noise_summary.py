@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -253,12 +253,12 @@ class Noise:
             "description": self.description,
             "sigma_um": microns(self.sigma),
             "ratio_to_stated": self.ratio_to_stated,
-            "lack_of_fit": None if self.lack_of_fit is None else asdict(self.lack_of_fit),
+            "lack_of_fit": self.lack_of_fit,
             "held_out_by": self.held_out_by,
             "intervals": {"kind": self.interval_kind, "description": self.interval_description},
         }
         if self.single is not None:
-            content["single_readings"] = asdict(self.single)
+            content["single_readings"] = self.single
         if self.reason is not None:
             content["reason"] = self.reason
         if self.sizes is not None:
@@ -266,7 +266,7 @@ class Noise:
         if self.tests:
             content["tests"] = [t._asdict() for t in self.tests]
         if self.drift is not None:
-            content["drift"] = asdict(self.drift)
+            content["drift"] = self.drift
         if self.tried is not None:
             content["tried"] = [t._asdict() for t in self.tried]
         return content

@@ -120,16 +120,12 @@ class SmoothPart:
         return [
             {
                 "effect": g.effect, "where": g.where, "follows": g.follows or None, "unit": unit,
-                "size": g.size, "length": _finite(g.length), "low": _finite(g.low),
-                "high": _finite(g.high), "scale": self.scale, "coefficients": self.coefficients,
-                "effective": self.effective, "rms": rms, "rms_ci95": list(ci95), "band95": half,
+                "size": g.size, "length": g.length, "low": g.low, "high": g.high,
+                "scale": self.scale, "coefficients": self.coefficients,
+                "effective": self.effective, "rms": rms, "rms_ci95": ci95, "band95": half,
             }
             for unit, (rms, ci95, half) in self.sizes.items()
         ]  # fmt: skip
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
 
 
 # What a method ends with.
@@ -218,7 +214,7 @@ class Options:
     constrained or regularised fit on top of the method's weights (`knowledge_fit`).  `faulty`:
     readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
     always, or never; they are listed in the result in any case.  `seed`: of multi-start and
-    searches; `jobs` has no effect, as nothing is drawn in processes.
+    searches.
     """
 
     method: Method = "auto"
@@ -231,7 +227,6 @@ class Options:
     prior: GaussianPrior | None = None
     faulty: FaultyReadings = "auto"
     seed: int = 0
-    jobs: int = 1
 
     def __post_init__(self) -> None:
         for name, value, valid in (

@@ -380,7 +380,7 @@ class PredictedError:
             "parameters": self.parameters * 1e6, "open_parameters": self.open * 1e6,
             "lack_of_fit": microns(self.lacking),
             "unchecked": microns(self.unchecked),
-            "blamed": list(self.blamed), "poses": self.poses, "source": self.source,
+            "blamed": self.blamed, "poses": self.poses, "source": self.source,
         }  # fmt: skip
 
 

@@ -22,8 +22,7 @@ from elastocal.identification.weighted_problem import (
 from elastocal.measurements import firsts, numbered, ranked
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.text import plain
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Held-out residuals: cross-validation over configurations in closed form.
 
@@ -91,17 +90,30 @@ def growth(B: Array, Q: Array, e: Array, configuration: IntArray) -> Array:
     """By how much (rows,) the residual grows where its configuration is left out; B are columns
     that are orthonormal as whitened ones, Q."""
     grown = np.empty(len(e))
-    for rows in same_size(configuration):
-        Qc, ec = Q[rows], e[rows]
-        if rows.shape[1] > Q.shape[1]:
-            # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
-            moved, alone = moved_by(Qc.transpose(0, 2, 1) @ Qc, (ec[:, None] @ Qc)[:, 0])
-        else:
-            solved, alone = moved_by(Qc @ Qc.transpose(0, 2, 1), ec)
-            moved = (solved[:, None] @ Qc)[:, 0]
+    for rows, moved, alone in left_out(Q, e, configuration):
         grown[rows] = (B[rows] @ moved[..., None])[..., 0]
         grown[rows[alone]] = np.inf
     return grown
+
+
+def left_out(
+    Q: Array, e: Array, configuration: IntArray
+) -> Iterator[tuple[IntArray, Array, BoolArray]]:
+    """Rows (g, m) of configurations of one size, Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c (g, columns), and which
+    are alone in some direction: there the latter is meaningless."""
+    for rows in same_size(configuration):
+        Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
+        # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
+        many = rows.shape[1] > Q.shape[1]
+        share = Qt @ Qc if many else Qc @ Qt
+        gap, alone = np.eye(share.shape[1]) - share, np.zeros(len(share), dtype=bool)
+        # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
+        heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
+        alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
+        gap[alone] = np.eye(share.shape[1])
+        own = e[rows][..., None]
+        moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)
+        yield rows, np.asarray(moved[..., 0], dtype=np.float64), alone
 
 
 def told_by_one(B: Array, configuration: IntArray) -> Array:
@@ -151,21 +163,6 @@ def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
         shared = ((F[rows] @ C[p:, :p]) * B[rows]).sum(axis=1)
         factor[rows] = np.sqrt(new / (new + 2 * shared))
     return factor
-
-
-def moved_by(share: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """(I − share)⁻¹ right per configuration, and where it is alone in some direction.
-
-    `share` (g, k, k) positive semidefinite, `right` (g, k); meaningless where alone.
-    """
-    gap = np.eye(share.shape[1]) - share
-    alone = np.zeros(len(share), dtype=bool)
-    # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
-    heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
-    alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
-    gap[alone] = np.eye(share.shape[1])
-    moved = np.asarray(np.linalg.solve(gap, right[..., None])[..., 0], dtype=np.float64)
-    return moved, alone
 
 
 def rms_3d(residual: Array, size: int) -> float:
@@ -409,9 +406,6 @@ class ResidualSummary:
         """
         found = [(g.by, group) for g in self.groupings for group in g.groups if group.deviates]
         return tuple(sorted(found, key=lambda pair: pair[1].p))
-
-    def to_json(self) -> dict[str, Any]:
-        return dict(plain(self))
 
 
 def summarise_residuals(

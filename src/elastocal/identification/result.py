@@ -44,6 +44,7 @@ from elastocal.model.calibrated import (
     tool_point,
 )
 from elastocal.model.observations import COMPONENTS, observe
+from elastocal.text import plain
 from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
@@ -132,7 +133,7 @@ class Combination:
         return {
             "terms": self.terms, "held": {name: self.held.get(name, 0.0) for name in self.terms},
             "expression": self.expression, "unit": self.unit, "value": self.value,
-            "std": _finite(self.std), "ci95": [_finite(v) for v in self.ci95],
+            "std": self.std, "ci95": self.ci95,
         }  # fmt: skip
 
 
@@ -213,16 +214,6 @@ class Finding:
         value = self.numbers[name]
         return value if isinstance(value, tuple) else ()
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists; what is not finite is None."""
-        numbers = {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in self.numbers.items()
-        }
-        return {
-            "kind": self.kind, "severity": self.severity, "numbers": numbers, "remedy": self.remedy,
-        }  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Verdict:
@@ -246,7 +237,7 @@ class Verdict:
         """JSON-ready; None where no error at new poses can be told."""
         return {
             "tone": self.tone, "trusted": self.trusted,
-            "at_um": None if self.at is None else self.at * 1e6,
+            "at_um": microns(self.at),
             "missing": [f.kind for f in self.missing],
         }  # fmt: skip
 
@@ -653,8 +644,9 @@ class Calibration(scrutiny.FoundFit, Result):
 
     def to_json(self) -> dict[str, Any]:
         """The result as a JSON-ready dictionary (DESIGN: identify → JSON)."""
-        chain, observed = self.model.chain, self.observations
-        return {
+        chain, observed, test = self.model.chain, self.observations, self.test
+        off = self.unsteadiness
+        return plain({
             "schema": SCHEMA,
             "robot": chain.name,
             "joints": [joint.name for joint in chain.joints],
@@ -664,42 +656,13 @@ class Calibration(scrutiny.FoundFit, Result):
             "method": self.method,
             "parameters": [_estimate_json(e) for e in self.estimates],
             "combinations": [c.to_json() for c in self.combinations],
-            "covariance": self.covariance.tolist(),
-            "covariance_of": list(self.determined),
-            "correlations": [list(c) for c in self.correlations],
-            "loads_N": measured_loads(observed).tolist(),
+            "covariance": self.covariance,
+            "covariance_of": self.determined,
+            "correlations": self.correlations,
+            "loads_N": measured_loads(observed),
             "n_rows": len(self.residual),
             "n_readings": len(observed.lead),
             "dof": self.dof,
-            **self._errors_json(),
-            "measured_visits": measured_visits(observed).to_json(),
-            "measured_poses": _json(self.shown),
-            "open": _json(self.left),
-            **self._noise_json(),
-            "active": [
-                {"label": a.label, "kind": a.kind, "parameters": list(a.names),
-                 "value": a.value, "multiplier": a.multiplier}
-                for a in self.active
-            ],
-            "prior_share": self.prior_share,
-            "smooth": [entry for part in self.smooth for entry in part.to_json()],
-            "faulty_report": _json(self.faulty_report),
-            "converged": self.converged,
-            "backend": self.model.backend_report(),
-            "outliers": [vars(o) for o in self.outliers],
-            "excluded": [vars(o) for o in self.excluded],
-            "copies": list(self.copies),
-            "influence": [c.to_json() for c in self.influence()],
-            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
-            "autocorrelation": _json(self.autocorrelation),
-            "uncertainty": _json(self.uncertainty()),
-            "warnings": list(self.warnings),
-            "findings": [f.to_json() for f in self.findings],
-        }  # fmt: skip
-
-    def _errors_json(self) -> dict[str, Any]:
-        test = self.test
-        return {
             "residual_rms_um": microns(self.residual_rms),
             "heldout_rms_um": microns(self.heldout_rms),
             "heldout_kept_rms_um": microns(self.heldout_rms),
@@ -713,20 +676,37 @@ class Calibration(scrutiny.FoundFit, Result):
             | {"sentence": headline(self) if self.findings else None},
             "predicted_new_poses_um": _json(self.predicted),
             "load_point_um": microns(self.load_point_error),
-        }
-
-    def _noise_json(self) -> dict[str, Any]:
-        off = self.unsteadiness
-        return {
+            "measured_visits": measured_visits(observed).to_json(),
+            "measured_poses": _json(self.shown),
+            "open": _json(self.left),
             "noise": self.noise.to_json(),
             "tails": None,
             "cell_noise": {
-                "joints_urad": (1e6 * off.joints).tolist(), "drift_um": microns(off.drift),
+                "joints_urad": 1e6 * off.joints, "drift_um": microns(off.drift),
                 "lasting_s": off.lasting, "configuration_um": microns(off.configuration),
                 "tails": None,
             },
-            "residual_summary": _json(self.residual_summary),
-        }  # fmt: skip
+            "residual_summary": self.residual_summary,
+            "active": [
+                {"label": a.label, "kind": a.kind, "parameters": a.names,
+                 "value": a.value, "multiplier": a.multiplier}
+                for a in self.active
+            ],
+            "prior_share": self.prior_share,
+            "smooth": [entry for part in self.smooth for entry in part.to_json()],
+            "faulty_report": _json(self.faulty_report),
+            "converged": self.converged,
+            "backend": self.model.backend_report(),
+            "outliers": self.outliers,
+            "excluded": self.excluded,
+            "copies": self.copies,
+            "influence": self.influence(),
+            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
+            "autocorrelation": self.autocorrelation,
+            "uncertainty": _json(self.uncertainty()),
+            "warnings": self.warnings,
+            "findings": self.findings,
+        })  # fmt: skip
 
 
 def _json(part: Any) -> dict[str, Any] | None:
@@ -734,15 +714,12 @@ def _json(part: Any) -> dict[str, Any] | None:
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:
-    return {
-        "name": e.name, "value": e.value, "unit": e.unit,
-        "std": None if e.std is None else _finite(e.std),
-        "ci95": None if e.ci95 is None else [_finite(v) for v in e.ci95],
-        "dof": None if e.dof is None else _finite(e.dof), "identifiable": e.identifiable,
-        "combined_with": list(e.combined_with), "nominal": e.nominal, "held": e.held,
-        "note": e.note or _endless(e.ci95),
-        **({} if e.limits is None else {"limits95": [_finite(v) for v in e.limits]}),
+    told = {
+        "name": e.name, "value": e.value, "unit": e.unit, "std": e.std, "ci95": e.ci95,
+        "dof": e.dof, "identifiable": e.identifiable, "combined_with": e.combined_with,
+        "nominal": e.nominal, "held": e.held, "note": e.note or _endless(e.ci95),
     }  # fmt: skip
+    return dict(plain(told if e.limits is None else told | {"limits95": e.limits}))
 
 
 def _endless(ci95: tuple[float, float] | None) -> str:
@@ -751,8 +728,3 @@ def _endless(ci95: tuple[float, float] | None) -> str:
         return ""
     ends = [name for name, v in zip(("lower", "upper"), ci95, strict=True) if not np.isfinite(v)]
     return f"the data set no {' or '.join(ends)} limit to it" if ends else ""
-
-
-def _finite(value: float) -> float | None:
-    """None for an interval without an end, and for the infinite dof of a normal distribution."""
-    return value if np.isfinite(value) else None

@@ -7,7 +7,7 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -19,9 +19,9 @@ from elastocal.engine.mixed import Standardised
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.options import SmoothPart
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
-from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
+from elastocal.identification.residuals import held_out_residual, left_out, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
-from elastocal.identification.weighted_problem import Weights, least_norm, same_size, weights_for
+from elastocal.identification.weighted_problem import Weights, least_norm, weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -87,12 +87,6 @@ class Influence:
     moved: str
     by: float
 
-    def to_json(self) -> dict[str, Any]:
-        return {
-            k: None if isinstance(v, float) and not np.isfinite(v) else v
-            for k, v in vars(self).items()
-        }
-
 
 def influence(fit: FoundFit) -> tuple[Influence, ...]:
     observed, p = fit.observations, len(fit.columns)
@@ -106,12 +100,10 @@ def influence(fit: FoundFit) -> tuple[Influence, ...]:
     std = np.sqrt(s2 * np.diag(back @ back.T))
     labels = np.repeat(observed.configuration, observed.size)
     found: list[tuple[Any, ...]] = []
-    for rows in same_size(labels):
-        Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
-        moved, alone = moved_by(Qc @ Qt, e[rows])
-        move = (Qt @ moved[..., None])[..., 0] @ back.T
+    for rows, moved, alone in left_out(Q[: len(labels)], e[: len(labels)], labels):
+        Qc, move = Q[rows], moved @ back.T
         # A configuration that alone determines something moves that without end.
-        move[alone] = np.abs(back @ Qt[alone]).max(axis=2)
+        move[alone] = np.abs(back @ Qc[alone].transpose(0, 2, 1)).max(axis=2)
         shift = np.divide(np.abs(move), std, out=np.zeros(move.shape), where=std > 0)
         by, cook = shift.max(axis=1), ((move @ information) * move).sum(axis=1)
         cook = cook / (p * s2) if s2 > 0 else 0 * cook
@@ -148,9 +140,6 @@ class Autocorrelation:
     band: float
     visits: int
     by: str
-
-    def to_json(self) -> dict[str, Any]:
-        return asdict(self) | {"correlations": list(self.correlations)}
 
 
 def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation | None:

@@ -554,8 +554,7 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     text += noise if turned else f"{say.length(finding.error)} ({noise})"
     if beyond < n:
         text += f", {beyond or 'none'} of them beyond the noise"
-    names = () if result.faulty_report is None else result.faulty_report.names
-    name = printable(names[finding.column]) if names else "a parameter"
+    name = printable(finding.moves_most)
     if not math.isfinite(finding.influence):
         return f"{text}; the other readings leave {name} undetermined."
     moves = "in the fit they move" if bends else "fitted along they would move"
