@@ -37,7 +37,7 @@ def test_columns_by_entry_and_drive_are_those_of_the_model_with_the_effect(
     name: str, where: str
 ) -> None:
     nominal = Nominal(COMPLIANCE, base_rotation=TILTED, settings=SETTINGS)
-    chain, cell = kr270_chain(), kr270_cell(["base_frame"], nominal=nominal)
+    chain, cell = kr270_chain(), kr270_cell(["base_frame", "marker_position"], nominal=nominal)
     model, effect = Model.assembled(chain, cell), CATALOGUE[name]
     table = with_moves(random_table(chain, 12, seed=5))
     table = replace(table, position=model.predict(table).reshape(-1, 3), distance=None)

@@ -30,6 +30,15 @@ TWO = stick("zz", (1.0, 1.0))
         ("joint_hardening", "hardening", 1e-10, lambda t: 1e-10 * t**3),
         ("backlash", "backlash", BETA, lambda t: BETA / 2 * np.tanh(t)),
         ("hysteresis", "hysteresis_per_torque", 1e-6, lambda t: 1e-6 * (np.hypot(t, 1) - 1)),
+        ("torque_response", "torque_response_2", BETA, lambda t: BETA * (t / 100) ** 3),
+        ("torque_response", "torque_response_3", BETA, lambda t: BETA * np.tanh(t)),
+        ("approach_response", "approach_response_1", BETA, lambda t: BETA + 0 * t),
+        (
+            "approach_response",
+            "approach_response_2",
+            BETA,
+            lambda t: BETA / 100 * (np.hypot(t, 1) - 1),
+        ),
     ],
 )
 def test_measured_torques_drive_the_same_laws(effect, key, value, law) -> None:
@@ -40,6 +49,23 @@ def test_measured_torques_drive_the_same_laws(effect, key, value, law) -> None:
     assert m.deflection(table).shape[1] == 0
     y = positions(m, table, **{key: value})[:, 1]
     np.testing.assert_allclose(y, np.sin(law(torque)), atol=1e-16)
+
+
+def test_without_a_name_a_base_tilts_as_its_springs_do() -> None:
+    table = rows(np.linspace(-2, 2, 5), force=(30.0, -20.0, -400.0))
+    known, nameless = model(stick("z"), "base_compliance"), model(stick("z"), "load_response:base")
+    tilted = positions(known, table, tilt_compliance_x=1e-6, tilt_compliance_y=2e-6)
+    np.testing.assert_allclose(
+        positions(nameless, table, load_response_rx=1e-3, load_response_ry=2e-3), tilted
+    )
+    assert np.ptp(tilted[:, 2]) > 1e-4
+
+
+def test_a_step_without_a_name_moves_what_was_read_later() -> None:
+    steps = {"marker:tip": {"step_time_s": 60.0}}
+    m = model(stick("z"), "marker_position", "residual_step:marker:tip", settings=steps)
+    moved = positions(m, rows(np.zeros(3), time=[0.0, 59.0, 60.0]), step_2=BETA)
+    np.testing.assert_allclose(moved[:, 1], [0.0, 0.0, BETA])
 
 
 def test_a_rated_torque_comes_from_compliance_weights_or_the_strongest_joint() -> None:

@@ -458,9 +458,10 @@ class SumAnswer:
 
     @property
     def without_names(self) -> tuple[FoundEffect, ...]:
-        """Curves and fields, which correct the arm though the verdict knows no name for them."""
-        curves = (f for f in self.effects if f.effect == JointCurve.name)
-        return (*curves, *self.fields)
+        """Curves, lines and what has no name, which correct the arm though the verdict knows no
+        cause of them."""
+        gears = (f for f in self.effects if f.effect in (JointCurve.name, GearSpectrum.name))
+        return (*gears, *self.fields)
 
     @property
     def unnamed_probability(self) -> float:

@@ -17,12 +17,12 @@ from elastocal.diagnosis.component_families import (
     catalogue_components,
     drifts,
     family_of,
-    fields,
     joint_curves,
     line_families,
     sharpened,
     shorter,
     with_scatter,
+    without_a_name,
 )
 from elastocal.diagnosis.components import (
     SOME,
@@ -56,7 +56,7 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
-from elastocal.model.effects.base import index
+from elastocal.model.effects.base import index, turning_joints
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.loads import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve, ResidualField
@@ -73,15 +73,15 @@ MOST_FIELDS = 4  # that one search adds
 
 
 def search_components(
-    dataset: DiagnosisData, chosen: ModelSet, without: Container[str] = (),
+    dataset: DiagnosisData, chosen: ModelSet, open_: bool, without: Container[str] = (),
     progress: Progress = lambda message: None,
 ) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]] | None:  # fmt: skip
     """The most probable sum beside the fitted parameters, the data with all its columns, and what
     may be there as well though these data do not show it.
 
     `chosen` is what the forward search found: its searched constants are tried as they are, the
-    effects `without` not.  None where it has names and no sum beside it promises to be CLEARLY
-    better.
+    effects `without` not.  None where it leaves nothing `open_` and no sum beside it promises to be
+    CLEARLY better.
     """
     full = _with_together(dataset, without)
     for weighed in (False, True):
@@ -95,7 +95,7 @@ def search_components(
         curves = [] if JointCurve.name in without else list(joint_curves(full))
         others = _first(every)
         tried = [*curves, *others]  # one object, by which a sum knows what completed it
-        if not (weighed or chosen.unknown or promised(chosen, tried) > PROMISING):
+        if not (weighed or open_ or promised(chosen, tried) > PROMISING):
             return None
         progress(f"sizes of {len(tried)} components at once")
         found = fit_sum(data, tried, instrument)
@@ -116,8 +116,8 @@ def search_components(
         again = with_returned(_with_lines(full, again), every)
     found = again
     for _ in range(0 if ResidualField.name in without else FIELD_SEARCHES):
-        progress("fields beside the components")
-        wider = _wider(found, fields(full, found, MOST_FIELDS))
+        progress("what has no name beside the components")
+        wider = _wider(found, without_a_name(full, found, MOST_FIELDS))
         if wider is found:
             break
         found = wider
@@ -591,8 +591,18 @@ def _kinds_that_show(
 def _with_together(dataset: DiagnosisData, without: Container[str]) -> DiagnosisData:
     """The data with the effects that are judged in the sum alone, whose columns they have."""
     base, kept = dataset.base, list(dataset.hypotheses)
-    if GearSpectrum.name in without:  # lines are sought as ripples are
+    # Lines are sought as ripples are, whether or not one may be named.
+    if GearSpectrum.name in without:
         kept = [h for h in kept if not isinstance(h.effect, GearRipple)]
+    elif GearRipple.name in without:
+        chain, cell, ripple = base.model.chain, base.model.cell, GearRipple()
+        kept += [
+            Hypothesis(
+                ripple, where, ripple.parameters(where, chain, cell),
+                ripple.settings(where, chain, cell),
+            )
+            for where in turning_joints(chain)
+        ]  # fmt: skip
     more = judged_together(base.model, base.observed.table, without)
     return dataset.changed(hypotheses=(*kept, *more))
 

@@ -41,7 +41,7 @@ from elastocal.diagnosis.noise_floor import (
 )
 from elastocal.engine.mixed import Products, Standardised, climb
 from elastocal.model.effects.base import Effect
-from elastocal.model.effects.smooth import ResidualField, Waves
+from elastocal.model.effects.smooth import Waves
 from elastocal.units import Array, IntArray
 
 Family = Literal[
@@ -87,7 +87,7 @@ class Component:
 
     @property
     def named(self) -> bool:
-        return not isinstance(self.effect, ResidualField)
+        return not self.effect.nameless
 
     @property
     def width(self) -> int:

@@ -263,7 +263,7 @@ def _diagnosed(
     progress("confirming")
     tests = structure_tests(found.first)
     found = found if whole else search.settled(found)
-    judged, fields = judge(found), fields if found.chosen.unknown else ()
+    judged = judge(found)
     answer = whole or FewAnswer.of(dataset, found, judged, fields, rng)
     answers = _pieces(answer, dataset, found.nothing.noise, tests)
     added = (*answers["effects"], *answers["slight"])
@@ -314,13 +314,15 @@ def _sum_of_all(
     """The sum of all that may act at once, None where a few causes are the better answer, by how
     many nats it is more probable than nothing, and what has no name in it."""
     progress("judging all that may act at once")
-    if (searched := search_components(dataset, found.chosen, options.without, progress)) is None:
+    few = FewAnswer.of(dataset, found, judge(found), (), rng)
+    open_, without = few.verdict == "unknown_effect" or few.supported.open, options.without
+    if (searched := search_components(dataset, found.chosen, open_, without, progress)) is None:
         return None, 0.0, ()
     full, total, hidden = searched
     answer, nothing = SumAnswer(dataset, full, total, hidden, rng).decided, found.nothing.score
     over = compared_score(full, total) - nothing
     if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
-        return None, 0.0, answer.without_names if found.chosen.unknown else ()
+        return None, 0.0, answer.without_names
     return answer, over, ()
 
 
@@ -339,6 +341,7 @@ def _pieces(
     location = answer.location(tests)
     if location is None and gap.open:
         location = answer.supported.location(tests)
+    unknown = answer.verdict == "unknown_effect"
     return {
         "verdict": "unknown_effect" if gap.open else answer.verdict,
         "gap": gap,
@@ -351,7 +354,8 @@ def _pieces(
         "curves": answer.curves(),
         "components": answer.components,
         "groups": answer.groups,
-        "fields": answer.fields,
+        # Beside few causes that explain it all, corrections without a name are not needed.
+        "fields": answer.fields if gap.open or unknown or answer.groups else (),
         "slight": answer.slight,
     }
 

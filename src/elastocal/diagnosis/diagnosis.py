@@ -352,7 +352,7 @@ class Diagnosis(Result):
         untested: Effects that the data cannot test, and what to record so that they can.
         components: What errors of each kind at each place contribute, where many act at once.
         groups: The same by effect, at all its places: one finding each.
-        fields: Smooth corrections without a name, which explain nothing.
+        fields: Corrections without a name, which explain nothing.
         slight: Of many causes those that move the markers by less than a hundredth of the gap's
             rms, or perhaps not at all: they correct the arm, and are no findings.
         findings: The judgements about it, the verdict first, each with its numbers and what to do.

@@ -35,7 +35,7 @@ from elastocal.model.effects.catalogue import CATALOGUE, set_constants
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import BY_ORDER, Backlash, GearSpectrum, Hysteresis
 from elastocal.model.effects.placements import ThermalExpansion
-from elastocal.model.effects.smooth import JointCurve, ResidualField
+from elastocal.model.effects.smooth import JointCurve
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, rows_needed, subset
@@ -181,7 +181,7 @@ def judged_together(
         for effect in CATALOGUE.values()
         if effect.together
         and effect.name not in without
-        and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
+        and not (effect.nameless or isinstance(effect, JointCurve | GearSpectrum))
         and all(recorded(table, need) for need in effect.needed(cell))
         and not (effect.unless and recorded(table, effect.unless))
         for where in effect.places(chain, cell)

@@ -265,6 +265,11 @@ class SupportedFloor:
     joints: Array
     instrument: float
 
+    @property
+    def open(self) -> bool:
+        """Whether more is unexplained than is noise."""
+        return self.unexplained > self.noise
+
     def location(self, tests: Sequence[StructureTest]) -> Location | None:
         """Where what is unexplained lies, each joint by its share; None where not in joints."""
         if self.joints.sum() <= self.instrument:

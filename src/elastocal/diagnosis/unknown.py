@@ -109,7 +109,7 @@ def _of_stiffness(
 
 def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Array]]:
     """Places that the load bends, the base and each link's end, with the entry that moves them and
-    the load's force and moment (C, v, 3) there along their axes, largest 1.
+    the load's force and moment (C, v, 3) there along the entry's axes.
 
     A frame moved by e moves every marker by R e, so the columns of its frame are R; and turned
     about e they move a marker by R e × lever, whose product with the force is the moment about e,
@@ -125,10 +125,7 @@ def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Arr
             return
         wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
         wrench = dataset.places.gather(wrench[dataset.lead])
-        parts = wrench[:, :, :3], wrench[:, :, 3:]
-        force, moment = (part / max(np.abs(part).max(), 1e-12) for part in parts)
-        # Beyond the last link there is only the tool and its markers.
-        yield "tool" if place == f"link{n}" else place, key, force, moment
+        yield place, key, wrench[:, :, :3], wrench[:, :, 3:]
 
 
 def waves(x: Array, present: NDArray[np.bool_], count: int) -> Array:
@@ -240,11 +237,15 @@ def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
 
 
 def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
-    for where, key, force, moment in wrenches(dataset):
+    last = f"link{dataset.table.q.shape[1]}"
+    for place, key, *wrench in wrenches(dataset):
+        # Beyond the last link there is only the tool and its markers.
+        where = "tool" if place == last else place
+        force, moment = (part / max(np.abs(part).max(), 1e-12) * MOTION for part in wrench)
         direction = np.zeros((*force.shape[:2], 6, 18))
         for a in range(3):
-            direction[:, :, a, 3 * a : 3 * a + 3] = MOTION * force
-            direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = MOTION * moment
+            direction[:, :, a, 3 * a : 3 * a + 3] = force
+            direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = moment
         yield Generic("force", f"force at {where}", where, "compliance", key, direction)
 
 

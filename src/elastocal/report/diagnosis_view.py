@@ -68,7 +68,7 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     yield cause_table(d)
     yield added_parameter_table(d)
     yield say.Fold("Place by place", lambda: [place_table(d)], printed=True)
-    yield say.Fold("Smooth corrections", lambda: _smooth(d), printed=True)
+    yield say.Fold("Corrections without a name", lambda: _corrections(d), printed=True)
     yield say.Fold("Error budget", lambda: [gap_table(d)], printed=True)
     best = candidate_table(d)
     yield say.Fold("Candidates", lambda: [best], printed=True)
@@ -561,7 +561,7 @@ def curve_span(curve: Curve) -> str:
 # Corrections that have no name.
 
 
-def _smooth(d: Diagnosis) -> Iterator[say.Block]:
+def _corrections(d: Diagnosis) -> Iterator[say.Block]:
     if d.slight:
         yield say.Sentence(
             f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "
@@ -569,10 +569,18 @@ def _smooth(d: Diagnosis) -> Iterator[say.Block]:
         )
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
-    yield say.ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=(
-        "Smooth functions without a physical name; they hold where the arm was measured: size "
-        "(standard deviation) and the length over which they change."
+    yield say.ShownTable(heads, rows, (0, 1), title="Corrections without a name", note=(
+        "Functions without a physical name; they hold where the arm was measured: size (standard "
+        "deviation) and the length over which smooth ones change."
     ))  # fmt: skip
+
+
+# What corrections that are no smooth functions follow, by the setting that is their size.
+FOLLOWED = {
+    "spectrum_size_rad": "its own angle, by lines", "step_size": "the time, by a step",
+    "torque_response_rad": "its torque", "approach_response_rad": "its last motion",
+    "load_response_size": "the load's force and moment",
+}  # fmt: skip
 
 
 def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
@@ -582,14 +590,15 @@ def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
     unit = {"joint": "mrad", "marker": "mm"}.get(kind, "mm, mrad")
     for key, value in f.settings.items():
         name, _, rest = key.rpartition("size")
-        if not name or rest not in ("", "_rad"):
+        if key not in FOLLOWED and (not name or rest not in ("", "_rad")):
             continue
         over = f.settings.get(f"{name}length{rest}", math.nan)
         of = name.rstrip("_").partition("_")[2]
         timed = of == "time"
+        angle = f"the angle of {say.place(of)}" if of else "its own angle"
         yield (
             say.place(f.where),
-            "the time" if timed else f"the angle of {say.place(of)}" if of else "its own angle",
+            FOLLOWED.get(key, "the time" if timed else angle),
             f"{say.significant(value * 1e3, 2)} {unit}",
             say.setting_value("over_s" if timed else "over_rad", over)
             if math.isfinite(over)

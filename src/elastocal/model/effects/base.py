@@ -137,6 +137,8 @@ class Effect:
     formats: ClassVar[tuple[Format, ...]] = ()
     # One of many causes at once: a diagnosis judges it only in the sum of all components.
     together: ClassVar[bool] = False
+    # It corrects the arm and names no cause.
+    nameless: ClassVar[bool] = False
     # A column of the table that says better what it takes from elsewhere.
     unless: ClassVar[str] = ""
     # The setting that is the prior size of its shrunk parameters.

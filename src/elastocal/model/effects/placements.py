@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -263,7 +264,7 @@ class WarmUp(DrivenEffect):
     of heat that is switched on at t = 0, the table's time.
     """
 
-    constants = (TIME_CONSTANT,)
+    constants: ClassVar[tuple[Setting, ...]] = (TIME_CONSTANT,)
     needs = ("time",)
 
     def course(self, arm: Arm, p: Symbols) -> ca.SX:

@@ -191,6 +191,21 @@ class JointCurve(SmoothEffect):
         return (smooth_function(place, {"curve": "rad"}, *stated),)
 
 
+def every_place(chain: Chain, cell: Cell) -> tuple[str, ...]:
+    """Places that may move without a known cause."""
+    markers = tuple(f"marker:{name}" for name in cell.tool.markers)
+    return (*joints(chain), *links(chain), "base", *markers)
+
+
+def motion_of(place: str) -> Entry:
+    """How such a place moves."""
+    if place.startswith("joint"):
+        return JointMotion()
+    if place.startswith("link"):
+        return LinkFrame()
+    return BaseMotion() if place == "base" else MarkerMotion()
+
+
 class ResidualField(SmoothEffect):
     """A place moves smoothly with joint angles or time, and nobody knows why.
 
@@ -203,20 +218,16 @@ class ResidualField(SmoothEffect):
     """
 
     name = "residual_field"
+    nameless = True
     stage = "geometry"
     family = "pose"
     entry = JointMotion()  # at a joint; see `entry_at`
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        markers = tuple(f"marker:{name}" for name in cell.tool.markers)
-        return (*joints(chain), *links(chain), "base", *markers)
+        return every_place(chain, cell)
 
     def entry_at(self, place: str) -> Entry:
-        if place.startswith("joint"):
-            return JointMotion()
-        if place.startswith("link"):
-            return LinkFrame()
-        return BaseMotion() if place == "base" else MarkerMotion()
+        return motion_of(place)
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         found: list[Setting] = []
