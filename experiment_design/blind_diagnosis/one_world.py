@@ -17,7 +17,7 @@ from afterwards import distances, plain_fit, true_reduction
 from draw import MINUTES_PER_VISIT, World, draw_poses, draw_visits
 from score import Record, claims, shortened, truths
 from suites import Task
-from whole_score import judged
+from whole_score import NEW, judged, tested
 from worker import Worker
 from world import Visits
 from world_files import write_table, write_world
@@ -59,6 +59,9 @@ def diagnose_world(task: Task, worker: Worker, origin: dict[str, Any]) -> Record
         }
         if task.asked.distance or task.asked.reduction:
             record |= _afterwards(task, world, record, visible, sealed)
+        if task.asked.left_out and answer is not None:
+            shutil.copyfile(sealed / "fresh.csv", visible / NEW)
+            record["dearer"] = _dearer(visible, worker)
         if task.asked.whole:
             fresh = sealed / "fresh.csv"
             record["whole"] = judged(
@@ -83,6 +86,16 @@ def _afterwards(
     if task.asked.reduction and answer is not None and found == truths(record["truth"]):
         out["reduction"] = true_reduction(base, answer, visible / CELL, sealed / "fresh.csv")
     return out
+
+
+def _dearer(visible: Path, worker: Worker) -> float | None:
+    """The error at new poses of the cell that a diagnosis without the effect wrote, over that of
+    one with the whole catalogue."""
+    if worker.diagnose(visible, "-o", "all.json", "--cell-out", "all.toml").exit != 0:
+        return None
+    cells = (CELL, "all.toml")
+    without, whole = (tested(visible, lambda *a: worker.run(visible, *a).exit, c) for c in cells)
+    return without / whole if without and whole else None
 
 
 # The poses that `diagnose --plan` proposes, measured by the simulator, against random ones.

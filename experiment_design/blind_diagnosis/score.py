@@ -63,7 +63,7 @@ def judged(r: Json) -> Record:
         "held": low <= reduction <= high,
         "promised": extra["probability_after"] if extra and r.get("extra") else np.nan,
         "separable": extra["separable"] if extra else None,
-        "whole": r.get("whole"),
+        "whole": r.get("whole"), "dearer": r.get("dearer"),
     } | {
         way: told_apart(truth, (extra or {}).get("inseparable", ()), again)
         for way, again in (r.get("extra") or {}).items() if way != "n_poses"

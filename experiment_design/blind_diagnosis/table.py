@@ -30,6 +30,7 @@ NEARLY_CERTAIN = 0.97
 ALLOWED_SECONDS = 10.0
 DISTANCES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, np.inf)
 BINS = 10  # of stated probabilities
+DEARER = 1.1
 UNANSWERABLE = ("outside", "left_out", "whole", "whole300")
 Bar = float | None
 Line = tuple[str, str, str, str, object, str]  # worlds, measure, bar, measured, n, met
@@ -108,6 +109,9 @@ def lines(f: pd.DataFrame) -> Iterator[Line]:
     yield from _unknown("outside the catalogue, × 2", suite["outside"])
     yield from _unknown("taken out of the catalogue, × 2", left_out)
     yield from _unknown("… that nothing left in it imitates (d ≥ 5)", far)
+    dearer = left_out["dearer"].dropna().astype(float)
+    told = f"error at new poses ≤ {DEARER:g} of that with the effect (median {dearer.median():.3g})"
+    yield share("taken out of the catalogue, × 2", told, dearer <= DEARER)
     yield from _probabilities(f[~f["suite"].isin(UNANSWERABLE)])
     for poses, name in ((FEW_POSES, "catalogue"), (MANY_POSES, "catalogue300")):
         yield from _reduction(f"shrinkage, {poses} poses", suite[name])

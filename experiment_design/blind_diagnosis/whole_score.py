@@ -43,7 +43,11 @@ ABSENT = (
     "payload_error", "thermal_expansion", "encoder_jump", "frame_jump", "marker_slip",
     "tracker_distortion", "torque_coupling", "torque_tilt",
 )  # fmt: skip
-NAMELESS = ("joint_curve", "residual_field")  # correct the arm, explain nothing
+# They correct the arm and explain nothing.
+NAMELESS = (
+    "joint_curve", "residual_field", "residual_step", "torque_response", "approach_response",
+    "load_response",
+)  # fmt: skip
 
 
 def judged(
@@ -71,8 +75,8 @@ def judged(
     covered = [p for key in stated for p in matching(gap, key)]
     strengths = {part: gap.strength([part]) for part in gap.parts}
     return {
-        "geometry_mm": _tested(visible, command, "cell.toml"),
-        "tool_mm": None if answer is None else _tested(visible, command, extended),
+        "geometry_mm": tested(visible, command, "cell.toml"),
+        "tool_mm": None if answer is None else tested(visible, command, extended),
         "oracle_mm": 1e3 * oracle_error(sights),
         "gap_um": 1e6 * gap.rms,
         "strengths": {":".join(part): size for part, size in strengths.items()},
@@ -97,7 +101,8 @@ def over_oracle(whole: Json, key: str = "tool_mm") -> float:
     return np.inf if whole[key] is None else float(whole[key] / whole["oracle_mm"])
 
 
-def _tested(visible: Path, command: Command, cell: str) -> float | None:
+def tested(visible: Path, command: Command, cell: str) -> float | None:
+    """Rms error in mm of the identified `cell` at the NEW poses in the visible folder."""
     if command("identify", cell, "data.csv", "--test", NEW, "-o", RESULT) != 0:
         return None
     result = json.loads((visible / RESULT).read_text(encoding="utf-8"))

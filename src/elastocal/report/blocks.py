@@ -551,7 +551,7 @@ def setting_value(key: str, value: float) -> str:
 
 
 def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
-    """Per effect, in the catalogue's order: name, stage, what it is, places, parameters.
+    """Per effect, stage by stage in the catalogue's order: name, what it is, places, parameters.
 
     Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
     parameter's typical size is null where only the readings say it.
@@ -560,7 +560,8 @@ def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
     chain = load_chain(given)
     given = numbered(given, chain)
     on, entries = {choice.name for choice in given.model.effects}, []
-    for effect in CATALOGUE.values():
+    stages = list(dict.fromkeys(effect.stage for effect in CATALOGUE.values()))
+    for effect in sorted(CATALOGUE.values(), key=lambda effect: stages.index(effect.stage)):
         where = effect.places(chain, given)
         first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
         try:
