@@ -8,10 +8,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.main import app
 from elastocal.compensation.compensate import read_targets
 from elastocal.errors import ElastocalError
 from elastocal.files import read_json
@@ -78,22 +76,3 @@ def test_time_grows_as_the_text_does(reader: str, tmp_path: Path) -> None:
         if costs[1] > MOST * costs[0]:  # a second look: another program had the processor
             costs = [max(cost(read, path, text), LEAST) for text in texts]
         assert costs[1] <= MOST * costs[0], (beginning, piece, costs)
-
-
-def test_a_mappings_own_expression_has_its_time(tmp_path: Path) -> None:
-    name = "a" * 60 + "!"
-    (tmp_path / "points.csv").write_text(
-        f"name,q1,q2,q3,q4,q5,q6,x,y,z\n{name},1,2,3,4,5,6,1,2,3\n"
-    )
-    (tmp_path / "map.toml").write_text(
-        '[[source]]\nrole = "both"\n[source.text]\ndelimiter = ","\n[source.columns]\n'
-        'name = "name"\nx_mm = "x"\n"q#_deg" = "q#"\n'
-        'y_mm = "y"\nz_mm = "z"\n[source.names]\npattern = \'(?P<configuration>^(a+)+$)\'\n'
-    )
-    words = ["import", "points.csv", "--map", "map.toml", "--preview"]
-    begun = time.process_time()
-    done = CliRunner().invoke(
-        app, [str(tmp_path / word) if "." in word else word for word in words]
-    )
-    assert time.process_time() - begun < 8
-    assert done.exit_code == 2 and "takes too long" in done.stderr and "map.toml" in done.stderr

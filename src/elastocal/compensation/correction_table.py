@@ -80,8 +80,9 @@ class CorrectionTable:
     warnings: tuple[str, ...] = ()
 
 
-def _counts(counts: tuple[int, ...], n: int, what: str) -> tuple[int, ...]:
-    told = ",".join(map(str, counts))
+def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[Array, ...]:
+    """`counts` levels (one number for all) from low to high (n,); of one level the middle."""
+    n, told = len(low), ",".join(map(str, counts))
     if len(counts) not in (1, n) or min(counts) < 1:
         raise InputError(f"{option('grid')} takes {what}, 1 or more; found '{told}'")
     counts = counts * n if len(counts) == 1 else counts
@@ -91,11 +92,10 @@ def _counts(counts: tuple[int, ...], n: int, what: str) -> tuple[int, ...]:
             f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the "
             "most; give fewer levels to the joints that matter least (1 holds one in the middle)"
         )
-    return counts
-
-
-def _levels(low: float, high: float, count: int) -> Array:
-    return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
+    return tuple(
+        np.linspace(a, b, k) if k > 1 else np.array([(a + b) / 2])
+        for a, b, k in zip(low, high, counts, strict=True)
+    )
 
 
 def correction_table(
@@ -180,11 +180,9 @@ def _mostly_inexact(
 
 
 def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Targets:
-    if grid.joints:
-        return targets_at(option("table"), None, None, "base", force, q=points)
-    rotation = grid.rotation
-    turned = None if rotation is None else np.broadcast_to(rotation, (len(points), 3, 3))
-    return targets_at(option("table"), points, turned, "base", force)
+    turned = None if grid.rotation is None else np.tile(grid.rotation, (len(points), 1, 1))
+    place, q = (None, points) if grid.joints else (points, None)
+    return targets_at(option("table"), place, turned, "base", force, q)
 
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
@@ -295,15 +293,12 @@ def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
 def grid_of(
     arm: CalibratedArm, counts: tuple[int, ...], box: str | None, rotation: str | None
 ) -> CorrectionGrid:
-    """`counts` levels (one for all) of each joint over its limits, or of x, y and z in a box; one
-    level: the middle."""
+    """Levels of each joint over its limits, or of x, y and z in a box."""
     chain = arm.model.chain
     if box is None:
-        n = chain.n_joints
-        counts = _counts(counts, n, f"one number, or one per joint ({n})")
         ends = finite_ranges(chain, *joint_limits(arm.model.cell, chain))
-        axes = tuple(_levels(a, b, k) for a, b, k in zip(*ends, counts, strict=True))
-        return CorrectionGrid(axes, True)
+        what = f"one number, or one per joint ({chain.n_joints})"
+        return CorrectionGrid(_axes(*ends, counts, what), True)
     corners = numbers(option("box"), box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
     lower, upper = corners[:3], corners[3:]
     turned = None
@@ -316,15 +311,14 @@ def grid_of(
         raise InputError(
             f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
         )
-    counts = _counts(counts, 3, "one number, or one each for x, y and z")
-    flat = [name for name, a, b, k in zip("xyz", lower, upper, counts, strict=True)
-            if k > 1 and b - a < LEAST_STEP * k]  # fmt: skip
+    axes = _axes(lower, upper, counts, "one number, or one each for x, y and z")
+    flat = [name for name, axis in zip("xyz", axes, strict=True)
+            if len(axis) > 1 and axis[-1] - axis[0] < LEAST_STEP * len(axis)]  # fmt: skip
     if flat:
         raise InputError(
             f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
             f"level there by {option('grid')}"
         )
-    axes = tuple(_levels(a, b, k) for a, b, k in zip(lower, upper, counts, strict=True))
     return CorrectionGrid(axes, False, turned)
 
 

@@ -343,7 +343,8 @@ def corrected_mjcf(
     text.lengthen_keys(sprung)
     told = text.let_act() if pieces.springs else []
     told += text.correct_flange(frames)
-    text.correct_masses()
+    if pieces.masses:
+        text.correct_masses()
     text.insert_in(text.tags[0], f"\n  {comment(note)}")
     return text.result(), told
 
@@ -381,12 +382,8 @@ class _MjcfText(XmlFile):
         self.set(tag, placed_body(None, T), ORIENTATIONS[1:])
 
     def move(self, body: int, error: Array) -> None:
-        """T ← T · error for the body's own attributes, whatever frames stand around it, and in
-        MuJoCo's model of the file."""
+        """T ← T · error for the body's own attributes, whatever frames stand around it."""
         tag, model = self.bodies[body], self.model
-        own = transform(model.body_pos[body], model.body_quat[body])
-        for name, value in placed_body(None, own @ error).items():
-            getattr(model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
         if tag.above is not None and tag.above.name == "frame":
             # What its attributes say, as MuJoCo understands them.
             kept = {k: v for k, v in tag.stated.items() if k in ("pos", *ORIENTATIONS)}
@@ -394,9 +391,8 @@ class _MjcfText(XmlFile):
             how = {k: v for k, v in stated if k in ("angle", "eulerseq")}
             world = element("worldbody", {}, element("body", kept))
             alone = element("mujoco", {}, element("compiler", how), world)
-            model = import_mujoco().MjModel.from_xml_string(alone)
-            own = transform(model.body_pos[1], model.body_quat[1])
-        self.place(tag, own @ error)
+            model, body = import_mujoco().MjModel.from_xml_string(alone), 1
+        self.place(tag, transform(model.body_pos[body], model.body_quat[body]) @ error)
 
     def add_springs(self, i: int, j: int) -> int:
         """Put the springs between link i and joint i before the joint; returns how many."""
@@ -496,8 +492,9 @@ class _MjcfText(XmlFile):
         model = self.model
         told = [tag.stated.get("inertiafromgeom") for tag in self.anywhere("compiler")]
         from_geoms = "true" in [value for value in told if value][-1:]
-        own = self.arm.anew().chain.masses
-        for j, old, new in zip(self.arm.joints, own, self.pieces.masses, strict=False):
+        now = MjcfArm.read(self.path, self.arm.base, self.arm.flange, self.result())
+        both = zip(self.arm.joints, now.chain.masses, self.pieces.masses, strict=False)
+        for j, old, new in both:
             mass = new.mass - old.mass
             moment = new.mass * new.com - old.mass * old.com
             if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:

@@ -267,18 +267,12 @@ def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Ar
 # Below this angle between two axes (rad) the foot of their common normal runs away with the
 # smallest error, a/α away; Hayati's parameter keeps it in place.
 NEARLY_PARALLEL = 0.02
-ARE_ANGLES = np.array([1, 0, 0, 1, 1])
+ARE_ANGLES, TRAILING = np.array([1, 0, 0, 1, 1]), np.array([0, 0, 1, 1, 1])
 NO_ROW = np.zeros(5)  # a row is θ, d, a, α and Hayati's β, in rad and m
 
 
-def trailing(row: Array) -> Array:
-    """Tx(a) Rx(α) Ry(β) (4, 4)."""
-    _, _, a, alpha, beta = row.tolist()
-    return dh.shift(dh.X, a) @ dh.turn(dh.X, alpha) @ dh.turn(dh.Y, beta)
-
-
 def transform(row: Array) -> Array:
-    return dh.turn(dh.Z, float(row[0])) @ dh.shift(dh.Z, float(row[1])) @ trailing(row)
+    return np.matmul(*dh.link(*row.tolist()))
 
 
 def turned_as(row: Array, other: Array) -> Array:
@@ -429,7 +423,7 @@ def _decompose(
         old = like[i]
         if last and keep_last and old is not None:
             # The turn about and the shift along the axis that bring it closest to T.
-            R = T[:3, :3] @ trailing(old)[:3, :3].T
+            R = T[:3, :3] @ transform(old * TRAILING)[:3, :3].T
             theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
             row = turned_as(np.array([theta, T[2, 3], *old[2:]]), old)
             carried = np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)

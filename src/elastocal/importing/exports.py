@@ -7,11 +7,9 @@ import codecs
 import csv
 import math
 import re
-import signal
-import threading
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -99,9 +97,8 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
             f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
             "that is the unit so"
         )
-    with bounded(where, comments):
-        found = (match["unit"] for text in comments if (match := expression.search(text)))
-        return next((unit for unit in found if unit and known_unit(unit)), None)
+    found = (match["unit"] for text in comments if (match := expression.search(text)))
+    return next((unit for unit in found if unit and known_unit(unit)), None)
 
 
 def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
@@ -110,36 +107,6 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
     except re.error as error:
         told = f"{where}: {key} = {quoted(pattern)} is no regular expression: {error}"
         raise InputError(told) from None
-
-
-PATIENCE = 2.0  # s of processor time; a letter and a text have theirs beside it
-PER_LETTER, PER_TEXT = 2e-6, 2e-5  # s, twenty times what such expressions take
-
-
-@contextmanager
-def bounded(where: str, texts: Sequence[str]) -> Iterator[None]:
-    """In a `with` block, expressions of a mapping, which may be exponential, are looked for in
-    these texts, for no longer than any number of them may take; in the main thread, and where the
-    system has a timer."""
-    main = threading.current_thread() is threading.main_thread()
-    if not (texts and main and hasattr(signal, "SIGVTALRM")):
-        yield
-        return
-
-    def late(number: int, frame: object) -> None:
-        raise InputError(
-            f"{where}: an expression of the mapping takes too long; write it without repeats of "
-            "repeats, as (a+)+"
-        )
-
-    before = signal.signal(signal.SIGVTALRM, late)
-    allowed = PATIENCE + PER_TEXT * len(texts) + PER_LETTER * sum(map(len, texts))
-    signal.setitimer(signal.ITIMER_VIRTUAL, allowed)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
-        signal.signal(signal.SIGVTALRM, before)
 
 
 @dataclass(frozen=True)
@@ -174,15 +141,14 @@ def table_rows(
     marks = tuple(settings.comments)
     skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
-    with bounded(source, lines if skip else ()):
-        for number, line in enumerate(lines, start=1):
-            bare = line.strip()
-            if marks and bare.startswith(marks):
-                comments.append((number, bare))
-            elif bare and skip is not None and skip.search(line):
-                ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
-            elif bare:
-                content.append((number, line))
+    for number, line in enumerate(lines, start=1):
+        bare = line.strip()
+        if marks and bare.startswith(marks):
+            comments.append((number, bare))
+        elif bare and skip is not None and skip.search(line):
+            ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
+        elif bare:
+            content.append((number, line))
     if not content:
         raise InputError(f"{source}: only comments and blank lines; export the points again")
     tried = _by_numbers(content) if settings.delimiter == "auto" else [settings.delimiter]

@@ -123,8 +123,7 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
                 f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
                 f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
             )
-    with exports.bounded(where, named):
-        matches = [next((m for e in expressions if (m := e.search(n))), None) for n in named]
+    matches = [next((m for e in expressions if (m := e.search(n))), None) for n in named]
     groups = [match.groupdict() if match else {} for match in matches]
     bad = [i for i, match in enumerate(matches) if match is None]
     if bad and (names.unmatched != "ignore" or len(bad) == len(named)):

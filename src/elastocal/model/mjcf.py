@@ -39,6 +39,7 @@ WORLD = 0  # MuJoCo's number of the world body
 SPRING = "elastocal_spring_"
 # MuJoCo wants masses of moving bodies; where a file's meshes are missing, these stand for them.
 STAND_IN = 1e-6
+MOST_MESH_BYTES = 100_000_000  # a larger one is taken as missing
 SMALLEST_GRAVITY = 1e-3  # m/s²; below it there is none
 
 
@@ -100,10 +101,6 @@ class MjcfArm:
         arm = cls(model, tree, *tree.ends(base, flange), bodies, unweighed, tuple(told))
         arm.check_open()
         return arm
-
-    def anew(self) -> MjcfArm:
-        tree = _tree(self.tree.path, self.tree.name, self.model, self.bodies, self.unweighed)
-        return replace(self, tree=tree)
 
     @cached_property
     def moving(self) -> tuple[FileJoint, ...]:
@@ -383,11 +380,13 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
     from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     # The geoms of a body that states its inertia say nothing more.
     stated = [] if from_geoms else [b for b in spec.bodies if b.explicitinertial]
-    strip(spec, [g for b in stated for g in b.geoms])
+    # Nor do height fields, which stand still.
+    fields = [g for g in spec.geoms if g.hfieldname]
+    strip(spec, [*fields, *(g for b in stated for g in b.geoms if not g.hfieldname)])
     first: ValueError | None = None
     used, folder = {g.meshname for g in spec.geoms}, path.parent / (spec.compiler.meshdir or "")
     missing = {m.name: m.file for m in spec.meshes
-               if m.name in used and m.file and not (folder / m.file).is_file()}  # fmt: skip
+               if m.name in used and m.file and not _is_mesh(folder / m.file)}  # fmt: skip
     for lost in (missing, None):  # those, then all
         try:  # a spec that could not be compiled says so again at whatever is asked of it
             geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
@@ -414,6 +413,10 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
     raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first or ValueError())}")
 
 
+def _is_mesh(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size <= MOST_MESH_BYTES
+
+
 def strip(spec: Any, geoms: Iterable[Any]) -> None:
     """Take out geoms, and all that frames, masses and constraints between joints do without."""
     import mujoco
@@ -431,7 +434,7 @@ def strip(spec: Any, geoms: Iterable[Any]) -> None:
     meshes = {geom.meshname for geom in spec.geoms}
     for kind in (
         "keys", "sensors", "actuators", "pairs", "excludes", "tuples",
-        "skins", "flexes", "materials", "textures", "meshes",
+        "skins", "flexes", "materials", "textures", "hfields", "meshes",
     ):  # fmt: skip
         for one in list(getattr(spec, kind)):
             if kind != "meshes" or one.name not in meshes:

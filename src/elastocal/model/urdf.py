@@ -13,13 +13,12 @@ import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, reduce
 from pathlib import Path
 
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.files import read_bytes
 from elastocal.model import rigid
 from elastocal.model.chain import (
     FINGERS,
@@ -31,7 +30,7 @@ from elastocal.model.chain import (
     LinkMass,
     check_angles,
 )
-from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile
+from elastocal.model.xml_file import Tag, XmlFile
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
@@ -353,14 +352,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
 
 
 def check_urdf(path: str | Path) -> Tree:
-    file = Path(path)
-    return _known(file, read_bytes(file, "URDF file", MAX_BYTES))
-
-
-@lru_cache(maxsize=8)
-def _known(path: Path, data: bytes) -> Tree:
-    # A cell's model, its first cell, an export each ask for the same file.
-    return tree_of(XmlFile(path, data, "a URDF"))
+    return tree_of(urdf_file(Path(path)))
 
 
 def urdf_file(path: Path) -> XmlFile:

@@ -10,7 +10,6 @@ import codecs
 import math
 import os
 import re
-import struct
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from elastocal.errors import InputError, require
-from elastocal.files import DEEPEST, check_regular, check_size, open_input, read_bytes
+from elastocal.files import DEEPEST, check_size, read_bytes
 from elastocal.text import SHOWN, printable, quoted
 
 MAX_BYTES = 10_000_000
@@ -235,16 +234,13 @@ def _undeclared(data: bytes) -> str:
     return ""
 
 
-# What an MJCF file asks of MuJoCo, counted before MuJoCo sees it.  Its compiler takes memory and
-# time by numbers in the file, however small that is.
+# What an MJCF file asks of MuJoCo, counted before MuJoCo sees it.  Its reader takes memory and time
+# by numbers in the file, however small that is.
 
 # A humanoid with hands and keyframes has 1500.  MuJoCo's compiler takes 1 s for so many bodies with
 # free joints; its time grows with their square, and that of 20 000 is beyond a minute.
 MOST_ELEMENTS = 5000
-MOST_MESH_BYTES = 100_000_000  # of a file
-MOST_FILES_BYTES = 300_000_000  # of all, each as often as it is named
-MOST_CELLS = 1_000_000  # of all height fields
-VERTEX_BYTES = 50  # of a mesh file, at least
+CELLS = 200  # points of a height field that count as one element
 # The largest numbers of attributes that MuJoCo sets memory aside by.
 LARGEST: dict[str, dict[str, float]] = {
     "size": {"nuserdata": 1e6, "nkey": 1e3, "njmax": 1e6, "nconmax": 1e6, "nstack": 1e8,
@@ -262,8 +258,8 @@ _UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
 def check_bounds(file: XmlFile) -> None:
     """Raise InputError where an MJCF file asks for more than an arm needs.
 
-    Counted are elements as often as they are replicated, sizes, and what files it names: included
-    models stand in its folder, and all are regular files.  The message names file and element.
+    Counted are elements as often as they are replicated, included or attached, and sizes; included
+    models are regular files in its folder.  The message names file and element.
     """
     weight = _Model(file.path).weight_of(file)
     require(
@@ -279,7 +275,7 @@ class _Model:
         # The folder as it is named, and that of the file where the name is a link.
         self._roots = path.parent.resolve(), path.resolve().parent
         self._weights: dict[Path, float] = {}
-        self._text = self._bytes = self._cells = 0
+        self._text = 0
 
     def weight_of(self, file: XmlFile) -> float:
         """How many elements MuJoCo makes of a file and all that it includes."""
@@ -306,68 +302,31 @@ class _Model:
                 max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
                 f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
             )
-        if tag.name == "hfield":
-            sides = (math.prod(_numbers(tag.get(key))) for key in ("nrow", "ncol"))
-            self._count_cells(file.path, math.prod(sides))
+            require(
+                (tag.name, key) != ("flexcomp", "file"),
+                f"{stated} makes a body of every vertex of a file, which no arm needs; take it out",
+            )
         inside = 1 + sum(self._weight(file, child) for child in tag.inside)
         return _count(tag) * (inside + sum(self._named(file, tag)))
 
     def _named(self, file: XmlFile, tag: Tag) -> Iterator[float]:
-        """Weights of the files that it names: of a model its elements, of a grid its vertices."""
+        """Weights of the models that it names."""
         name = tag.get("file")
         if tag.name == "attach":
             models = {one.get("name") or Path(one.get("file")).stem: one.get("file")
                       for one in file.tags if one.name == "model"}  # fmt: skip
             name = models.get(tag.get("model"), "")
-        if tag.name in ("include", "model", "attach"):
-            # Beside the model or beside the file itself, as versions of MuJoCo differ.
-            for found in {self._folder / name, file.path.parent / name} if name else ():
-                if os.path.lexists(found):
-                    require(
-                        any(found.resolve().is_relative_to(root) for root in self._roots),
-                        f"{file.path}: includes {printable(name)}, which is outside its folder; "
-                        "put a copy there",
-                    )
-                    yield self.weight_of(XmlFile.read(found, "included model", "an MJCF file"))
+        if tag.name not in ("include", "model", "attach") or not name:
             return
-        for each in [v for k, v in tag.stated.items() if k.startswith("file") and v]:
-            for found in self._places(file, each):
-                try:
-                    size = check_regular(found, "file", MOST_MESH_BYTES)
-                    self._bytes += size
-                    require(
-                        self._bytes <= MOST_FILES_BYTES,
-                        f"{found}: with it the files that the model names have more than "
-                        f"{MOST_FILES_BYTES / 1e6:g} MB; keep the arm alone",
-                    )
-                except InputError as error:
-                    told = f"{file.path}: <{printable(tag.name)}> names {error}"
-                    raise InputError(told) from None
-                if tag.name == "flexcomp":
-                    yield size / VERTEX_BYTES
-                elif tag.name == "hfield":
-                    # A PNG says its points where it begins, however small it is.
-                    with open_input(found, "file of <hfield>") as handle:
-                        head = handle.read(24)
-                    if head.startswith(b"\x89PNG") and len(head) == 24:
-                        sides = struct.unpack(">II", head[16:24])
-                        self._count_cells(file.path, math.prod(map(float, sides)))
-
-    def _places(self, file: XmlFile, name: str) -> set[Path]:
-        """Where a file may stand; the last part of its name alone counts under `strippath`."""
-        stated = [tag.get(f"{kind}dir") for tag in file.tags if tag.name == "compiler"
-                  for kind in ("asset", "mesh", "texture")]  # fmt: skip
-        names = {name, re.split(r"[\\/]", name)[-1]} - {""}
-        places = {folder / place / each for folder in (file.path.parent, self._folder)
-                  for place in ("", *stated) for each in names}  # fmt: skip
-        return {place for place in places if os.path.lexists(place) and not place.is_dir()}
-
-    def _count_cells(self, path: Path, cells: float) -> None:
-        self._cells += int(min(cells, 1e18))
-        require(
-            self._cells <= MOST_CELLS,
-            f"{path}: <hfield> has more than {MOST_CELLS} points, which no arm needs; take it out",
-        )
+        # Beside the model or beside the file itself, as versions of MuJoCo differ.
+        for found in {self._folder / name, file.path.parent / name}:
+            if os.path.lexists(found):
+                require(
+                    any(found.resolve().is_relative_to(root) for root in self._roots),
+                    f"{file.path}: includes {printable(name)}, which is outside its folder; "
+                    "put a copy there",
+                )
+                yield self.weight_of(XmlFile.read(found, "included model", "an MJCF file"))
 
 
 def _numbers(text: str) -> list[float]:
@@ -379,9 +338,15 @@ def _numbers(text: str) -> list[float]:
 def _count(tag: Tag) -> float:
     """How often MuJoCo makes what an element states; a dimension that is 0 or not there counts as
     one, and a vertex or segment is a body with three joints and a geom."""
-    if tag.name not in ("replicate", "composite", "flexcomp"):
-        return 1.0
-    count = math.prod(max(n, 1.0) for n in _numbers(tag.get("count")))
+
+    def size(*keys: str) -> float:
+        return math.prod(max(n, 1.0) for key in keys for n in _numbers(tag.get(key)))
+
     if tag.name == "replicate":
-        return count
-    return 5 * max(count, *(len(tag.get(k).split()) / 3 for k in ("point", "vertex")))
+        return size("count")
+    if tag.name == "hfield":
+        return 1 + size("nrow", "ncol") / CELLS
+    if tag.name in ("composite", "flexcomp"):
+        vertices = (len(tag.get(key).split()) / 3 for key in ("point", "vertex"))
+        return 5 * max(size("count"), *vertices)
+    return 1.0
