@@ -57,7 +57,7 @@ class Study:
         model = Model.assembled(chain, cell)
         forces, feasibility = plan_forces(cell), Feasibility(cell, chain)
         targets = test_poses(cell, chain)
-        drawn = draw(cell, chain, forces, feasibility, 2000, SEED)
+        drawn = draw(feasibility, forces, 2000, SEED)
         n = int(shares_of(cell).sum())
         setup = set_up(model, drawn.q, n, targets, Known())
         pool = setup.pool(drawn.q, drawn.group)

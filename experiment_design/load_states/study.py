@@ -104,7 +104,7 @@ def unequal(cell: Cell, poses: int, times: int = 3) -> float:
     others, with as many readings in all."""
     model = Model(cell)
     rules = Feasibility(cell, model.chain)
-    q = draw(cell, model.chain, plan_forces(cell), rules, 1000, 0)
+    q = draw(rules, plan_forces(cell), 1000, 0)
     setup = set_up(model, q.q, poses, test_poses(cell, model.chain, rules, 0), Known())
     setup = replace(setup, ways=single_ways(setup.information))
     problem = balanced(setup.problem(setup.pool(q.q, q.group), np.array([poses])))

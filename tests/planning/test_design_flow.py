@@ -138,7 +138,9 @@ def what_is_predicted_is_the_inverse_of_the_information(
     std = np.sqrt(np.diag(V)) * setup.information.sizes
     assert np.allclose([p.std for p in plan.predicted], std, rtol=1e-5)
     assert all(r.loss >= 1 - 1e-9 for r in plan.reasons)
-    for q, reason in zip(plan.q, plan.reasons, strict=True):
+    for k, (q, reason) in enumerate(zip(plan.q, plan.reasons, strict=True)):
+        loss = value_of(setup, np.delete(plan.q, k, axis=0)) / plan.value
+        assert reason.loss == pytest.approx(loss, rel=1e-6)
         B = setup.information.blocks(q[None])[0]
         less = np.linalg.inv((M - B.T @ B) / np.outer(scale, scale)) / np.outer(scale, scale)
         growth = dict(

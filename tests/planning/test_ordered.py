@@ -25,14 +25,15 @@ SHARES = np.array([6])
 
 
 class Walled(Feasibility):
-    """No move begins or ends beyond joint1 = `wall`; counts how often it is asked for each."""
+    """No move begins or ends beyond joint1 = `wall`; counts how often each is checked."""
 
     wall = np.inf
     asked: Counter[Any]
+    _paths: Any = property(lambda self: self)
 
-    def paths_free(self, q_from: Any, q_to: Any, loaded: Any) -> Any:
-        ends = zip(q_from, q_to, strict=True)
-        self.asked.update((frozenset((a.tobytes(), b.tobytes())), loaded) for a, b in ends)
+    def free(self, q_from: Any, q_to: Any, loaded: Any) -> Any:
+        ends = zip(q_from, q_to, loaded, strict=True)
+        self.asked.update((frozenset((a.tobytes(), b.tobytes())), hung) for a, b, hung in ends)
         return (np.atleast_2d(q_from)[:, 0] < self.wall) & (np.atleast_2d(q_to)[:, 0] < self.wall)
 
 
@@ -53,12 +54,9 @@ def walled(wall: float) -> Walled:
 
 
 def search(setup: Any, found: Selection, cell: Walled, effort: str) -> Search:
-    space = joint_space(CELL, CHAIN)
-    searches = Searches(setup, space, cell)
-    return Search(
-        setup, found.pool, searches, SHARES, EFFORTS[effort], 0, Checkpoint(), lambda text: None,
-        setup,
-    )  # fmt: skip
+    searches = Searches(setup, joint_space(CELL, CHAIN), cell)
+    quiet = Checkpoint(), lambda text: None
+    return Search(found.pool, searches, SHARES, EFFORTS[effort], 0, *quiet)
 
 
 @pytest.mark.parametrize("effort", ["batch", "quick"])

@@ -319,7 +319,7 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
             if plan is not None:
                 written[path] = robot_program(
                     path.suffix, plan.execution, chain, plan.configurations, plan.forces,
-                    name=path.stem, limits=joint_limits(cell, chain),
+                    joint_limits(cell, chain), path.stem,
                 )  # fmt: skip
         except InputError as error:
             raise InputError(f"--program {path}: {error}") from None

@@ -78,7 +78,7 @@ def draw_pool(
         # A joint whose compliance is known at its levels only can be nowhere else.
         spec = replace(cell.design, levels=cell.model.compliance_levels)
         cell = replace(cell, design=spec)
-    q = draw(cell, chain, forces, Feasibility(cell, chain), n, seed).q
+    q = draw(Feasibility(cell, chain), forces, n, seed).q
     approach = time = None
     if table.approach is not None:
         approach = rng.choice([-1.0, 1.0], q.shape)

@@ -95,28 +95,24 @@ class Candidates:
 
     @classmethod
     def join(cls, lots: Sequence[Candidates]) -> Candidates:
-        removed = {rule: sum(lot.removed_by[rule] for lot in lots) for rule in lots[0].removed_by}
+        rules = lots[0].removed_by
+        removed = {rule: sum(lot.removed_by.get(rule, 0) for lot in lots) for rule in rules}
         q, group = (np.concatenate([getattr(lot, name) for lot in lots]) for name in ("q", "group"))
         tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
         return cls(q, group, tried, ok, removed)
 
 
 def draw(
-    cell: Cell,
-    chain: Chain,
-    forces: Array,
-    checker: Feasibility,
-    n: int,
-    seed: int,
-    jobs: int = 1,
+    rules: Feasibility, forces: Array, n: int, seed: int, jobs: int = 1,
     progress: Progress = lambda message: None,
-) -> Candidates:
+) -> Candidates:  # fmt: skip
     """About `n` candidates feasible under all `forces` (L, 3) N, equally many per level.
 
     Owen-scrambled Sobol points (Owen 1998; scipy.stats.qmc) over the joint ranges, one sequence
     per level, filtered chunk by chunk until there are enough, or TRIES per candidate wanted.  The
     result depends on `seed` only, not on `jobs`, the number of processes (−1: all cores).
     """
+    cell, chain = rules.cell, rules.chain
     space = joint_space(cell, chain)
     groups = space.n_groups
     require(n >= groups, f"{n} candidates are too few for {groups} levels; ask for more")
@@ -124,7 +120,7 @@ def draw(
     for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
         progress(f"drawing candidates, level {group + 1} of {groups}")
         wanted, lots, count = n // groups + (group < n % groups), list[Candidates](), 0
-        for lot in _checked(checker, forces, group, points(space, group, stream), jobs):
+        for lot in _checked(rules, forces, group, points(space, group, stream), jobs):
             lots.append(lot)
             count += len(lot.q)
             if count >= wanted or len(lots) * CHUNK >= max(TRIES * wanted if count else 0, GIVE_UP):
@@ -136,7 +132,7 @@ def draw(
                 at = f" with joint{j + 1} at {told(chain, j, space.levels[group])}"
             raise InsufficientDataError(
                 f"{cell.path or cell.name}: no feasible pose found{at}; "
-                f"{checker.advice(checker.every(some, forces))}"
+                f"{rules.advice(rules.every(some, forces))}"
             )
         lot = Candidates.join(lots)
         drawn.append(replace(lot, q=lot.q[:wanted], group=lot.group[:wanted]))
@@ -148,12 +144,11 @@ NO_LEVEL = "level"  # the rule that a pose brought along breaks where it stands 
 
 
 def brought(
-    cell: Cell, chain: Chain, forces: Array, checker: Feasibility, table: Measurements,
-    pins: Pins | None,
-) -> tuple[Candidates, list[str], str]:  # fmt: skip
+    rules: Feasibility, forces: Array, table: Measurements, pins: Pins | None
+) -> tuple[Candidates, list[str], str]:
     """The poses of a table that the cell allows, but for those that stay anyhow, the name of each,
     and which are refused.  A pose that stands in several rows is one."""
-    space = joint_space(cell, chain)
+    space = joint_space(rules.cell, rules.chain)
     q, first = np.unique(np.round(table.q, 9), axis=0, return_index=True)
     order = np.argsort(first, kind="stable")
     q = table.q[first[order]].copy()
@@ -165,7 +160,7 @@ def brought(
         q[:, space.held] = np.array(space.levels)[group]
     own = np.flatnonzero(off <= LEVEL_SLACK)
     own = own[np.argsort(group[own], kind="stable")]
-    verdict = checker.under(q[own], forces)
+    verdict = rules.under(q[own], forces)
     where = f"{table.source}: the cell allows none of its {len(q)} poses"
     if not len(own):
         raise InsufficientDataError(
@@ -173,7 +168,7 @@ def brought(
             "the levels of [design.levels], or drop these"
         )
     if not verdict.ok.any():
-        raise InsufficientDataError(f"{where}; {checker.advice(verdict)}")
+        raise InsufficientDataError(f"{where}; {rules.advice(verdict)}")
     refused = {NO_LEVEL: [names[k] for k in np.flatnonzero(off > LEVEL_SLACK)]}
     for k, broken in zip(own[~verdict.ok], verdict.broken[~verdict.ok], strict=True):
         rule = verdict.rules[int(broken.argmax())].replace("_", " ")
@@ -209,23 +204,23 @@ def points(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Ite
         yield space.poses(drawn.random(CHUNK), group)
 
 
-def _check(checker: Feasibility, forces: Array, group: int, q: Array) -> Candidates:
-    verdict = checker.under(q, forces)
+def _check(rules: Feasibility, forces: Array, group: int, q: Array) -> Candidates:
+    verdict = rules.under(q, forces)
     n = int(verdict.ok.sum())
     return Candidates(q[verdict.ok], np.full(n, group), len(q), n, verdict.removed_by)
 
 
 def _checked(
-    checker: Feasibility, forces: Array, group: int, chunks: Iterator[Array], jobs: int
+    rules: Feasibility, forces: Array, group: int, chunks: Iterator[Array], jobs: int
 ) -> Iterator[Candidates]:
     if jobs == 1:
-        yield from (_check(checker, forces, group, q) for q in chunks)
+        yield from (_check(rules, forces, group, q) for q in chunks)
     from joblib import Parallel, delayed, effective_n_jobs
 
     with Parallel(n_jobs=jobs, batch_size=PER_TASK) as pool:
         while True:
             wave = islice(chunks, PER_TASK * effective_n_jobs(jobs))
-            yield from pool([delayed(_check)(checker, forces, group, q) for q in wave])
+            yield from pool([delayed(_check)(rules, forces, group, q) for q in wave])
 
 
 def told(chain: Chain, j: int, value: float) -> str:
@@ -310,8 +305,9 @@ class Pins:
     struck: Array
     taken: tuple[str, ...]
 
-    def placed(self, cell: Cell, chain: Chain, rules: Feasibility) -> IntArray:
+    def placed(self, rules: Feasibility) -> IntArray:
         """The level (k,) of each pose that stays."""
+        cell = rules.cell
         group = np.zeros(len(self.q), dtype=np.int64)
         verdict = rules.every(self.q, plan_forces(cell))
         # That it stands near one struck out is the user's choice.

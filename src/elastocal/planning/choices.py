@@ -222,7 +222,7 @@ class Choice:
 
     def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
         rules = Feasibility(cell, self.work.chain)
-        return draw(cell, self.work.chain, plan_forces(cell), rules, candidates, self.seed)
+        return draw(rules, plan_forces(cell), candidates, self.seed)
 
     def relaxed(
         self, cell: Cell, drawn: Candidates | int = SEARCHED, read: BoolArray | None = None

@@ -19,7 +19,6 @@ from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import (
-    NO_LEVEL,
     Candidates,
     Pins,
     brought,
@@ -57,7 +56,6 @@ from elastocal.planning.relaxation import (
     first_allowed,
     random_information,
     sized_plans,
-    values_without,
 )
 from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection, ordered
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
@@ -228,7 +226,7 @@ class _Design:
         progress, options = self.progress, self.options
         pins, pinned_at = options.pins, np.zeros(0, dtype=np.int64)
         if pins is not None and len(pins.q):
-            pinned_at = pins.placed(self.cell, self.chain, self.feasibility)
+            pinned_at = pins.placed(self.feasibility)
         self.pinned = np.bincount(pinned_at, minlength=self.space.n_groups)
         shares = self._shares()
         planned = [self._shares(n) for n in options.curve]
@@ -244,41 +242,36 @@ class _Design:
             region, self.feasibility.seen, self.work,
         )  # fmt: skip
         self.warnings += setup.warnings
-        pinned = setup.pool(pins.q, pinned_at) if pins is not None and len(pins.q) else None
+        if pins is not None and len(pins.q):
+            setup = replace(setup, pinned=setup.pool(pins.q, pinned_at))
         self.states: LoadStates | None = None
         if self.cell.design.load_states == "chosen":
-            asked = setup.having(pinned)
-            ways, self.states = chosen_states(asked, q, group, shares, progress)
+            ways, self.states = chosen_states(setup, q, group, shares, progress)
             setup = replace(setup, ways=ways)
         pool = setup.pool(q, group)
-        search = setup.having(pinned)
         if cap := self.cell.design.cap:
             state = self.checkpoint.finished(
-                "share", lambda: {"share": share_within(search, pool, shares, cap, progress)}
+                "share", lambda: {"share": share_within(setup, pool, shares, cap, progress)}
             )
             setup = replace(setup, share=float(state["share"]))
-            search = setup.having(pinned)
-        searches = Searches(search, self.space, self.feasibility)
+        searches = Searches(setup, self.space, self.feasibility)
         effort = EFFORTS[options.effort]
         if self.cell.design.candidates is None:  # the plan is one of the poses that were brought
             effort = SearchEffort(starts=0, rounds=0, exchanges=max(effort.starts, 1))
 
         def sought(shares: IntArray, checkpoint: Checkpoint) -> tuple[Search, Selection]:
-            seek = Search(
-                search, pool, searches, shares, effort, options.seed, checkpoint, progress,
-                setup,
-            )  # fmt: skip
+            seek = Search(pool, searches, shares, effort, options.seed, checkpoint, progress)
             return seek, seek.select()
 
-        curve = self._curve(search, pool)
+        curve = self._curve(setup, pool)
         if self.cell.design.target is None:
             seek, found = sought(shares, self.checkpoint)
         else:
-            seek, found, sizes = self._fewest(search, pool, sought)
+            seek, found, sizes = self._fewest(setup, pool, sought)
             curve = tuple(sorted((*curve, *sizes), key=lambda size: size.poses))
         progress("random plans beside it")
-        drawn = random_information(search.problem(pool, seek.shares), options.seed)
-        return self._plan(setup, seek, found, counts, targets.source, curve, known, drawn, pinned)
+        drawn = random_information(setup.problem(pool, seek.shares), options.seed)
+        return self._plan(setup, seek, found, counts, targets.source, curve, drawn)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -320,7 +313,7 @@ class _Design:
         return state["q"], state["group"], CandidateCounts(**json.loads(str(state["counts"])))
 
     def _drawn(self) -> State:
-        spec, asked = self.cell.design, (self.cell, self.chain, self.forces, self.feasibility)
+        spec, asked = self.cell.design, (self.feasibility, self.forces)
         lots, names, told, options = list[Candidates](), list[str](), "", self.options
         if spec.taught is not None:
             self.progress(f"checking the poses of {spec.taught}")
@@ -331,8 +324,6 @@ class _Design:
             self.progress("drawing candidates")
             n = spec.candidates or 1
             lots.append(draw(*asked, n, options.seed, options.jobs, self.progress))
-        if len(lots) > 1:
-            lots[1].removed_by[NO_LEVEL] = 0
         drawn = Candidates.join(lots)
         counts = asdict(CandidateCounts(drawn.tried, drawn.feasible, drawn.removed_by))
         found = {"q": drawn.q, "group": drawn.group, "names": np.array(names, dtype=np.str_)}
@@ -385,9 +376,8 @@ class _Design:
                     raise
                 low = n = n + 1
                 continue
-            share = found.certificate.efficiency_pool
-            bound = None if share is None else figure(found.value * share)
-            tried[n] = PlanSize(n, figure(found.value), bound)
+            bound = found.certificate.bound_pool
+            tried[n] = PlanSize(n, figure(found.value), None if bound is None else figure(bound))
             if found.value <= target:
                 best, high = (seek, found), n
             else:
@@ -414,23 +404,23 @@ class _Design:
 
     def _plan(
         self, setup: Setup, seek: Search, found: Selection, counts: CandidateCounts, targets: str,
-        curve: tuple[PlanSize, ...], known: Known, drawn: Array, pinned: FeasiblePool | None,
+        curve: tuple[PlanSize, ...], drawn: Array,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
-        found, execution, told = ordered(seek, found, pinned)
+        found, execution, told = ordered(seek, found)
         self.warnings += told
         pool, chosen = found.pool, found.chosen
         q, blocks, readings = pool.q[chosen], pool.blocks[chosen], pool.readings[chosen]
-        spec, model = self.cell.design, setup.information.model
-        problem = setup.problem(pool, seek.shares)
+        spec, model, done = self.cell.design, setup.information.model, self.done
         M = setup.gathered(blocks)
+        without = np.stack([setup.gathered(np.delete(blocks, k, axis=0)) for k in range(len(q))])
         noise, alias, left = model.cell.noise, found.alias, M
         if alias is not None and noise.drift:
             left = alias.information(M, execution.times(len(q), len(self.forces)), noise)
         seen, numbers = setup.information.seen(q), setup.information.numbers(q, readings)
-        numbers += 0 if known.done is None else known.done.numbers
+        numbers += 0 if done is None else done.numbers
         R, gain = setup.target_rows, None
-        if known.done is not None and R is not None:
+        if done is not None and R is not None:
             gain = Gain.of(R, setup.prior, M, self.options.seed)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
         return Plan(
@@ -452,7 +442,7 @@ class _Design:
             predicted=predicted(model, setup.found, left, numbers),
             reasons=reasons(
                 model, setup.found, blocks, setup.prior,
-                values_without(problem, chosen), found.value,
+                setup.criterion.of_information(without), found.value,
             ),
             targets=f"test poses: {targets}",
             seed=self.options.seed,
@@ -460,7 +450,7 @@ class _Design:
             curve=curve,
             bound_reported=None if bound is None else figure(bound),
             warnings=tuple(self.warnings),
-            made_for="" if known.done is None else known.done.note,
+            made_for="" if done is None else done.note,
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(found),
             chance=Chance.of(drawn, found.value, setup.criterion),

@@ -18,8 +18,9 @@ from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.identification.noise_structure import course_waves
+from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
-from elastocal.planning.moves import Moves, PathChecker
+from elastocal.planning.moves import Moves
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 
@@ -533,7 +534,7 @@ def nearest_first(cost: Array) -> list[int]:
 def schedule(
     q: Array,
     motion: Motion,
-    checker: PathChecker,
+    checker: Feasibility,
     *,
     loads: Array | None = None,
     read: BoolArray | None = None,

@@ -328,6 +328,7 @@ class Feasibility:
     def __init__(self, cell: Cell, chain: Chain, struck: Array | None = None) -> None:
         self.cell, self.chain, self._struck = cell, chain, struck
         self.kinematics = Kinematics(cell, chain)
+        self._known: dict[tuple[Any, ...], bool] = {}  # moves, either way
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
         self.rules = rule_book(cell, chain, self.kinematics, self.bodies, self.pairs)
@@ -413,11 +414,18 @@ class Feasibility:
         )
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
-        """(M,) for moves q_from → q_to (M, n), as `Paths` guarantees it; visibility and torque
-        concern poses at rest."""
+        """(M,) for moves q_from → q_to (M, n), as `Paths` guarantees it, each checked once however
+        often it is asked for; visibility and torque concern poses at rest."""
         start, end = self._poses(q_from, LOADED).q, self._poses(q_to, LOADED).q
         start, end = np.broadcast_arrays(start, end)
-        return self._paths.free(start, end, np.broadcast_to(loaded, len(start)))
+        hangs = np.broadcast_to(loaded, len(start))
+        ends = zip(start, end, hangs.tolist(), strict=True)
+        moves = [(*sorted((a.tobytes(), b.tobytes())), hung) for a, b, hung in ends]
+        new = list({move: k for k, move in enumerate(moves) if move not in self._known}.values())
+        if new:
+            free = self._paths.free(start[new], end[new], hangs[new])
+            self._known.update(zip((moves[k] for k in new), free.tolist(), strict=True))
+        return np.array([self._known[move] for move in moves], dtype=bool)
 
     def blockers(self, q_from: Array, q_to: Array, loaded: bool) -> list[str]:
         """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are

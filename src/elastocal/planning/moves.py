@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,21 +14,13 @@ from scipy.sparse import csgraph
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.planning.feasibility import Feasibility
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which joint moves are free: a graph over joint vectors whose edges are checked when needed.
 
 # Added to every edge, relative to the longest one: of equally long ways the one with fewer stops.
 PER_EDGE = 1e-9
-
-
-class PathChecker(Protocol):
-    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
-        """Are all configurations from q_from to q_to (M, n), ends included, allowed (M,)?  The
-        answer for the way back is the same."""
-
-    def blockers(self, q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
-        """What is in the way of the straight move between two joint vectors (n,)."""
 
 
 def travel_times(points: Array, speed: Array | None) -> Array:
@@ -43,7 +35,7 @@ class Roadmap:
     move counts as free until it is checked; a blocked one is replaced by the fastest way through
     other points.  So costs never exceed the true ones (Bohlin and Kavraki 2000)."""
 
-    def __init__(self, points: Array, times: Array, loaded: bool, checker: PathChecker) -> None:
+    def __init__(self, points: Array, times: Array, loaded: bool, checker: Feasibility) -> None:
         self.points, self.loaded, self.checker = points, loaded, checker
         self.carrying = " with the load" if loaded else ""
         self.direct = times.copy()  # inf where blocked
@@ -168,7 +160,7 @@ class Moves:
 
     @classmethod
     def of(
-        cls, q: Array, motion: Motion, checker: PathChecker, forces: Array,
+        cls, q: Array, motion: Motion, checker: Feasibility, forces: Array,
         limits: tuple[Array, Array] | None, via: Array | None, read: BoolArray | None = None,
     ) -> Moves:  # fmt: skip
         n_poses, n = q.shape

@@ -229,13 +229,19 @@ class Certificate:
     """
 
     pool: int
-    bound_pool: float | None
-    efficiency_pool: float | None
+    bound_pool: float | None = None
+    efficiency_pool: float | None = None
     bound_continuum: float | None = None
     efficiency_continuum: float | None = None
     searched: int = 0
     ascents: int = 0
     starts: tuple[float, ...] = ()
+
+    def of(self, value: float) -> Certificate:
+        """That of a plan of Φ = `value` under the same bounds."""
+        bounds = self.bound_pool, self.bound_continuum
+        pool, continuum = (None if bound is None else min(bound / value, 1.0) for bound in bounds)
+        return replace(self, efficiency_pool=pool, efficiency_continuum=continuum)
 
     @property
     def better_pool(self) -> float | None:

@@ -233,7 +233,12 @@ def estimate(
         progress(f"searching the continuum, level {group + 1} of {len(problem.shares)}")
         q = np.concatenate([*islice(points(searches.space, group, streams[group]), chunks)])
         new = setup.pool(q, np.full(len(q), group))
-        lots.append(new.take(_best_feasible(searches, new.q, price(new))))
+        order, good = np.argsort(-price(new), kind="stable"), np.zeros(0, dtype=np.int64)
+        for part in np.split(order[: LOT * LOTS], LOTS):
+            good = np.append(good, part[searches.feasible(new.q[part])])
+            if len(distinct(new.q[good], STARTS)) == STARTS:
+                break
+        lots.append(new.take(good))
         both = FeasiblePool.join([lots[-1], pool.take(problem.group == group)])
         order = np.argsort(-price(both), kind="stable")
         starts.append(both.take(order[distinct(both.q[order], STARTS)]))
@@ -257,16 +262,6 @@ def estimate(
     found, searched = every.take(np.concatenate(better)), len(levels) * CHUNK * chunks
     poses = {"q": found.q, "group": found.group, "readings": found.readings}
     return poses | {"bound": bound, "searched": searched, "ascents": len(begun)}
-
-
-def _best_feasible(searches: Searches, q: Array, d: Array) -> IntArray:
-    order, so_far = np.argsort(-d, kind="stable"), np.zeros(0, dtype=np.int64)
-    for lot in range(LOTS):
-        part = order[lot * LOT : (lot + 1) * LOT]
-        so_far = np.append(so_far, part[searches.feasible(q[part])])
-        if len(distinct(q[so_far], STARTS)) == STARTS:
-            break
-    return so_far
 
 
 def distinct(q: Array, count: int) -> IntArray:

@@ -49,10 +49,7 @@ Step = tuple[Literal["move", "load", "measure"], Array, str]
 VIA = "via point, not measured"
 
 
-def steps_of(
-    execution: Execution, configurations: Sequence[str], forces: Array | None = None
-) -> list[Step]:
-    forces = np.zeros((1, 3)) if forces is None else forces
+def steps_of(execution: Execution, configurations: Sequence[str], forces: Array) -> list[Step]:
     home, dwell, nothing = execution.motion.home, execution.motion.dwell, np.zeros(0)
     steps: list[Step] = [] if home is None else [("move", home, "home")]
     for stop in execution.stops:
@@ -78,6 +75,7 @@ def load_name(force: Array) -> str:
 
 
 LONGEST = 100  # characters of a note; controllers cut or refuse long lines
+LONGEST_NAME = 24
 # Words of both languages that no module or function can be called; upper and lower case alike.
 RESERVED = frozenset(
     re.findall(
@@ -94,12 +92,12 @@ RESERVED = frozenset(
 )
 
 
-def program_name(text: str, most: int = 24) -> str:
+def program_name(text: str) -> str:
     """`text` reduced to a name that KRL and URScript allow, none of their own words."""
     ascii_only = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_]+", "_", ascii_only).strip("_")
-    name = (name if name[:1].isalpha() else f"p_{name}")[:most].rstrip("_")
-    return f"{name}_plan"[:most] if name.lower() in RESERVED or name == "p" else name
+    name = (name if name[:1].isalpha() else f"p_{name}")[:LONGEST_NAME].rstrip("_")
+    return f"{name}_plan"[:LONGEST_NAME] if name.lower() in RESERVED or name == "p" else name
 
 
 def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
@@ -200,22 +198,17 @@ FIRST = "The first move begins wherever the arm stands; only the moves after it 
 
 def robot_program(
     suffix: str, execution: Execution, chain: Chain, configurations: Sequence[str],
-    forces: Array | None = None, *, name: str = "elastocal_plan",
-    limits: tuple[Array, Array] | None = None,
+    forces: Array, limits: tuple[Array, Array], name: str,
 ) -> str:  # fmt: skip
     """The text of NAME.src (KRL) or NAME.script (URScript): moves, stops in which the tracker
-    measures, and halts for the load; joint values inside `limits` (lower, upper; rad; by default
-    the robot's), in the order of the chain.  Read back, it is the plan, or an ElastocalError."""
+    measures, and halts for the load; joint values inside `limits` (lower, upper) in rad, in the
+    order of the chain.  Read back, it is the plan, or an ElastocalError."""
     language, write = LANGUAGES[suffix.lower()]
     check_six_axes(chain, language)
-    lower, upper = limits or (
-        np.array([joint.lower for joint in chain.joints]),
-        np.array([joint.upper for joint in chain.joints]),
-    )
     steps = steps_of(execution, configurations, forces)
-    check_driven(steps, lower, upper)
+    check_driven(steps, *limits)
     told = f"elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}"
-    text = "\n".join(write(program_name(name), told, limits_text(lower, upper), steps)) + "\n"
+    text = "\n".join(write(program_name(name), told, limits_text(*limits), steps)) + "\n"
     check_program(text, steps)
     return text
 

@@ -178,11 +178,6 @@ def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> fl
     return tangent.bound(problem.prior, float(sum(best)))
 
 
-def efficiency(value: float, bound: float) -> float:
-    """bound/Φ in (0, 1]: a plan of efficiency 0.99 is at most 1 % above the best possible Φ."""
-    return min(bound / value, 1.0)
-
-
 # Column generation.
 
 GAP = 1e-4  # 1 − bound/Φ at which the relaxation ends
@@ -478,12 +473,6 @@ def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
     _, price = problem.worth(inverse(problem.information(plan)))
     price[plan] += price.max()
     return np.sort(best_of(price, problem.group, problem.shares))
-
-
-def values_without(problem: DesignProblem, chosen: IntArray) -> Array:
-    """Φ (n,) of the plan `chosen` (n,) without its k-th pose; inf where nothing replaces it."""
-    rest = [problem.information(np.delete(chosen, k)) for k in range(len(chosen))]
-    return problem.criterion.of_information(np.stack(rest))
 
 
 # The best plan of several starts.

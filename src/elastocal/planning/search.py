@@ -15,7 +15,6 @@ from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.criteria import inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
-from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Roadmap, Unreachable, travel_times
 from elastocal.planning.plan import Certificate
 from elastocal.planning.polish import Searches, estimate, polish
@@ -25,7 +24,6 @@ from elastocal.planning.relaxation import (
     balancing,
     check_determined,
     check_enough,
-    efficiency,
     exact_plan,
     exchange,
     fitted,
@@ -34,7 +32,7 @@ from elastocal.planning.relaxation import (
     random_plan,
     rounded,
 )
-from elastocal.planning.setup import FeasiblePool, Setup
+from elastocal.planning.setup import FeasiblePool
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 POOL = 2000  # candidates where nobody asks for a number
@@ -96,27 +94,22 @@ class Selection:
     def exchanged(self, pool: FeasiblePool, chosen: IntArray, value: float) -> Selection:
         """Another plan (k,) of Φ = `value`, from a pool that may hold more poses: the bounds hold,
         as a plan's own poses, where they are new, are those that the continuum's is about."""
-        c = self.certificate
-        of_pool, of_continuum = (
-            None if share is None else min(share * (self.value / value), 1.0)
-            for share in (c.efficiency_pool, c.efficiency_continuum)
-        )
-        certificate = replace(c, efficiency_pool=of_pool, efficiency_continuum=of_continuum)
+        certificate = self.certificate.of(value)
         return replace(self, pool=pool, chosen=chosen, value=value, certificate=certificate)
 
 
 class Search:
-    """What a plan is sought with: the setup, whose parameters y = T z are balanced, `plain` without
-    the poses that stay, and the `pool`, which grows by what polish and ascents find."""
+    """What a plan is sought with: the setup, whose parameters y = T z are balanced, and the `pool`,
+    which grows by what polish and ascents find."""
 
     def __init__(
-        self, setup: Setup, pool: FeasiblePool, searches: Searches, shares: IntArray,
-        effort: SearchEffort, seed: int, checkpoint: Checkpoint, progress: Progress, plain: Setup,
+        self, pool: FeasiblePool, searches: Searches, shares: IntArray, effort: SearchEffort,
+        seed: int, checkpoint: Checkpoint, progress: Progress,
     ) -> None:  # fmt: skip
-        self.setup, self.searches, self.shares, self.plain = setup, searches, shares, plain
+        self.setup, self.searches, self.shares = searches.setup, searches, shares
         self.effort, self.seed, self.pool = effort, seed, pool
         self.checkpoint, self.progress = checkpoint, progress
-        whole = setup.problem(pool, shares)
+        whole = self.setup.problem(pool, shares)
         check_enough(whole)
         self.T = balancing(whole)
         self._of: tuple[FeasiblePool, DesignProblem] | None = None
@@ -161,11 +154,10 @@ class Search:
         polished, and where these ended."""
         problem, relaxed, effort, seed = self.problem, self.relaxed, self.effort, self.seed
         rng, least, ends = np.random.default_rng(seed), np.inf, list[float]()
-
-        def make() -> State:
-            return {"chosen": exact_plan(problem, relaxed, starts=effort.exchanges, seed=seed)[0]}
-
-        best = begun = self.checkpoint.finished("exchange", make)["chosen"]
+        best = begun = self.checkpoint.finished(
+            "exchange",
+            lambda: {"chosen": exact_plan(problem, relaxed, starts=effort.exchanges, seed=seed)[0]},
+        )["chosen"]
         for k in range(effort.starts):
             if k:
                 begun = (
@@ -181,11 +173,9 @@ class Search:
     def polished(self, chosen: IntArray, name: str, fine: bool = False) -> IntArray:
         """The plan (k,) polished; poses that moved join the pool."""
         plan = self.pool.take(chosen)
-
-        def make() -> State:
-            return {"q": polish(self.problem, self.searches, self.T, plan, fine)}
-
-        q = self.checkpoint.finished(name, make)["q"]
+        q = self.checkpoint.finished(
+            name, lambda: {"q": polish(self.problem, self.searches, self.T, plan, fine)}
+        )["q"]
         moved, now = (q != plan.q).any(axis=1), chosen.copy()
         now[moved] = len(self.pool) + np.arange(moved.sum())
         self._join(q[moved], plan.group[moved], plan.readings[moved])
@@ -211,13 +201,12 @@ class Search:
         return found
 
     def _certificate(self, value: float, ends: list[float], continuum: list[State]) -> Certificate:
-        size, starts = len(self.pool), tuple(ends)
+        own = Certificate(len(self.pool), starts=tuple(ends))
         if not self.problem.criterion.certifiable:
-            return Certificate(size, None, None, starts=starts)
-        if len(self.relaxed.weights) < size:
+            return own
+        if len(self.relaxed.weights) < len(self.pool):
             self._relax(FINE)
-        bound = self.relaxed.bound
-        own = Certificate(size, bound, efficiency(value, bound), starts=starts)
+        own = replace(own, bound_pool=self.relaxed.bound).of(value)
         if not self.effort.starts:
             return own
         # The tangent of the pool's optimum says little of poses far better than the pool's: they
@@ -228,14 +217,9 @@ class Search:
             if new["bound"] >= NEAR * self.relaxed.bound or not len(new["q"]) or k == REFINED:
                 break
             self._relax()
-        beyond = min(float(new["bound"]), bound)
-        return replace(
-            own,
-            bound_continuum=beyond,
-            efficiency_continuum=efficiency(value, beyond),
-            searched=int(sum(c["searched"] for c in continuum)),
-            ascents=int(sum(c["ascents"] for c in continuum)),
-        )
+        searched, ascents = (int(sum(c[n] for c in continuum)) for n in ("searched", "ascents"))
+        beyond = min(float(new["bound"]), own.bound_pool or np.inf)
+        return replace(own, bound_continuum=beyond, searched=searched, ascents=ascents).of(value)
 
 
 # The order of a plan that moves can follow; poses that none reaches are replaced, and polished.
@@ -247,13 +231,11 @@ VIA = 200  # candidates through which a blocked move may go
 REPLACED = 10  # times at most
 
 
-def ordered(
-    search: Search, found: Selection, pinned: FeasiblePool | None = None
-) -> tuple[Selection, Execution, list[str]]:
+def ordered(search: Search, found: Selection) -> tuple[Selection, Execution, list[str]]:
     """The selection in the order of its levels, its execution, and warnings.  Poses that no chain
-    of free moves reaches are replaced by the best others, unless they are `pinned`, and all then
+    of free moves reaches are replaced by the best others, unless they are pinned, and all then
     polished again, as far as moves reach them there."""
-    order, warnings = _Ordering(search, found, pinned), []
+    order, warnings = _Ordering(search, found), []
     plan, execution = order.reachable()
     if order.gone:
         plan, execution = order.polished(plan, execution)
@@ -271,10 +253,10 @@ class _Ordering:
     """A plan `found` put in order; `gone` poses of it were unreachable so far.  Blocked moves may
     go through the `hub` (k, n): home, and poses of the pool, which free moves join."""
 
-    def __init__(self, search: Search, found: Selection, pinned: FeasiblePool | None) -> None:
-        self.search, self.found, self.pinned, self.gone = search, found, pinned, 0
-        self.paths = _Paths(search.searches.checker)
-        self.loaded = bool(np.any(self.paths.feasibility.cell.design.loads))
+    def __init__(self, search: Search, found: Selection) -> None:
+        self.search, self.found, self.gone = search, found, 0
+        self.rules = search.searches.checker
+        self.loaded = bool(np.any(self.rules.cell.design.loads))
         self.hub = found.pool.q[:: max(len(found.pool) // VIA, 1)]
 
     def reachable(self) -> tuple[Selection, Execution]:
@@ -289,15 +271,13 @@ class _Ordering:
         return self.put(self.found)
 
     def put(self, found: Selection) -> tuple[Selection, Execution]:
-        search, plan = self.search, found.whole(self.pinned)
-        setup, plain = search.setup, search.plain
+        search, rules, setup = self.search, self.rules, self.search.setup
+        plan = found.whole(setup.pinned)
         q, blocks = plan.pool.q[plan.chosen], plan.pool.blocks[plan.chosen]
-        readings = plan.pool.readings[plan.chosen]
-        M = plain.gathered(blocks)
-        alias = Alias.of(plain.information, q, blocks, M, plain.target_rows, readings)
-        rules = self.paths.feasibility
+        readings, M = plan.pool.readings[plan.chosen], setup.gathered(blocks)
+        alias = Alias.of(setup.information, q, blocks, M, setup.target_rows, readings)
         execution = schedule(
-            q, at_stops(rules.cell), self.paths,
+            q, at_stops(rules.cell), rules,
             loads=setup.information.forces,
             read=readings > 0,
             limits=joint_limits(rules.cell, rules.chain),
@@ -324,7 +304,7 @@ class _Ordering:
         """The same postures, whole turns nearer to home, or to the middle of the joint ranges: to
         the same posture a turn on there is often no way.  Poses whose information would be another
         are left as they are."""
-        rules, pool = self.paths.feasibility, self.found.pool
+        rules, pool = self.rules, self.found.pool
         chain, home = rules.chain, rules.cell.design.motion.home
         lower, upper = finite_ranges(chain, *joint_limits(rules.cell, chain))
         turn = np.where([kind == "revolute" for kind in chain.kinds], 2 * np.pi, np.inf)
@@ -343,7 +323,7 @@ class _Ordering:
         those of the LIKELY candidates of a level that a free move joins to the hub."""
         search, found, pool = self.search, self.found, self.found.pool
         search.pool = pool
-        problem, gone = search.problem, found.whole(self.pinned).chosen[error.poses]
+        problem, gone = search.problem, found.whole(search.setup.pinned).chosen[error.poses]
         if (gone >= len(pool)).any():
             raise error
         self.gone += len(gone)
@@ -368,9 +348,9 @@ class _Ordering:
         self.found = found.exchanged(pool, chosen, search.value(chosen))
 
     def _joined(self, q: Array) -> Array:
-        motion = self.paths.feasibility.cell.design.motion
+        motion = self.rules.cell.design.motion
         points = q if motion.home is None else np.vstack([motion.home, q])
-        roadmap = Roadmap(points, travel_times(points, motion.speed), self.loaded, self.paths)
+        roadmap = Roadmap(points, travel_times(points, motion.speed), self.loaded, self.rules)
         parts = roadmap.parts(list(range(len(points))))
         return points[parts[0] if motion.home is None else next(p for p in parts if 0 in p)]
 
@@ -381,22 +361,5 @@ class _Ordering:
         alone = np.arange(len(q))
         for k in range(min(TRIED, len(self.hub))):
             there = self.hub[next_to[alone, k]]
-            alone = alone[~self.paths.paths_free(q[alone], there, self.loaded)]
+            alone = alone[~self.rules.paths_free(q[alone], there, self.loaded)]
         return ~np.isin(np.arange(len(q)), alone)
-
-
-class _Paths:
-    """The cell's moves, each checked once however often a plan changes around it."""
-
-    def __init__(self, feasibility: Feasibility) -> None:
-        self.feasibility, self.blockers = feasibility, feasibility.blockers
-        self.known: dict[tuple[object, ...], bool] = {}
-
-    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
-        ends = zip(q_from, q_to, strict=True)
-        keys = [(*sorted((a.tobytes(), b.tobytes())), loaded) for a, b in ends]
-        new = list({key: k for k, key in enumerate(keys) if key not in self.known}.values())
-        if new:
-            free = self.feasibility.paths_free(q_from[new], q_to[new], loaded)
-            self.known.update((keys[k], bool(f)) for k, f in zip(new, free, strict=True))
-        return np.array([self.known[key] for key in keys], dtype=bool)

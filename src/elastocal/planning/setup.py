@@ -75,7 +75,8 @@ class Setup:
     """`information` over the kept parameters, `prior` (p, p) scaled, and what the criterion is made
     of: `inputs` of the test poses alone, and `beyond`, ∂position/∂parameters (T, r, p) at poses all
     over the joint ranges and their weights (T,), on which `share` of the criterion's weight lies.
-    `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one."""
+    `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one.
+    `pinned`: poses that stay, which every problem knows before."""
 
     information: PoseInformation
     found: Estimable
@@ -85,6 +86,7 @@ class Setup:
     warnings: tuple[str, ...]
     ways: IntArray
     share: float = 0.0
+    pinned: FeasiblePool | None = None
 
     @cached_property
     def criterion(self) -> ScenarioCriterion:
@@ -114,18 +116,13 @@ class Setup:
             q, group = np.tile(q, (len(self.ways), 1)), np.tile(group, len(self.ways))
         return FeasiblePool(q, group, readings, self.information.blocks(q, readings))
 
-    def having(self, pinned: FeasiblePool | None) -> Setup:
-        """For what is chosen beside poses that stay: their information is known before."""
-        return self if pinned is None else replace(self, prior=self.gathered(pinned.blocks))
-
     def problem(self, pool: FeasiblePool, shares: IntArray) -> DesignProblem:
         """Of as many stops as the `shares` (L,) of poses take in all load states."""
         shares = shares * self.ways.shape[1] // np.count_nonzero(self.ways[0])
         cell = self.information.model.cell
+        prior = self.prior if self.pinned is None else self.gathered(self.pinned.blocks)
         source = f"{cell.path or cell.name}: "
-        return DesignProblem(
-            pool.blocks, self.prior, pool.group, shares, self.criterion, source=source
-        )
+        return DesignProblem(pool.blocks, prior, pool.group, shares, self.criterion, source)
 
     def gathered(self, blocks: Array) -> Array:
         """M (p, p) of a plan's blocks (N, r, p) and what was known before."""

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.cells import kr270_chain, random_poses
+from support.cells import kr270_cell, kr270_chain, random_poses
 from support.discs import Discs
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import ElastocalError, InputError
-from elastocal.model.chain import Chain
+from elastocal.model.chain import Chain, joint_limits
 from elastocal.planning.execution import schedule
 from elastocal.planning.programs import (
     RESERVED,
@@ -27,7 +27,14 @@ from elastocal.planning.programs import (
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
 NAMES = [f"c{i}" for i in range(1, 6)]
-KRL, URSCRIPT = (partial(robot_program, suffix) for suffix in (".src", ".SCRIPT"))
+LIMITS = joint_limits(kr270_cell(), kr270_chain())
+
+
+def written(suffix, execution, chain, names=NAMES, limits=LIMITS):
+    return robot_program(suffix, execution, chain, names, FORCES, limits, "plan")
+
+
+KRL, URSCRIPT = (partial(written, suffix) for suffix in (".src", ".SCRIPT"))
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +60,11 @@ def planned(execution):
 @pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_the_text_is_the_same_every_time_and_names_cannot_break_it(chain, write):
     execution = execution_of(chain)
-    assert write(execution, chain, NAMES, FORCES) == write(execution, chain, NAMES, FORCES)
+    assert write(execution, chain) == write(execution, chain)
     evil = ['"; HALT', "a\nEND", 'b")\nend', "Höhe µ", "\x00"]
-    text = write(execution, replace(chain, name='r"\nEND'), evil, FORCES)
+    text = write(execution, replace(chain, name='r"\nEND'), evil)
     assert text.isascii()
-    ours = write(execution, chain, NAMES, FORCES)
+    ours = write(execution, chain)
     assert text.count("\n") == ours.count("\n") and text.count('"') == ours.count('"')
 
 
@@ -67,9 +74,9 @@ def test_other_arms_than_six_revolute_joints_are_refused(chain, write):
     seven = Chain("seven", (*chain.joints, chain.joints[0]), np.eye(4))
     sliding = replace(chain, joints=(replace(chain.joints[0], kind="prismatic"), *chain.joints[1:]))
     with pytest.raises(InputError, match="has 7"):
-        write(execution, seven, NAMES)
+        write(execution, seven)
     with pytest.raises(InputError, match=f"joint {chain.joints[0].name} slides"):
-        write(execution, sliding, NAMES)
+        write(execution, sliding)
 
 
 @given(
@@ -95,16 +102,16 @@ def test_a_joint_value_outside_the_limits_is_refused(chain, write):
         replace(execution, stops=(replace(beyond, q=np.full(6, np.nan)),)),
     ):
         with pytest.raises(InputError, match=r"moves joint \d to .*, outside its limits"):
-            write(wrong, chain, NAMES, FORCES)
+            write(wrong, chain)
     tight = np.full(6, -1e-3), np.full(6, 1e-3)
     with pytest.raises(InputError, match="outside its limits"):
-        write(execution, chain, NAMES, FORCES, limits=tight)
+        write(execution, chain, limits=tight)
 
 
 @pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_a_program_read_back_is_the_plan_to_a_millionth_of_a_radian(chain, write):
     execution = execution_of(chain, home=HOME, both_directions=True)
-    text = write(execution, chain, NAMES, FORCES)
+    text = write(execution, chain)
     steps = list(steps_of(execution, NAMES, FORCES))
     check_program(text, steps)
     moves = [values for kind, values in program_steps(text) if kind == "move"]

@@ -71,8 +71,7 @@ class Case:
         return self.setup.pool(q, group)
 
     def draw(self, n: int) -> Candidates:
-        model = self.model
-        return draw(model.cell, model.chain, self.information.forces, self.rules, n, 0, 1)
+        return draw(self.rules, self.information.forces, n, 0)
 
     def criterion(self, name: str) -> ScenarioCriterion:
         """`name` on three test poses."""
