@@ -275,16 +275,20 @@ def _list_of(check: Check, least: int = 0) -> Check:
     return checked
 
 
-def _table_of(key: Check, check: Check) -> Check:
+def _by_name(check: Check) -> Check:
     def checked(value: Any) -> bool:
-        return isinstance(value, Mapping) and all(key(k) and check(v) for k, v in value.items())
+        return isinstance(value, Mapping) and all(_text(k) and check(v) for k, v in value.items())
 
     return checked
 
 
+def _is_a(name: str) -> Check:
+    """Whether a class of that name is among those of a value, which need not be loaded for it."""
+    return lambda value: any(each.__name__ == name for each in type(value).__mro__)
+
+
 def _seed(value: Any) -> bool:
-    whole = _whole(value) and 0 <= value <= LARGEST_SEED
-    return whole or type(value).__name__ == "Generator"
+    return (_whole(value) and 0 <= value <= LARGEST_SEED) or _is_a("Generator")(value)
 
 
 # Kind as it is annotated → how a message names it, and whether a value is one.  Names that are not
@@ -299,20 +303,17 @@ KINDS: dict[str, tuple[str, Check]] = {
     "Array": ("numbers", _values),
     "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
     "Sequence[str]": ("a list of names", _list_of(_text)),
-    "Sequence[TargetPose]": (
-        "a list of TargetPose", _list_of(lambda v: type(v).__name__ == "TargetPose"),
-    ),
-    "Mapping[str, float]": ("numbers by name", _table_of(_text, _number)),
-    "Mapping[str, Sequence[float]]": (
-        "a list of numbers by name", _table_of(_text, _list_of(_number, 1)),
-    ),
+    "Sequence[TargetPose]": ("a list of TargetPose", _list_of(_is_a("TargetPose"))),
+    "Mapping[str, float]": ("numbers by name", _by_name(_number)),
+    "Mapping[str, Sequence[float]]": ("a list of numbers by name", _by_name(_list_of(_number, 1))),
+    "Mapping": ("a Mapping", lambda v: isinstance(v, Mapping)),
     "tuple[ArrayLike, ArrayLike]": (
         "two corners", lambda v: isinstance(v, Collection) and len(v) == 2 and all(map(_array, v)),
     ),
     "Progress": ("a function", callable),
     "None": ("None", lambda v: v is None),
 }  # fmt: skip
-CLASSES = {"a path"}  # words for what a function tells apart itself
+CLASSES = {"a path", "a Mapping"}  # words for what a function tells apart itself
 ALIASES = {
     "AnyModel": "Model | Cell | str | Path",
     "Table": "Measurements | str | Path | DataFrame",
@@ -402,14 +403,9 @@ def kinds_of(annotation: str) -> list[str]:
 
 
 def _kind(name: str) -> tuple[str, Check]:
-    def of_class(value: Any) -> bool:
-        return any(each.__name__ == name for each in type(value).__mro__) or (
-            name == "Mapping" and isinstance(value, Mapping)
-        )
-
     if name not in KINDS:
         CLASSES.add(f"a {name}")
-    return KINDS.get(name, (f"a {name}", of_class))
+    return KINDS.get(name, (f"a {name}", _is_a(name)))
 
 
 def _shown(value: Any) -> str:

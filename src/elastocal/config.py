@@ -85,13 +85,9 @@ class Table(BaseModel):
 
 
 def key(takes: str, default: Any = None) -> Any:
-    """An optional key of a `Table`; `takes` completes the sentence 'key … takes …'."""
+    """A key of a `Table`; `takes` completes the sentence 'key … takes …'.  One whose `default` is
+    ... must be there."""
     return Field(default=default, description=takes)
-
-
-def required(takes: str) -> Any:
-    """A key that must be there; `takes` as for `key`."""
-    return Field(description=takes)
 
 
 @dataclass(frozen=True)
@@ -546,31 +542,23 @@ def matrix(rows: int | None, columns: int) -> PlainValidator:
     return PlainValidator(check)
 
 
-def _unit_vector(vector: Array) -> Array | None:
-    largest = np.abs(vector).max()
-    if largest == 0:
-        return None
-    # First by the largest entry, whose square cannot overflow or vanish.
-    scaled = vector / largest
-    return np.asarray(scaled / np.linalg.norm(scaled))
-
-
-def direction(vector: Array, spot: Spot, name: str) -> Array:
-    unit = _unit_vector(np.asarray(vector, dtype=float))
-    if unit is None:
-        what = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
-        raise InputError(f"{spot.path}: {what}")
-    return unit
-
-
 def _direction(value: object) -> Array:
     check: Any = numbers(3).func
     vector: Array = check(value)
-    unit = _unit_vector(vector)
-    if unit is None:
+    if not vector.any():
         raise PydanticCustomError("zero", "a direction, as in [0, 0, 1]")
+    # First by the largest entry, whose square cannot overflow or vanish.
+    scaled = vector / np.abs(vector).max()
+    unit: Array = scaled / np.linalg.norm(scaled)
     # What has unit length already stays as it is, digit for digit.
     return vector if np.abs(vector - unit).max() < 1e-12 else unit
+
+
+def direction(vector: Array, spot: Spot, name: str) -> Array:
+    """The same of a key."""
+    told = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
+    spot.require(np.any(vector), told)
+    return _direction(vector)
 
 
 def _tuple(value: object) -> object:

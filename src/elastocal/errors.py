@@ -12,7 +12,7 @@ argument, on the command line the flag.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -162,6 +162,17 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
         f"command and its files ({TRACEBACK}=1 shows where)",
         INTERNAL,
     )
+
+
+def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, int] | None:
+    """File and line of the last of a traceback's frames whose file is somebody's `own`, of a
+    SyntaxError those that it names; None where there is none."""
+    import traceback
+
+    if isinstance(error, SyntaxError) and error.filename:
+        return error.filename, error.lineno or 1
+    frames = traceback.extract_tb(error.__traceback__)
+    return next(((f.filename, f.lineno or 1) for f in frames[::-1] if own(f.filename)), None)
 
 
 def _of_plugin(error: Exception) -> str:

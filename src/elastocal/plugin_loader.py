@@ -17,7 +17,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, Any
 
-from elastocal.errors import InputError, option, require
+from elastocal.errors import InputError, option, raised_at, require
 from elastocal.files import check_exists, read_text
 from elastocal.text import quoted
 
@@ -188,15 +188,13 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
 
 def _told(error: BaseException, path: Path | None) -> str:
     """ "my_effects.py, line 3: NameError: …": the last line that is the plug-in's own."""
-    import traceback
-
-    if isinstance(error, SyntaxError) and error.filename:
-        file, line, text = error.filename, error.lineno, error.msg
-    else:
-        frames = traceback.extract_tb(error.__traceback__)
-        own = [f for f in frames if path is not None and f.filename == str(path)]
-        own = own or [f for f in frames if not f.filename.startswith((OURS, "<frozen"))] or frames
-        file, line, text = own[-1].filename, own[-1].lineno, str(error)
+    file, line = (
+        raised_at(error, lambda f: f == str(path))
+        or raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
+        or raised_at(error, lambda f: True)
+        or ("", 0)
+    )
+    text = error.msg if isinstance(error, SyntaxError) else error
     return f"{file}, line {line}: {type(error).__name__}: {text}; correct the plug-in"
 
 

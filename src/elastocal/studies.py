@@ -48,7 +48,7 @@ from pydantic import Field
 
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import ElastocalError, InputError, option, raised_at, require
 from elastocal.files import atomic_write, read_bytes, read_json, read_text
 from elastocal.screen import StudyStop, shown
 from elastocal.text import did_you_mean, json_text, listed, printable, quoted
@@ -267,13 +267,8 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        file, line = str(folder.resolve() / "study.py"), 1
-        frames = traceback.extract_tb(error.__traceback__)
-        own = [f for f in frames if Path(f.filename).is_relative_to(folder.resolve())]
-        if isinstance(error, SyntaxError) and error.filename:
-            file, line = error.filename, error.lineno or 1
-        elif own:
-            file, line = own[-1].filename, own[-1].lineno or 1
+        own, nowhere = folder.resolve(), (folder.resolve() / "study.py", 1)
+        file, line = raised_at(error, lambda f: Path(f).is_relative_to(own)) or nowhere
         raise InputError(
             f"{file}, line {line}: {what} raised {type(error).__name__}: {error}; correct it there"
         ) from error

@@ -34,7 +34,7 @@ from elastocal.text import (
     printable,
     quoted,
 )
-from elastocal.units import Array, IntArray, to_si
+from elastocal.units import FACTORS, Array, IntArray, to_si
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -210,10 +210,8 @@ def _problem(cell: str, comma_allowed: bool) -> str | None:
 NO_UNIT = ("",)
 IGNORED = ("#", "_", "note")
 # Seen in other people's tables: they make a name such as x_cm a wrong unit, not a typing error.
-OTHER_UNITS = frozenset(
-    ("cm", "km", "nm", "inch", "in", "mrad", "urad", "grad", "turn", "rev", "kN", "kg", "mNm",
-     "kNm", "h", "ms", "us", "K", "F", "mm", "m", "um", "deg", "rad", "N", "Nm", "s", "min", "C")
-)  # fmt: skip
+OTHER_UNITS = {unit for units in FACTORS.values() for unit in units if unit}
+OTHER_UNITS |= {"km", "nm", "inch", "urad", "grad", "turn", "kg", "mNm"}
 
 
 # What a table may hold

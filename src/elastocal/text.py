@@ -35,9 +35,7 @@ def did_you_mean(name: str, valid: Iterable[str]) -> str:
 
 
 def listed(names: Iterable[str], limit: int = 40) -> str:
-    names = list(names)
-    more = f", … ({len(names) - limit} more)" if len(names) > limit else ""
-    return ", ".join(names[:limit]) + more
+    return some(names, limit, more=", … ({} more)")
 
 
 def some(names: Iterable[str], most: int, joint: str = ", ", more: str = " and {} more") -> str:

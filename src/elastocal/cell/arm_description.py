@@ -31,7 +31,6 @@ from elastocal.config import (
     keys_of,
     numbers,
     record,
-    required,
 )
 from elastocal.errors import InputError, require
 from elastocal.text import is_label, listed, quoted
@@ -332,7 +331,7 @@ def _choices(entries: object) -> object:
 class CompensatorTable(Table):
     """A spring between two anchor points that takes a part of a joint's load."""
 
-    joint: Text = required('the joint the spring spans, e.g. "joint2"')
+    joint: Text = key('the joint the spring spans, e.g. "joint2"', ...)
     stiffness_N_per_m: NonNegative | None = key("a number >= 0 in N/m")
     anchor_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = key(
         "two numbers in m"

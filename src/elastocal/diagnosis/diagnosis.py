@@ -407,6 +407,11 @@ class Diagnosis(Result):
         return self.verdict in ("ambiguous", "unknown_effect") and not self.groups
 
     @property
+    def doubtful(self) -> bool:
+        """Whether, nothing being named, "no effect" would be the less likely half of the truth."""
+        return self.probability_nothing < 0.5
+
+    @property
     def dependences(self) -> tuple[StructureTest, ...]:
         """Covariates that the residual depends on, the most conspicuous first."""
         found = [t for t in self.structure if t.p_family <= STRUCTURE]

@@ -22,10 +22,10 @@ from elastocal.config import (
     Table,
     Text,
     checked,
+    key,
     keyed,
     read_toml,
     record,
-    required,
 )
 from elastocal.errors import InputError, option, require
 from elastocal.model.manipulator import Model
@@ -353,8 +353,8 @@ def physical_constraints(model: Model) -> Constraints:
 
 
 class PriorTable(Table):
-    mean: float = required(NUMBER)
-    std: Positive = required("a positive number in SI units")
+    mean: float = key(NUMBER, ...)
+    std: Positive = key("a positive number in SI units", ...)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.above import Saved, checked_arguments
 from elastocal.cell.work_cell import Cell
-from elastocal.config import Many, Table, checked, is_number, key, keyed, record, required
+from elastocal.config import Many, Table, checked, is_number, key, keyed, record
 from elastocal.errors import InputError, option, require
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
@@ -319,14 +319,14 @@ class _Stated(Table):
 
 
 class _Entry(_Stated):
-    name: str = required("a name")
-    held: float = required("a number")
+    name: str = key("a name", ...)
+    held: float = key("a number", ...)
     dof: float | None = key("a number")
     combined_with: list[str] | None = key("a list of names")
 
 
 class _Result(_Stated):
-    parameters: list[_Entry] = required("a list of parameters")
+    parameters: list[_Entry] = key("a list of parameters", ...)
     nominal_flange: Annotated[Array, _array(4)] | None = key("3 rows of 4 numbers")
     covariance_of: list[str] = key("a list of names", [])
     covariance: Matrix = key("a square table of finite numbers", NONE)

@@ -157,8 +157,6 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
 # The verdict, and what beside it
 
 
-# Below this probability of none "no effect" would be the less likely half of the truth.
-LIKELY_NONE = 0.5
 NONE_NAMED = (
     "No effect is named: something may be missing, but nothing both stands out from the noise and "
     "lowers the error at poses left out of the fit"
@@ -186,7 +184,7 @@ def diagnosis_headline(d: Diagnosis) -> str:
         return f"{told} {verb} the remaining error; these data cannot decide."
     if d.verdict != "unknown_effect":
         none = f"probability of none: {say.probability(d.probability_nothing)}"
-        if d.probability_nothing < LIKELY_NONE:
+        if d.doubtful:
             return f"{NONE_NAMED} ({none})."
         return f"No further effect exceeds the noise; {none}."
     where = location_text(d.location) if d.location else ""
