@@ -113,16 +113,6 @@ def run():
     Late()
     time.sleep(60)
 """,
-    "by a library": """
-from elastocal.screen import interrupt_check
-def run():
-    check = interrupt_check()
-    try:
-        signal.raise_signal(signal.SIGINT)
-    except KeyboardInterrupt:
-        pass
-    check()
-""",
     "by nobody, when Python is half taken down": """
 class Late:
     def __del__(self, kill=os.kill, number=os.getpid(), interrupt=signal.SIGINT):

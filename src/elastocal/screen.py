@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from time import monotonic
 from types import FrameType
-from typing import TYPE_CHECKING, Any, Self, TextIO, cast
+from typing import TYPE_CHECKING, Any, Self
 
 from elastocal.text import printable
 
@@ -48,32 +48,10 @@ codecs.register_error("elastocal", _spelt)
 
 
 def prepare_streams() -> None:
-    """Have stdout and stderr spell out what their encoding lacks, instead of failing.
-
-    What CasADi writes to stderr is dropped: what comes of it is judged where it is used.
-    """
+    """Have stdout and stderr spell out what their encoding lacks, instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="elastocal")
-    if sys.stderr is not None:
-        sys.stderr = cast(TextIO, _WithoutCasadi(sys.stderr))
-
-
-class _WithoutCasadi:
-    """A stream without the lines of CasADi, which come in pieces, the first one "CasADi - "."""
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream, self._dropping = stream, False
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._stream, name)
-
-    def write(self, text: str) -> int:
-        self._dropping |= text.startswith("CasADi - ")
-        if not self._dropping:
-            return self._stream.write(text)
-        self._dropping = not text.endswith("\n")
-        return len(text)
 
 
 def close_streams() -> None:
@@ -131,21 +109,6 @@ def _note(number: int, frame: FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
-def interrupt_check() -> Callable[[], None]:
-    """Raises KeyboardInterrupt, whenever it is called, where one came since now.
-
-    CasADi catches one inside a solver and returns where the search stood: without the check the
-    work would go on, with results that depend on when the key was pressed.
-    """
-    before = len(interrupts)
-
-    def check() -> None:
-        if len(interrupts) > before:
-            raise KeyboardInterrupt
-
-    return check
-
-
 GRACE = 30.0  # s that running tasks of a study are waited for
 
 
@@ -153,8 +116,8 @@ class StudyStop:
     """Ctrl-C and SIGTERM: in a `with` block, `asked` says that no more tasks may be handed out.
 
     A second signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check`
-    raises it again: CasADi catches one inside a solver and returns where the search stood, and
-    such a result must not be kept.
+    raises it again: a task's library may catch one and return where its search stood, and such a
+    result must not be kept.
     """
 
     def __init__(self, grace: float = GRACE, tell: Callable[[str], None] | None = None) -> None:

@@ -1,6 +1,5 @@
 """An interrupted design goes on where it was, and ends as if nothing had happened."""
 
-import contextlib
 import signal
 import subprocess
 import sys
@@ -17,8 +16,7 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.planning import checkpoint, search
-from elastocal.screen import noting_interrupts
+from elastocal.planning import checkpoint
 
 GOING_ON = "resuming the interrupted design"
 # A child may inherit that SIGINT is ignored; here it must not.
@@ -66,25 +64,6 @@ def test_it_goes_on_and_ends_with_the_same_plan(tmp_path, monkeypatch, whole, ed
     assert edited != ((tmp_path / "plan.csv").read_bytes() == whole)
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 6 - edited
     assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
-
-
-def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
-    """A library may catch it and return a search cut short, which must not be kept."""
-    polish = search.polish
-
-    def interrupted_polish(*arguments, **options):
-        with contextlib.suppress(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-        return polish(*arguments, **options)
-
-    cell = write_cell(tmp_path, altered(DEFLECTION, poses="2", candidates="20"))
-    arguments = ("design", cell, "-o", tmp_path / "plan.csv", "-q")
-    with monkeypatch.context() as patch, noting_interrupts():  # as the command itself does
-        patch.setattr(search, "polish", interrupted_polish)
-        result = elastocal(*arguments)
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    assert result.exit_code == 130
-    assert stages_in(tmp_path / "plan.csv.resume") == {"candidates", "exchange"}
 
 
 def stages_in(begun):

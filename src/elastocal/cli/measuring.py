@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from itertools import groupby
@@ -29,7 +28,7 @@ from elastocal.cli.app import (
     whole_numbers,
 )
 from elastocal.errors import InputError, require
-from elastocal.screen import interrupt_check, say
+from elastocal.screen import interrupts, say
 from elastocal.text import listed
 
 if TYPE_CHECKING:
@@ -211,12 +210,7 @@ def design(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
     )  # fmt: skip
-    check = interrupt_check()
-    with run.progress() as tell:
-
-        def progress(message: str) -> None:
-            check()
-            tell(message)
+    with run.progress() as progress:
 
         def chosen(path: Path) -> None:
             from elastocal.diagnosis.diagnose import write_extended_cell
@@ -233,7 +227,7 @@ def design(
         pinned = [plan_and_names(asked[name])[0] for name in ("keep", "strike") if name in asked]
         stated = [asked.get(name) for name in ("augment", "knowledge")]
         files = run.reads(cell, *stated, *pinned, *files_of(wanted))
-        plan, checkpoint = _resumed(wanted, options, output, files, asked, check, progress)
+        plan, checkpoint = _resumed(wanted, options, output, files, asked, progress)
         progress("writing")
         texts = _programs(programs, plan.model.cell, plan)
         page = partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())
@@ -254,7 +248,7 @@ def design(
 
 def _resumed(
     cell: Cell, options: DesignOptions, output: Path, files: list[Path], asked: Asked,
-    check: Callable[[], None], progress: Progress,
+    progress: Progress,
 ) -> tuple[Plan, Checkpoint]:  # fmt: skip
     """The plan, where an interrupted run of the same input left off, and what that left."""
     from elastocal.planning.checkpoint import Checkpoint, key_of
@@ -262,19 +256,17 @@ def _resumed(
 
     apart = ("jobs", "augment", "knowledge")  # these are among the files
     told = {name: value for name, value in asked.items() if name not in apart}
-    checkpoint = Checkpoint.beside(output, key_of(files, **told), check)
+    checkpoint = Checkpoint.beside(output, key_of(files, **told))
     if checkpoint.begun:
         progress("resuming the interrupted design")
+    before = len(interrupts)
     try:
-        plan = run(cell, options, checkpoint, progress)
+        return run(cell, options, checkpoint, progress), checkpoint
     except Exception as error:
-        check()
-        if not isinstance(error, OSError):
+        if not isinstance(error, OSError) and len(interrupts) == before:
             # The same input ends here again: there is nothing to go on with.
             checkpoint.clear()
         raise
-    check()
-    return plan, checkpoint
 
 
 def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> str:

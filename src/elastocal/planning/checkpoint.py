@@ -37,16 +37,15 @@ def key_of(files: Iterable[Path], **options: object) -> str:
 @dataclass(frozen=True)
 class Checkpoint:
     """What the stages of a design have finished, `kept` as arrays STAGE/NAME and in a file beside
-    its output; nowhere if `path` is None.  `check` is called before anything is kept: it raises
-    where work was interrupted.  `prefix`: of one of several plans that the design searches."""
+    its output; nowhere if `path` is None.  `prefix`: of one of several plans that the design
+    searches."""
 
     path: Path | None = None
-    check: Callable[[], None] = lambda: None
     prefix: str = ""
     kept: dict[str, NDArray] = field(default_factory=dict)
 
     @classmethod
-    def beside(cls, output: Path, key: str, check: Callable[[], None] = lambda: None) -> Checkpoint:
+    def beside(cls, output: Path, key: str) -> Checkpoint:
         """In the file `OUTPUT.resume`, which other input or options begin anew, once they have
         something to keep.  Raises InputError where something else has that name."""
         path, kept = output.with_name(output.name + ".resume"), {KEY: np.array(key)}
@@ -61,7 +60,7 @@ class Checkpoint:
                 "elsewhere, or name another -o",
             )
             kept = saved if str(saved[KEY]) == key else kept
-        return cls(path, check, kept=kept)
+        return cls(path, kept=kept)
 
     @property
     def begun(self) -> bool:
@@ -74,7 +73,6 @@ class Checkpoint:
         if own:
             return own
         made = {at: np.asarray(value) for at, value in make().items()}
-        self.check()
         if self.path is None:
             return made
         self.kept.update({name + at: value for at, value in made.items()})
