@@ -209,6 +209,11 @@ class Gap:
         return self.unexplained**2 / excess if excess > 0 else 0.0
 
     @property
+    def scatters(self) -> bool:
+        """Whether what is unexplained is worth telling: above 0.2 of the noise, 2 % more in all."""
+        return self.unexplained > 0.2 * self.noise_floor
+
+    @property
     def open(self) -> bool:
         """Whether no verdict may call the gap explained, or nothing: what is unexplained is more
         than the noise, and more than LARGE of the gap."""

@@ -30,7 +30,6 @@ MOST_NAMED = 6
 MOST_IN_HEADLINE = 3
 FEW = 2  # effects whose shapes stand open
 FINE = 0.1  # fraction below which a tenth of a percent is told
-MATERIAL = 0.2  # of the noise: 2 % more in all
 ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
 MOMENTS = ("jump_time_s", "slip_time_s")
 NAMELESS = "without a name"
@@ -229,7 +228,7 @@ def location_text(location: Location) -> str:
 
 def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
     yield "Error", _error_line(d)
-    if d.gap.unexplained > MATERIAL * d.gap.noise_floor:  # what looks like noise and is none
+    if d.gap.scatters:  # what looks like noise and is none
         yield (
             "Error",
             f"{say.length(d.gap.unexplained)} rms are unexplained: they look like scatter of the "

@@ -160,18 +160,14 @@ def stop_table(plan: Plan) -> say.ShownTable:
     return say.ShownTable(heads, rows, (2,) if loads else (), title="Stops in order")
 
 
-APART = 0.02  # of the criterion, between starts of the search: more of them may find better
-VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread as its weights are
-
-
 def plan_headline(plan: Plan) -> str:
     text = f"{say.counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
         text += f"position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
     else:
         text += f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
-    found, better = plan.certificate.efficiency_pool, plan.certificate.better_pool
-    if found is None or better is None or found < VAIN:
+    better = plan.certificate.better_pool
+    if better is None or plan.certificate.vain:
         return f"{text}; no bound on the best plan is known."
     away = 100 * better
     text += "; no other plan from these candidates is "
@@ -206,8 +202,7 @@ def plan_steps(plan: Plan) -> list[str]:
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses for a value, "
             f"{option('curve')} compares numbers of poses."
         )
-    ends = plan.certificate.starts
-    if len(ends) > 1 and max(ends) - min(ends) > APART * max(abs(end) for end in ends):
+    if plan.certificate.starts_apart:
         steps.append(f"For a better plan: {option('effort', 'thorough')}, which has more starts.")
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
@@ -353,13 +348,13 @@ def _certificate_lines(plan: Plan) -> Told:
         yield "Certificate", f"none: {plan.criterion} {reason}, so no bound is known."
         return
     told = "" if bound is None else f" (bound {name} = {bound:.4g}{unit})"
-    efficiency = f"{found:.4f}" if found >= VAIN else f"{found:.1g}"
+    efficiency = f"{found:.1g}" if c.vain else f"{found:.4f}"
     yield (
         "Certificate",
         f"certified on the pool: efficiency {efficiency} (in readings) against the best subset of "
         f"the {c.pool} candidates with the same number per level{told}.",
     )
-    if found < VAIN:
+    if c.vain:
         yield (
             "Certificate",
             "with so few poses the bound says nothing: the relaxation spreads weights over many "
