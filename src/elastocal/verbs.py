@@ -236,36 +236,28 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     """[design] of the cell with what is asked for, checked by it, in its place."""
     import numpy as np
 
-    from elastocal.cell.plan_wishes import (
-        CANDIDATES,
-        DesignSpec,
-        Motion,
-        TargetBox,
-        TargetPath,
-        TargetPose,
-        of_candidates,
-    )
+    from elastocal.cell import plan_wishes as wish
     from elastocal.planning.criteria import criterion_named
 
     def test_poses(given: Any) -> tuple[TargetPose, ...]:
         require(np.ndim(given) > 0, f"{option('test_poses')} takes joints by pose; found {given}")
-        if all(isinstance(pose, TargetPose) for pose in given):
+        if all(isinstance(pose, wish.TargetPose) for pose in given):
             return tuple(given)
-        return tuple(TargetPose(q) for q in np.atleast_2d(np.asarray(given, dtype=float)))
+        return tuple(wish.TargetPose(q) for q in np.atleast_2d(np.asarray(given, dtype=float)))
 
     made: dict[str, Callable[[Any], Any]] = {
         "criterion": lambda name: criterion_named(name, option("criterion")) and name,
         "interest": lambda names: _names("interest", names),
         "loads": lambda forces: np.atleast_2d(np.asarray(forces, dtype=float)),
         "test_poses": test_poses,
-        "test_path": lambda path: TargetPath(Path(path)) if isinstance(path, str | Path) else path,
-        "test_box": lambda box: box if isinstance(box, TargetBox) else TargetBox(*box),
+        "test_path": lambda at: wish.TargetPath(Path(at)) if isinstance(at, str | Path) else at,
+        "test_box": lambda box: box if isinstance(box, wish.TargetBox) else wish.TargetBox(*box),
     }
     chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
     chosen = {key: made[key](v) if key in made else v for key, v in chosen.items()}
     if "candidates" in chosen:
-        told = f"takes {CANDIDATES}; found {quoted(chosen['candidates'])}"
-        found = of_candidates(chosen["candidates"])
+        told = f"takes {wish.CANDIDATES}; found {quoted(chosen['candidates'])}"
+        found = wish.of_candidates(chosen["candidates"])
         require(found is not None, f"{option('candidates')} {told}")
         given, taught = found or (None, None)
         given = None if given is None else whole("candidates", given, 1)
@@ -282,12 +274,12 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
             require(not (chosen[key] and chosen.get(other)), told)
             chosen.setdefault(other, None)
     motion = {
-        key: _wish(Motion, key, chosen.pop(key))
+        key: _wish(wish.Motion, key, chosen.pop(key))
         for key in ("load_changes", "reference_every") if key in chosen
     }  # fmt: skip
     if motion:
         chosen["motion"] = replace(chosen.get("motion", cell.design.motion), **motion)
-    chosen = {key: _wish(DesignSpec, key, value) for key, value in chosen.items()}
+    chosen = {key: _wish(wish.DesignSpec, key, value) for key, value in chosen.items()}
     # What the cell says of the number of poses gives way to what is asked for here.
     number: dict[str, Any] = {"minutes": None} if wishes else {}
     if "poses" in chosen or "minutes" in chosen:

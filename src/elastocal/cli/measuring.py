@@ -228,7 +228,8 @@ def design(
         stated = [asked.get(name) for name in ("augment", "knowledge")]
         files = run.reads(cell, *stated, *pinned, *files_of(wanted))
         plan, checkpoint = _resumed(wanted, options, output, files, asked, progress)
-        progress("writing")
+        if report is not None:
+            progress("writing the report")
         texts = _programs(programs, plan.model.cell, plan)
         page = partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())
         run.write(

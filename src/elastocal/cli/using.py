@@ -372,18 +372,8 @@ def compensate(
         box (X0,Y0,Z0,X1,Y1,Z1): Grid over this box in mm in the base frame, not over the joints.
         rotation (RX,RY,RZ): Rotation vector of the tool in --box, in degrees.
     """
-    from elastocal.compensation.compensate import (
-        check_reached,
-        commands_csv,
-        one_target,
-        summary,
-    )
-    from elastocal.compensation.correction_table import (
-        correction_table,
-        grid_of,
-        posture_of,
-        summary_and_csv,
-    )
+    from elastocal.compensation import compensate as single
+    from elastocal.compensation import correction_table as grids
     from elastocal.files import atomic_write
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated, tool_point
@@ -400,21 +390,21 @@ def compensate(
         progress("reading")
         arm = read_calibrated(cell, result, run.plugins)
         run.reads(cell, result, targets, cell=arm.model.cell)
-        start = posture_of(arm, near)
+        start = grids.posture_of(arm, near)
         counts = tuple(whole_numbers(grid, GRID))
-        lines = None if table is None else grid_of(arm, counts, box, rotation)
-        wanted = targets if target is None else one_target(target, asked["frame"], force)
+        lines = None if table is None else grids.grid_of(arm, counts, box, rotation)
+        wanted = targets if target is None else single.one_target(target, asked["frame"], force)
         if wanted is not None:
             found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
             if not partial:
-                check_reached(found)
+                single.check_reached(found)
             kinds = found.chain.kinds
-            content["commands"] = summary(found, kinds, commands=output is None)
-            commands = commands_csv(found, kinds)
+            content["commands"] = single.summary(found, kinds, commands=output is None)
+            commands = single.commands_csv(found, kinds)
         if table is not None and lines is not None:
             where = tool_point(arm.model.cell, asked.get("point"))
-            made = correction_table(arm, lines, where, force, start, asked["seed"], progress)
-            content["table"], corrections = summary_and_csv(made, arm, partial)
+            made = grids.correction_table(arm, lines, where, force, start, asked["seed"], progress)
+            content["table"], corrections = grids.summary_and_csv(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(
             (output, lambda path: atomic_write(path, commands)),
