@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 else:
     globals().update(later(
-        *(f"elastocal.{room} {names}" for room, names in ROOMS.items()),
+        *(f"elastocal.{room} {told}" for room, told in ROOMS.items() if room != "errors"),
         "numpy.typing ArrayLike",
         "pandas DataFrame",
         "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
