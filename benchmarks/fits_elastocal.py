@@ -30,7 +30,7 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
     every = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
     problem = Problem(model, observed, weights, start_values(model, table), every)
-    _, found, reduction, *_ = settle(problem, sizes_and_check(problem))
+    found, reduction, _ = settle(problem, sizes_and_check(problem))
     found.cofactor()
     return found.x, len(reduction.kept)
 

@@ -174,8 +174,8 @@ def profile(y, constraints=()):
     (b1, b0), (rss,), *_ = np.polyfit(X, y, 1, full=True)
     model, start = AnyModel(lambda b, x: b[1] * (x - b[0]), 2, X), np.array([-b0 / b1, b1])
     sigma = float(np.sqrt(rss / 10))
-    stated = model.names, np.arange(2), start, Constraints(constraints), None, sigma
-    known = PriorRows.stated(*stated)
+    system = Constraints(constraints).resolve(model.names)
+    known = PriorRows(np.zeros((0, 2)), np.zeros(0), system)
     found = KnownFit(fitted(model, y, start, np.ones(2), known=known)[0], known, sigma)
     return found.fit.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
 

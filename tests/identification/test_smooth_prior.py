@@ -23,7 +23,7 @@ def drawn(seed: int, scale: tuple[float, ...] = (1.0, 1.0, 1.0), sigma: float = 
 
 
 def linear(B, e) -> LinearRows:
-    return LinearRows.of(RFactor.of(B, e), np.zeros(SHRUNK), STD, GROUP)
+    return LinearRows(RFactor.of(B, e), STD, GROUP)
 
 
 def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]:

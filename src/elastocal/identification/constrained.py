@@ -33,18 +33,12 @@ def equality_space(A: Array, b: Array) -> tuple[Array, Array, float]:
     """All x with A x = b (k, p), or the least-squares ones where the rows contradict each other:
     the shortest (p,), an orthonormal basis (p, q) of the way to the others, and the largest
     |A x − b| left, of unit rows."""
-    p = A.shape[1]
     norms = np.linalg.norm(A, axis=1)
-    rows = A[norms > 0] / norms[norms > 0, None]
-    values = b[norms > 0] / norms[norms > 0]
-    if not len(rows):
-        return np.zeros(p), np.eye(p), float(np.max(np.abs(b), initial=0.0))
-    Q, R, _ = linalg.qr(rows.T, pivoting=True)
-    sizes = np.abs(np.diag(R))
-    rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
-    origin = Q[:, :rank] @ least_norm(rows @ Q[:, :rank], values)
-    gap = float(np.max(np.abs(rows @ origin - values)))
-    return origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0)))
+    unit = np.where(norms > 0, norms, 1.0)
+    # With a row of zeros, which leaves every way open: LAPACK takes no matrix without rows.
+    rows, values = np.vstack([A / unit[:, None], np.zeros(A.shape[1])]), np.append(b / unit, 0.0)
+    origin = least_norm(rows, values, cond=RANK)
+    return origin, linalg.null_space(rows, RANK), float(np.abs(rows @ origin - values).max())
 
 
 # The answer.

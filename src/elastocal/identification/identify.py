@@ -20,13 +20,11 @@ from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
-    LEVEL,
     Covariance,
     PriorRows,
     Problem,
     Rows,
     clustered,
-    t_quantile,
     variance_of,
 )
 from elastocal.identification.mistakes import refuse_nonsense
@@ -159,7 +157,8 @@ def _fitted(
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
-    smooth = bool(model.shrunk[free].any())
+    if smooth := bool(model.shrunk[free].any()):
+        options.check_functions()
     every = _solution(model, observed, x0, ordinary(model, free), options, progress, not smooth)
 
     def refit(good: NDArray[np.bool_]) -> Solution:
@@ -499,7 +498,7 @@ def refined(
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
     found = fit_kept(problem, start.sizes, x, start.reduction)
-    return replace(start, problem=problem, fit=found)
+    return replace(start, fit=found)
 
 
 # Configurations per parameter from which the scatter of those of a large table counts.
@@ -533,15 +532,14 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     if kind in ("auto", "classical"):
         return classical
     if kind == "profile":
-        from elastocal.identification.knowledge_fit import KnownFit, profile_end
+        from elastocal.identification.knowledge_fit import KnownFit, intervals_with_knowledge
 
-        names, none = problem.model.names, Constraints()
-        known = PriorRows.stated(names, fit.columns, fit.x, none, None, sigma)
-        found, rises = KnownFit(fit, known, sigma), (sigma * t_quantile(LEVEL, classical.dof)) ** 2
-        ends = [[profile_end(found, k, float(rise), side) for side in (-1, 1)]
-                for k, rise in enumerate(rises)]  # fmt: skip
+        free = Constraints().resolve([problem.model.names[c] for c in fit.columns])
+        known = PriorRows(np.zeros((0, len(fit.columns))), np.zeros(0), free)
+        many = np.zeros(len(fit.columns), dtype=bool)
+        own = intervals_with_knowledge(KnownFit(fit, known, sigma), classical.dof, kind, many)
         text = "profile of the nonlinear sum of squares (all readings independent)"
-        return replace(classical, kind="profile", description=text, ends=np.array(ends))
+        return replace(classical, kind=kind, description=text, ends=own.ends)
     V = fit.r_factor.half
 
     def rows(part: Part) -> Rows:
@@ -570,11 +568,10 @@ def run_method(
     they know nothing of smooth functions among the parameters `free`.  Constraints and prior come
     last, on the weights and the readings that the method ends with.
     """
-    own = None
     if every.problem.model.shrunk[free].any():
         from elastocal.identification.smooth_fit import fit_smooth  # few models have any
 
-        found, own = fit_smooth(every, sound, faulty, free, options, progress)
+        found = fit_smooth(every, sound, faulty, free, options, progress)
     elif options.knows:
         alone = replace(options, constraints=None, prior=None, intervals="auto")
         found = _by_method(every, sound, faulty, refit, alone, progress)
@@ -585,7 +582,7 @@ def run_method(
         return found
     from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
 
-    return fit_with_knowledge(found, options, progress, own)
+    return fit_with_knowledge(found, options, progress)
 
 
 def _by_method(
@@ -681,7 +678,7 @@ def _holding(
     fit = fit_kept(problem, solution.sizes, solution.fit.x, reduction)
     if not fit.converged:
         return None
-    solution = replace(solution, problem=problem, fit=fit, reduction=reduction)
+    solution = replace(solution, fit=fit, reduction=reduction)
     if noise is not None:
         observed = every.problem.observations
         readings = linearised(problem.model, observed, fit.x, reduction.kept)

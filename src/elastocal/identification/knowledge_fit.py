@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg, special
+from scipy import special
 
 from elastocal.errors import ElastocalError, InsufficientDataError, option, require
 from elastocal.identification.constrained import Minimum, Reduced
-from elastocal.identification.knowledge import Constraints, GaussianPrior, share_of_prior
+from elastocal.identification.knowledge import Constraints, share_of_prior
 from elastocal.identification.least_squares import (
     LEVEL,
     Covariance,
@@ -20,7 +20,7 @@ from elastocal.identification.least_squares import (
     t_quantile,
 )
 from elastocal.identification.least_squares import fit as least_squares
-from elastocal.identification.options import FunctionPrior, MethodResult, Options
+from elastocal.identification.options import MethodResult, Options
 from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
@@ -31,7 +31,7 @@ from elastocal.identification.solve import (
 )
 from elastocal.identification.weighted_problem import RFactor, evaluate
 from elastocal.text import listed, quoted
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # A fit with knowledge: where its constraints let it go, and how far.
 
@@ -75,12 +75,7 @@ class KnownFit:
     @cached_property
     def cofactor(self) -> Array:
         """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
-
-    @cached_property
-    def on_face(self) -> Array:
-        """The same with every active constraint taken for an equality."""
-        return self._pinned(self.face)
+        return self.pinned(self.reduced.unit[:, None] * self.reduced.T)
 
     @property
     def covariance(self) -> Array:
@@ -97,7 +92,8 @@ class KnownFit:
         """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
         return self.face.shape[1] - float(((self.known.P @ self.face) ** 2).sum())
 
-    def _pinned(self, half: Array) -> Array:
+    def pinned(self, half: Array) -> Array:
+        """half · halfᵀ in directions (columns, q), without what equalities leave of a parameter."""
         fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
         half = np.where(fixed[:, None], 0.0, half)
         return np.asarray(half @ half.T)
@@ -155,10 +151,8 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
 # Which parameters a fit with constraints and a prior has.
 
 
-def fitted_columns(
-    solution: Solution, constraints: Constraints, prior: GaussianPrior | None, sigma: float
-) -> IntArray:
-    """Indices of the parameters to fit under the constraints and the prior, ascending.
+def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntArray:
+    """Indices of the parameters to fit with what is `stated` of all of them, ascending.
 
     These are the kept parameters of the solution; the free ones that the prior or an equality
     names, for that is knowledge of themselves; and what else the choice of the kept parameters
@@ -166,12 +160,12 @@ def fitted_columns(
     readings of k + d are knowledge of d.  Bounds and matrices make nothing known: they act on the
     fitted parameters, with all others held where the fit held them.
 
-    Raises InputError for a name that is no parameter, or a prior on a parameter that is held fixed;
-    InsufficientDataError where an equality names a parameter that stays undetermined.
+    Raises InputError for a prior on a parameter that is held fixed; InsufficientDataError where an
+    equality names a parameter that stays undetermined.
     """
+    assert stated.system is not None
     problem, kept, model = solution.problem, solution.reduction.kept, solution.problem.model
-    names, free, A = model.names, problem.free, constraints.resolve(model.names).A
-    P = np.zeros((0, len(names))) if prior is None else sigma * prior.rows(names)[0]
+    names, free, P, A = model.names, problem.free, stated.P, stated.system.A
     known, tied = (np.flatnonzero(rows.any(axis=0)) for rows in (P, A))
     fixed = [quoted(names[c]) for c in np.setdiff1d(known, free)]
     require(
@@ -210,7 +204,7 @@ ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
 
 
 def intervals_with_knowledge(
-    found: KnownFit, of_readings: Array, kind: str, many: set[str]
+    found: KnownFit, of_readings: Array, kind: str, many: BoolArray
 ) -> Covariance:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
@@ -220,7 +214,7 @@ def intervals_with_knowledge(
 
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
-    Parameters that are `many`, those of smooth functions, have t intervals in any case.
+    Parameters that are `many` (columns,), those of smooth functions, have t intervals in any case.
     """
     known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
     assert known.system is not None
@@ -238,13 +232,11 @@ def intervals_with_knowledge(
         lower, upper = known.system.lower[:, None], known.system.upper[:, None]
         plain = np.clip(plain, lower, upper)
         return Covariance(name, matrix, dof, f"{text}; assumes normal noise", ends=plain)
-    ends = np.repeat(x[:, None], 2, axis=1)
-    of_functions = np.array([name in many for name in found.names])
-    ends[of_functions] = plain[of_functions]
+    ends = np.where(many[:, None], plain, x[:, None])
     # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
     rises = (found.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
-    for k, name in enumerate(found.names):
-        for end, side in enumerate((-1, 1)) if name not in many else ():
+    for k in np.flatnonzero(~many).tolist():
+        for end, side in enumerate((-1, 1)):
             rise = float(rises[k])
             if kind == "profile":
                 ends[k, end] = profile_end(found, k, rise, side)
@@ -261,90 +253,84 @@ NO_PART = 1e-9  # factors below this share of a typical size are no combination
 CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user knows
 
 
-def joined(stated: GaussianPrior | None, own: GaussianPrior | None) -> GaussianPrior | None:
-    """Both priors; of a parameter that both name, the stated one."""
-    if stated is None or own is None:
-        return own if stated is None else stated
-    rest = [k for k, name in enumerate(own.names) if name not in set(stated.names)]
-    return GaussianPrior(
-        (*stated.names, *(own.names[k] for k in rest)),
-        np.concatenate([stated.mean, own.mean[rest]]),
-        linalg.block_diag(stated.covariance, own.covariance[np.ix_(rest, rest)]),
-    )
-
-
-def fit_with_knowledge(
-    before: MethodResult, options: Options, progress: Progress, own: FunctionPrior | None = None
-) -> MethodResult:
+def fit_with_knowledge(before: MethodResult, options: Options, progress: Progress) -> MethodResult:
     """Minimise |W (y − h(X))|² + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
     W and the readings are those that the method ended with `before`, σ the noise of a whitened row
     under it.  `fitted_columns` says what is fitted, `intervals_with_knowledge` what the intervals
-    are; t intervals have the method's own degrees of freedom.  `own` is the prior of smooth
-    functions, which joins the stated one.
+    are; t intervals have the method's own degrees of freedom.  The prior of smooth functions joins
+    the stated one, which counts where both name a parameter.
 
     Raises InputError for constraints that contradict each other or held values and names that are
     no parameters; InsufficientDataError where an equality names a parameter that readings, prior
     and equalities do not determine.
     """
-    solution = before.solution
-    problem, fit = solution.problem, solution.fit
+    solution, own, names = before.solution, before.functions, before.solution.problem.model.names
+    problem, fit, prior = solution.problem, solution.fit, options.prior
+    sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
+    P, target = np.zeros((0, len(names))), np.zeros(0)
+    if prior is not None:
+        P, target = (sigma * rows for rows in prior.rows(names))
+    stated = len(P)
     if own is not None:
         problem = replace(problem, free=np.union1d(problem.free, fit.columns))
-        solution = replace(solution, problem=problem)
-    constraints = options.constraints or Constraints()
-    prior = joined(options.prior, None if own is None else own.prior)
-    sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
-    columns = fitted_columns(solution, constraints, prior, sigma)
-    stated = PriorRows.stated(problem.model.names, columns, fit.x, constraints, prior, sigma)
-    progress("fitting under constraints" if prior is None else "fitting with the prior")
+        solution = replace(solution, fit=replace(fit, problem=problem))
+        free = ~(P != 0).any(axis=0)[own.columns]
+        ties = PriorRows.near(own.mean[free], own.std[free] / sigma)
+        rows = np.zeros((len(ties.P), len(names)))
+        rows[:, own.columns[free]] = ties.P
+        P, target = np.vstack([P, rows]), np.append(target, ties.target)
+    whole = PriorRows(P, target, (options.constraints or Constraints()).resolve(names))
+    columns = fitted_columns(solution, whole, sigma)
+    known = whole.restricted(columns, fit.x)
+    progress("fitting with the prior" if len(P) else "fitting under constraints")
     found = KnownFit(
-        least_squares(problem, columns, fit.x, solution.sizes, known=stated), stated, sigma
+        least_squares(problem, columns, fit.x, solution.sizes, known=known), known, sigma
     )
-    progress("intervals under constraints" if prior is None else "intervals with the prior")
+    progress("intervals with the prior" if len(P) else "intervals under constraints")
     told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
     spare = own.dof if own else min(told.values())
     dof = np.array([spare if own else told.get(c, spare) for c in columns.tolist()])
-    many = set() if own is None else set(own.prior.names)
+    many = np.isin(columns, [] if own is None else own.columns)
     spread = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
-    shares = {} if prior is None else {
+    shares = {
         name: float(share)
         for c, name, share in zip(columns, found.names, found.prior_share, strict=True)
         if np.isfinite(share) and not problem.model.shrunk[c]
-    }  # fmt: skip
-    fitted = _as_fit(found)
+    } if len(P) else {}  # fmt: skip
     # Linearised, with the active constraints kept active: directions of the face are orthonormal by
     # the rows of readings and prior together.
     heldout, leverage = held_out_by_parts(
         problem.model, problem.parts, found.fit.x, columns, found.face
     )
-    known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
-    doubts = _contradiction(solution, before.spread, found, own)
+    final = replace(
+        solution, fit=_as_fit(found), reduction=_reduction(solution, found), held=heldout
+    )
+    doubts = _contradiction(before, found, stated)
     return replace(
-        before, method="constrained", solution=known, spread=spread,
+        before, method="constrained", solution=final, spread=spread,
         active=found.best.active, prior_share=shares, effective=round(found.effective),
         leverage=leverage, warnings=(*before.warnings, *doubts),
-        smooth=tuple(part.refitted(fitted.x, columns, spread.matrix) for part in before.smooth),
+        smooth=tuple(part.refitted(final.fit.x, columns, spread.matrix) for part in before.smooth),
     )  # fmt: skip
 
 
-def _contradiction(
-    solution: Solution, before: Covariance, found: KnownFit, own: FunctionPrior | None
-) -> tuple[str, ...]:
+def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[str, ...]:
     """A sentence where the objective grew by more than noise explains (F-test).
 
-    Rows of the prior and active constraints count as degrees of freedom, less the parameters they
-    made estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious.
+    The stated prior's `rows` and active constraints count as degrees of freedom, less the
+    parameters they made estimable.  At active bounds the true distribution is smaller (χ̄²): the
+    test is cautious.
     """
-    rows = len(found.known.P) - (0 if own is None else len(own.prior.names))
-    stated = rows + len(found.best.active) - (len(found.names) - len(solution.fit.columns))
+    fit, own = before.solution.fit, before.functions
+    stated = rows + len(found.best.active) - (len(found.names) - len(fit.columns))
     if stated < 1:
         return ()
-    grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
-    dof = max(float(before.dof.min()), 1.0)
+    grown = found.objective - float(fit.whitened @ fit.whitened)
+    dof = max(float(before.spread.dof.min()), 1.0)
     if own is not None:
-        grown, dof = grown - own.stands, own.dof
+        grown, dof = grown - own.squares(fit.x), own.dof
     F = max(grown, 0.0) / (stated * found.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
@@ -365,10 +351,8 @@ def _as_fit(found: KnownFit) -> Fit:
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
     much as the readings of a parameter do.
     """
-    reduced = found.reduced
-    A = reduced.system.A * reduced.unit
-    equalities = A / np.linalg.norm(A, axis=1)[:, None] / reduced.unit
-    rows = np.vstack([reduced.J, equalities])
+    reduced, A = found.reduced, found.reduced.system.A
+    rows = np.vstack([reduced.J, A / np.linalg.norm(A * reduced.unit, axis=1)[:, None]])
     return replace(found.fit, r_factor=RFactor.of(rows, np.append(reduced.t, np.zeros(len(A)))))
 
 
@@ -382,7 +366,7 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     dropped = np.setdiff1d(before.dropped, columns)
     both = np.concatenate([columns, dropped])
     R = evaluate(problem.model, problem.parts, found.fit.x, both).r_factor.R
-    mixing = found.on_face @ (R[:, :k].T @ R[:, k:])
+    mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0
     return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.knowledge import Constraints, GaussianPrior, System
+from elastocal.identification.knowledge import System
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Partition,
@@ -72,18 +72,16 @@ class Problem:
 
 @dataclass(frozen=True)
 class Fit:
-    """Values x (parameters,), raw and whitened residual (rows,), R factor of whitened B and it.
+    """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual.
 
     `columns` (fitted,) index the parameters, `sizes` (parameters,) their typical sizes.
     """
 
     x: Array
     residual: Array
-    whitened: Array
     r_factor: RFactor
     converged: bool
     reason: str
-    steps: int
     problem: Problem = field(repr=False)
     columns: NDArray[np.int64]
     sizes: Array
@@ -93,6 +91,19 @@ class Fit:
         """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
         observed = self.problem.observations
         return self.problem.model.regressor(observed.table, self.x, self.columns, observed).B
+
+    @cached_property
+    def whitened(self) -> Array:
+        """The whitened residual (rows,)."""
+        return self.problem.weights.apply(self.residual)
+
+    @cached_property
+    def of_free(self) -> RFactor:
+        """The R factor of all free columns at x."""
+        problem = self.problem
+        if np.array_equal(self.columns, problem.free):
+            return self.r_factor
+        return evaluate(problem.model, problem.parts, self.x, problem.free).r_factor
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
@@ -113,19 +124,12 @@ class PriorRows:
         """X ~ N(centre, width²) in units of the noise, (columns,) each."""
         return cls(np.diag(1 / width), centre / width)
 
-    @classmethod
-    def stated(
-        cls, names: tuple[str, ...], columns: IntArray, x: Array, constraints: Constraints,
-        prior: GaussianPrior | None, sigma: float,
-    ) -> PriorRows:  # fmt: skip
-        """Constraints and prior on the `columns`, the others held at x (parameters,), beside rows
-        of noise `sigma`.  Raises InputError where a held parameter alone breaks a constraint."""
-        P, target = np.zeros((0, len(columns))), np.zeros(0)
-        if prior is not None:
-            P, target = prior.rows(names)
-            held = np.setdiff1d(np.arange(len(x)), columns)
-            P, target = sigma * P[:, columns], sigma * (target - P[:, held] @ x[held])
-        return cls(P, target, constraints.resolve(names).restricted(columns, x))
+    def restricted(self, columns: IntArray, x: Array) -> PriorRows:
+        """What it says of the `columns`, the others held at x.  Raises InputError where these alone
+        break a constraint."""
+        held = moved(x, columns, -x[columns])
+        system = None if self.system is None else self.system.restricted(columns, x)
+        return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
 
 
 @dataclass(frozen=True)
@@ -195,9 +199,9 @@ class Objective:
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
-    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Evaluation, str, int]:
+    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Evaluation, str]:
         """Full Gauss–Newton steps while they lower the cost, damped ones where they do not: where
-        they end, why, and after how many evaluations.
+        they end, and why.
 
         Ends where the linearised cost promises less than `tolerance` of itself: that last step is
         still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
@@ -205,14 +209,13 @@ class Objective:
         ending.
         """
         at = self.evaluate(u)
-        cost, damping, evaluations = self.cost(u, at), 0.0, 1
+        cost, damping = self.cost(u, at), 0.0
         failed = -1.0  # the damping that was too little a step ago
-        while evaluations < most:
+        for _ in range(most - 1):
             step, promised = self.step(u, at, damping)
             last, small = promised <= tolerance * cost, np.abs(step).max(initial=0.0) <= ROUNDING
             if last and small:
-                return u, at, NEGLIGIBLE, evaluations
-            evaluations += 1
+                return u, at, NEGLIGIBLE
             try:
                 trial = self.evaluate(u + step)
                 trial_cost = self.cost(u + step, trial)
@@ -220,16 +223,16 @@ class Objective:
                 trial, trial_cost = at, np.inf
             if last and (damping == 0 or failed >= 0):  # more than what is left is not to be had
                 kept = trial_cost <= cost * (1 + ROUNDING)
-                return (*((u + step, trial) if kept else (u, at)), SETTLED, evaluations)
+                return (*((u + step, trial) if kept else (u, at)), SETTLED)
             if cost - trial_cost > 1e-4 * promised:
                 u, at, cost = u + step, trial, trial_cost
                 less = damping / 10 if damping > LEAST_DAMPING * _steepest(at) else 0.0
                 damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
             elif small:
-                return u, at, NEGLIGIBLE, evaluations
+                return u, at, NEGLIGIBLE
             else:
                 failed, damping = damping, self._shortened(u, at, damping, step)
-        return u, at, EXHAUSTED, evaluations
+        return u, at, EXHAUSTED
 
     def _shortened(self, u: Array, at: Evaluation, damping: float, step: Array) -> float:
         """The damping with which a step that failed has at most SHORTER of its length."""
@@ -279,11 +282,10 @@ def fit(
     objective = Objective(problem, columns, x, size, known)
     if objective.limits is not None:  # the nearest that is allowed
         u = _least(np.eye(len(u)), u, objective.limits)
-    u, at, reason, evaluations = objective.descend(u, tolerance, max_steps)
+    u, at, reason = objective.descend(u, tolerance, max_steps)
     return Fit(
-        objective.values(u), at.residual, problem.weights.apply(at.residual),
-        at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason, evaluations, problem, columns,
-        sizes,
+        objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
+        problem, columns, sizes,
     )  # fmt: skip
 
 
@@ -326,16 +328,12 @@ class Covariance:
         with v itself for the latter, what the models differ by would count twice.
         """
         typical = float(np.median(self.dof)) if len(self.dof) else np.inf
-        x = self._apart(rows)
+        v = np.maximum(variance_of(rows, self.matrix), 1e-300)
+        parts = (w * (variance_of(rows, matrix) / v - 1) ** 2 / 2 for w, matrix in self.among)
+        x = sum(parts, np.zeros(len(v)))
         unsure = 1 / max(typical, 1e-300) + x / (1 + 4 * x)
         dof = np.divide(1, unsure, out=np.full(len(x), np.inf), where=unsure > 0)
         return dof, (1 + 2 * x) / (1 + 4 * x)
-
-    def _apart(self, rows: Array) -> Array:
-        """x (n,) of the combinations `rows`: by how much the models differ."""
-        v = np.maximum(variance_of(rows, self.matrix), 1e-300)
-        parts = (w * (variance_of(rows, matrix) / v - 1) ** 2 / 2 for w, matrix in self.among)
-        return sum(parts, np.zeros(len(v)))
 
     def interval(self, x: Array, level: float = LEVEL) -> Array:
         """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,); std_j by the

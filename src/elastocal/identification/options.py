@@ -132,6 +132,22 @@ class SmoothPart:
 
 
 @dataclass(frozen=True)
+class FunctionPrior:
+    """What smooth functions bring into a fit: their parameters `columns` (k,) about `mean` (k,)
+    with deviations `std` (k,), and the noise `sigma` of a whitened row, known with `dof`."""
+
+    columns: IntArray
+    mean: Array
+    std: Array
+    sigma: float
+    dof: float
+
+    def squares(self, x: Array) -> float:
+        """Their part of a fit's objective at x (parameters,), in units of whitened rows."""
+        return float((((x[self.columns] - self.mean) * self.sigma / self.std) ** 2).sum())
+
+
+@dataclass(frozen=True)
 class MethodResult:
     """The final fit, its `spread`, and the noise where it was estimated.
 
@@ -139,9 +155,9 @@ class MethodResult:
     fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
     many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
     the readings contradict them; in a fit to readings alone effective and leverage follow from
-    the solution.  `smooth` are the smooth functions, with which `standard` (N, size) are the
-    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
-    the parameters that the readings `hardly_shown`, by their index.
+    the solution.  `smooth` are the smooth functions, whose prior is `functions`, with which
+    `standard` (N, size) are the residuals of all readings free of the fit's part in them.  `limits`
+    are the 95 % intervals of the parameters that the readings `hardly_shown`, by their index.
     """
 
     method: str
@@ -155,6 +171,7 @@ class MethodResult:
     leverage: Array | None = None
     warnings: tuple[str, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
+    functions: FunctionPrior | None = None
     standard: Array | None = None
     limits: dict[int, tuple[float, float]] = field(default_factory=dict)
 
@@ -162,18 +179,6 @@ class MethodResult:
     def ci95(self) -> Array:
         """The 95 % intervals (fitted, 2)."""
         return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
-
-
-@dataclass(frozen=True)
-class FunctionPrior:
-    """What smooth functions bring into a fit: the `prior` of their parameters, the noise `sigma`
-    of a whitened row beside them and its degrees of freedom `dof`, and where the prior's part of
-    the objective `stands` in the fit without further knowledge."""
-
-    prior: GaussianPrior
-    sigma: float
-    dof: float
-    stands: float
 
 
 # How to identify: method, noise, what is held, what becomes of faulty readings.
@@ -257,12 +262,17 @@ class Options:
             )
         if self.knows:
             remedy = f"with these there are {', '.join(WITH_KNOWLEDGE)}"
-            self.check_prior("neither constraints nor a prior", ROBUST, WITH_KNOWLEDGE, remedy)
+            self._refuse(ROBUST, WITH_KNOWLEDGE, "neither constraints nor a prior", remedy)
 
-    def check_prior(
-        self, what: str, without: tuple[str, ...], intervals: tuple[str, ...], remedy: str
+    def check_functions(self) -> None:
+        """Raise InputError for methods and intervals that take no prior, as functions have."""
+        without = (*ROBUST, "eq14", "eq14-residual")
+        what = "no prior, which smooth functions have"
+        self._refuse(without, ("auto", "classical"), what, "leave it away")
+
+    def _refuse(
+        self, without: tuple[str, ...], intervals: tuple[str, ...], what: str, remedy: str
     ) -> None:
-        """Raise InputError for a method `without` a prior (`what` in words), or other intervals."""
         if self.resolved in without:
             raise InputError(
                 f"the method {self.resolved} takes {what}; use the default method, which excludes "

@@ -717,8 +717,8 @@ def robust_result(
         x[kept] += found.x
         steps += 1
     fit = replace(
-        sound.fit, x=x, residual=at.residual, whitened=e, converged=converged, steps=steps,
-        problem=problem, columns=kept, sizes=sound.sizes,
+        sound.fit, x=x, residual=at.residual, converged=converged, columns=kept,
+        problem=replace(problem, x0=sound.problem.x0),
         reason=sound.fit.reason if converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
@@ -729,7 +729,6 @@ def robust_result(
     heldout = held_out_residual(
         fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
     )
-    problem = replace(problem, x0=sound.problem.x0)
-    solution = replace(sound, problem=problem, fit=fit, held=heldout)
+    solution = replace(sound, fit=fit, held=heldout)
     cluster = None if intervals == "auto" else observed.configuration
     return MethodResult(method, solution, covariance_of(found, B, cluster), None, good)

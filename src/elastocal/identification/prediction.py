@@ -30,7 +30,7 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.least_squares import Covariance, root_of, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.solve import EXACT, Solution, free_r_factor, reduce
+from elastocal.identification.solve import EXACT, Solution, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
@@ -146,10 +146,10 @@ def left_open(
     mixing = np.zeros((len(kept), len(open_)))
     typical = typical_sizes(model.parameters, x, kept)
     if len(open_) and own.any():
-        R = free_r_factor(solution.problem, solution.fit).R[:, : len(free)]
-        R = R * typical[free]
+        R = solution.fit.of_free.R * typical[free]
         columns, rest = np.searchsorted(free, kept[own]), np.searchsorted(free, open_)
-        mixing[own] = _shares(R[:, columns], R[:, rest], typical[kept[own]], typical[open_])
+        shares = least_norm(R[:, columns], R[:, rest], cond=1e-10) * typical[kept[own]][:, None]
+        mixing[own] = np.divide(shares, typical[open_], out=shares, where=typical[open_] > 0)
     names = tuple(model.names[d] for d in open_)
     redundant = _redundant(solution, open_, typical)
     for i, (low, high) in (limits or {}).items():
@@ -194,14 +194,6 @@ def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:
     read = {f"marker:{table.marker_names[m]}" for m in np.unique(table.marker)}
     places = dict.fromkeys(p.where for p in model.parameters if p.where.startswith("marker:"))
     return tuple(place for place in places if place not in read)
-
-
-def _shares(B_K: Array, B_D: Array, kept: Array, left: Array) -> Array:
-    """mixing (K, D) with B_D ≈ B_K · mixing, of columns scaled by the sizes `kept`, `left`."""
-    found = least_norm(B_K, B_D, cond=1e-10)
-    known = left > 0
-    found[:, known] *= kept[:, None] / left[known]
-    return np.asarray(found)
 
 
 def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -> Array:

@@ -20,21 +20,16 @@ import numpy as np
 from scipy import sparse, special
 
 from elastocal.engine.mixed import Products, climb
-from elastocal.identification.knowledge import GaussianPrior, share_of_prior
+from elastocal.identification.knowledge import share_of_prior
 from elastocal.identification.least_squares import Covariance, Fit, PriorRows, Problem
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import (
-    ROBUST,
-    FunctionPrior,
-    MethodResult,
-    Options,
-    SmoothPart,
-)
+from elastocal.identification.options import FunctionPrior, MethodResult, Options, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, choose, is_placed
+from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import (
     Part,
     RFactor,
@@ -67,7 +62,7 @@ SMALL = 0.05
 PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
-CLIMBS, ENOUGH, CURVED = 30, 0.02, 0.3  # of −2ℓ: what the last step may promise; its curvature
+CLIMBS, ENOUGH, CURVED = 30, 1e-3, 0.3  # of −2ℓ: what the last step may promise; its curvature
 
 
 @dataclass(frozen=True)
@@ -83,6 +78,9 @@ class Scales:
     def sigma(self) -> float:
         return float(np.sqrt(self.variance))
 
+    def without(self, g: int) -> Scales:
+        return replace(self, scale=np.where(np.arange(len(self.scale)) == g, 0.0, self.scale))
+
 
 @dataclass(frozen=True)
 class LinearRows:
@@ -96,13 +94,6 @@ class LinearRows:
     std: Array
     group: IntArray
 
-    @classmethod
-    def of(cls, factor: RFactor, away: Array, std: Array, group: IntArray) -> LinearRows:
-        """From the R factor with the functions `away` (shrunk,) from nominal."""
-        rows = factor.augmented.copy()
-        rows[:, -1] += rows[:, len(rows) - 1 - len(away) : -1] @ away
-        return cls(RFactor(rows, factor.rows), std, group)
-
     def only(self, kept: IntArray) -> LinearRows:
         """With the ordinary columns `kept` alone: what the others took is the functions' again."""
         chosen = np.append(kept, np.arange(self.ordinary, self.factor.columns))
@@ -115,29 +106,23 @@ class LinearRows:
     @cached_property
     def products(self) -> Products:
         """Those of B_s and e with the ordinary columns projected out."""
-        S, e = self.factor.augmented[self.ordinary :, self.ordinary : -1], self.factor.augmented
-        left = e[self.ordinary :, -1]
+        rest = self.factor.augmented[self.ordinary :, self.ordinary :]
+        S, left = rest[:, :-1], rest[:, -1]
         spare = max(self.factor.rows - self.ordinary, 1)
         return Products(S.T @ S, S.T @ left, float(left @ left), spare)
 
     def scales(self, start: Scales | None = None) -> Scales:
         """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
         at the `start` stays so."""
-        alive = (
-            np.ones(self.group.max(initial=-1) + 1, dtype=bool)
-            if start is None
-            else start.scale > 0
-        )
-        own = np.flatnonzero(alive[self.group])
-        group = np.unique(self.group[own], return_inverse=True)[1].ravel()
-        whole = self.products
-        products = replace(whole, M=whole.M[np.ix_(own, own)], z=whole.z[own])
-        grown = 2.0 * (group[:, None] == np.arange(int(alive.sum())))
+        products, n = self.products, int(self.group.max(initial=-1)) + 1
+        own = self.group[:, None] == np.arange(n)
+
+        def variances(theta: Array) -> Array:
+            return np.exp(2 * theta[1:])[self.group] * self.std**2
 
         def objective(theta: Array) -> tuple[float, Array, Array]:
             """In log σ and the ½ log λ of the groups."""
-            variances = np.exp(2 * theta[1:])[group] * self.std[own] ** 2
-            value, slope, information = products.objective(variances, grown, float(theta[0]))
+            value, slope, information = products.objective(variances(theta), 2.0 * own, theta[0])
             over = np.maximum(2 * theta[1:], 0.0) / PRICE
             slope[1:] += 4 * over / PRICE
             # What is next to nothing has next to no curvature: no step may be taken for it.
@@ -146,31 +131,32 @@ class LinearRows:
             information[at, at] += 8 / PRICE**2
             return value + float(over @ over), slope, information
 
-        variance, n = max(whole.squares / whole.rows, 1e-300), grown.shape[1]
-        size = 0.5 * np.log([LEAST, MOST])
-        noise = 0.5 * np.log(variance) + np.array([-20.0, 1.0])
-        lower, upper = (np.concatenate([[noise[k]], np.full(n, size[k])]) for k in (0, 1))
+        variance = max(products.squares / products.rows, 1e-300)
+        least, most = 0.5 * np.log([LEAST, MOST])
+        lower = np.append(0.5 * np.log(variance) - 20.0, np.full(n, least))
+        upper = np.append(0.5 * np.log(variance) + 1.0, np.full(n, most))
+        if start is not None:
+            gone = 1 + np.flatnonzero(start.scale == 0)
+            lower[gone], upper[gone] = -np.inf, -np.inf
 
         def found(theta: Array) -> Array:
             return climb(objective, np.clip(theta, lower, upper), lower, upper, ENOUGH, CLIMBS)[0]
 
         if start is None:
             levels = 0.5 * np.log(variance * np.array(SHARES))
-            begun = [np.concatenate([[level], np.zeros(n)]) for level in levels]
+            begun = [np.append(level, np.zeros(n)) for level in levels]
             theta = found(min(begun, key=lambda one: objective(one)[0]))
-            small = theta[1:] < 0.5 * np.log(SMALL)
+            small = np.append(False, theta[1:] < 0.5 * np.log(SMALL))
             if small.any():
-                again = found(np.where(np.concatenate([[False], small]), 0.0, theta))
+                again = found(np.where(small, 0.0, theta))
                 theta = min(theta, again, key=lambda one: objective(one)[0])
         else:
             # From nothing the likelihood shows no way back: what is small begins anew.
-            known = np.where(start.scale[alive] < SMALL, 1.0, start.scale[alive])
-            theta = found(0.5 * np.log(np.concatenate([[start.variance], known])))
-        scale, gain = np.zeros(len(alive)), np.zeros(len(alive))
-        scale[alive] = np.exp(2 * theta[1:])
-        at = products.at(scale[self.group[own]] * self.std[own] ** 2, float(theta[0]))
-        gain[alive] = at.left_out([np.flatnonzero(group == g) for g in range(n)])
-        return Scales(scale, float(np.exp(2 * theta[0])), gain)
+            known = np.where(start.scale < SMALL, 1.0, start.scale)
+            theta = found(0.5 * np.log(np.append(start.variance, known)))
+        at = products.at(variances(theta), theta[0])
+        gain = at.left_out([np.flatnonzero(mine) for mine in own.T])
+        return Scales(np.exp(2 * theta[1:]), float(np.exp(2 * theta[0])), gain)
 
     def posterior(self, scales: Scales) -> Posterior:
         k, std = self.ordinary, np.sqrt(scales.scale / scales.variance)[self.group] * self.std
@@ -193,15 +179,6 @@ class Posterior:
     own: IntArray
     P: Array
 
-    @property
-    def ordinary(self) -> int:
-        return self.r_factor.columns - len(self.own)
-
-    @property
-    def of_own(self) -> Array:
-        """P of the shrunk ones (own, own), diagonal."""
-        return self.P[:, self.ordinary :]
-
     @cached_property
     def half(self) -> Array:
         return self.r_factor.half
@@ -215,9 +192,9 @@ class Posterior:
     def marginal(self) -> RFactor:
         """R of the ordinary columns with the shrunk ones taken for noise,
         RᵀR/σ² = B_fᵀ(σ² + B_sΛB_sᵀ)⁻¹B_f."""
-        last = np.roll(np.arange(self.r_factor.columns), len(self.own))
-        rows = self.r_factor.of_columns(last)
-        return RFactor(rows.augmented[len(self.own) :, len(self.own) :], rows.rows)
+        n = len(self.own)
+        rows = self.r_factor.of_columns(np.roll(np.arange(self.r_factor.columns), n))
+        return RFactor(rows.augmented[n:, n:], rows.rows)
 
     @cached_property
     def cofactor(self) -> Array:
@@ -239,8 +216,7 @@ class Posterior:
 
 STEPS = 25
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
-CHOICES = 3  # of the ordinary parameters, each under the sizes found with the one before
-ROUNDS = 5
+ROUNDS = 6
 # Two readings say the same where what the fit knows of them is that correlated, and their errors
 # differ by less than this share of themselves.
 SAME_POSE, ALIKE = 0.8, 0.5
@@ -254,12 +230,11 @@ LEAST_GAIN, CERTAIN = 0.01, 50.0
 class Functions:
     """What has a prior: columns (shrunk,), in groups (shrunk,) of one scale each.
 
-    First the smooth functions `groups`, then the `sized` parameters, those of an effect at a place
-    that have one unit together.
+    First the smooth functions `groups`, then parameters of known size, those of an effect at a
+    place that have one unit together.
     """
 
     groups: tuple[SmoothGroup, ...]
-    sized: IntArray
     columns: IntArray
     group: IntArray
     std: Array
@@ -278,11 +253,13 @@ class Functions:
         group = np.repeat(np.arange(len(columns)), [len(c) for c in columns])
         every = np.concatenate(columns)
         std = np.array([model.parameters[c].typical for c in every], dtype=float)
-        return cls(tuple(own), sized, every, group, std, model.nominal[every])
+        return cls(tuple(own), every, group, std, model.nominal[every])
 
     def rows(self, factor: RFactor, x: Array) -> LinearRows:
         """From the R factor of the free ordinary columns and these at x."""
-        return LinearRows.of(factor, x[self.columns] - self.nominal, self.std, self.group)
+        rows, away = factor.augmented.copy(), x[self.columns] - self.nominal
+        rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
+        return LinearRows(RFactor(rows, factor.rows), self.std, self.group)
 
 
 def sized_of(model: Model, free: IntArray) -> IntArray:
@@ -294,13 +271,10 @@ def sized_of(model: Model, free: IntArray) -> IntArray:
     stands for all that are not, where these poses cannot tell them apart.  None are where nothing
     would be left without a prior.
     """
-    placed, found = is_placed(model), []
-    for c in free[~model.shrunk[free] & ~placed[free]].tolist():
-        p = model.parameters[c]
-        if p.typical is not None and np.isinf([p.lower, p.upper]).all():
-            found.append(c)
-    left = np.setdiff1d(free[~model.shrunk[free]], found)
-    return np.array(found if len(left) else [], dtype=np.int64)
+    own = ordinary(model, free)
+    known = [p.typical is not None and np.isinf([p.lower, p.upper]).all() for p in model.parameters]
+    found = own[(np.array(known) & ~is_placed(model))[own]]
+    return found if len(found) < len(own) else found[:0]
 
 
 @dataclass(frozen=True)
@@ -325,8 +299,9 @@ class JointFit:
         return apply(at.B @ self.posterior.half), apply(at.residual)
 
     def standardised(self, others: Part | None = None) -> Array:
-        """Residuals (rows,) free of the fit's part in them, in m or rad: of the fit's own readings,
-        configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1 − QQᵀ."""
+        """Residuals (N, size) free of the fit's part in them, in m or rad: of the fit's own
+        readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of
+        1 − QQᵀ."""
         parts, side = self.found.problem.parts, -1
         if others is not None:
             columns = len(self.found.columns)
@@ -346,7 +321,7 @@ class JointFit:
             standard[part.rows] = e
 
         list(each(parts, one))
-        return standard
+        return standard.reshape(-1, parts.observed.size)
 
 
 # The course: fit, noise and faulty readings in turn, then what else may change.
@@ -355,19 +330,14 @@ class JointFit:
 def fit_smooth(
     every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, options: Options,
     progress: Progress,
-) -> tuple[MethodResult, FunctionPrior]:  # fmt: skip
-    """All free parameters fitted together, from fits of the ordinary ones alone, and the prior.
+) -> MethodResult:  # fmt: skip
+    """All free parameters fitted together, from fits of the ordinary ones alone.
 
     `every` holds all observations, `sound` the fit to those that are not `faulty` (N,); both know
     nothing of the smooth functions, whose parameters are among `free`.
-
-    Raises InputError for methods and intervals that take no prior.
     """
-    what = "no prior, which smooth functions have"
-    without = (*ROBUST, "eq14", "eq14-residual")
-    options.check_prior(what, without, ("auto", "classical"), "leave it away")
     model, size, tried = every.problem.model, every.problem.observations.size, []
-    for sized in (sized_of(model, free), np.zeros(0, dtype=np.int64)):
+    for sized in (sized_of(model, free), free[:0]):
         progress("fitting smooth functions")
         search = _Course(every, sound, Functions.of(model, free, sized), options, progress)
         fit, noise, good = search.settled(~faulty)
@@ -392,28 +362,19 @@ def _followed(observed: Observations, group: SmoothGroup) -> Array:
     return np.asarray(table.q[observed.lead, group.joint])
 
 
-def _without(solution: Solution, sized: IntArray) -> Solution:
-    problem, r = solution.problem, solution.reduction
-    kept, dropped = ~np.isin(r.kept, sized), ~np.isin(r.dropped, sized)
-    return replace(
-        solution,
-        problem=replace(problem, free=np.setdiff1d(problem.free, sized)),
-        reduction=replace(
-            r, kept=r.kept[kept], dropped=r.dropped[dropped], mixing=r.mixing[kept][:, dropped],
-            invisible=np.setdiff1d(r.invisible, sized),
-        ),
-    )  # fmt: skip
-
-
 class _Course:
     def __init__(
         self, every: Solution, sound: Solution, functions: Functions, options: Options,
         progress: Progress,
     ) -> None:  # fmt: skip
         self.every, self.options, self.progress = every, options, progress
-        self.sound, self.functions = _without(sound, functions.sized), functions
         self.model, self.observed = every.problem.model, every.problem.observations
-        self.harmful: list[str] = []
+        self.functions, self.harmful = functions, list[str]()
+        own = np.setdiff1d(sound.problem.free, functions.columns)
+        problem = replace(sound.problem, free=own)
+        self.sound = replace(
+            sound, fit=replace(sound.fit, problem=problem), reduction=sound.reduction.among(own)
+        )
         self.estimating = options.resolved == "reml" and not every.problem.large
         # Labels of each reading, and one column that no residual follows: they have paid for the
         # parameters already.
@@ -437,78 +398,53 @@ class _Course:
     ) -> JointFit:  # fmt: skip
         """The fit to readings and prior from x.
 
-        The sizes of the functions are estimated on the way, from `scales` on; which ordinary
-        parameters are fitted is chosen anew beside them, from `reduction` on, unless `choosing` is
+        The sizes of the functions are estimated there, from `scales` on, and which ordinary
+        parameters are fitted is chosen beside them, instead of `reduction`, unless `choosing` is
         False.  Raises ElastocalError where the start has poses without equilibrium.
         """
-        f, sizes, ordinary = self.functions, self.every.sizes, self.sound.problem.free
-        problem = replace(problem, free=np.append(ordinary, f.columns))
-        x = self._started(x, reduction)
+        f, own, sizes = self.functions, self.sound.problem, self.every.sizes
+        problem = replace(problem, free=np.append(own.free, f.columns))
+        x = reduction.shifted(x, own.x0)
         if scales is not None:
             gone = f.columns[(scales.scale == 0)[f.group]]
             x[gone] = self.model.nominal[gone]
         free = self._rows(problem, x)
-        for left in reversed(range(CHOICES if scales is None else 1)):
-            scales = free.only(np.searchsorted(ordinary, reduction.kept)).scales(scales)
-            again = self._chosen(free, scales) if choosing else reduction
-            if not np.array_equal(again.kept, reduction.kept):
-                reduction, x = again, self._started(x, again)
+        scales = free.only(np.searchsorted(own.free, reduction.kept)).scales(scales)
+        if choosing:
+            before, marginal = reduction.kept, free.posterior(scales).marginal
+            reduction = choose(own, sizes, marginal, scales.sigma, WORTH_A_COLUMN)
+            if not np.array_equal(before, reduction.kept):
+                x = reduction.shifted(x, own.x0)
                 free = self._rows(problem, x)
-                if left:
-                    continue
-            reduction = reduction.seen(ordinary, free.factor.R, sizes)
-            posterior = free.only(np.searchsorted(ordinary, reduction.kept)).posterior(scales)
-            own = f.columns[posterior.own]
-            known = PriorRows(posterior.P, posterior.of_own @ self.model.nominal[own])
-            # While there is another choice, a single step.
-            found = least_squares(
-                problem, np.append(reduction.kept, own), x, sizes, known=known,
-                max_steps=2 if left else STEPS,
-                tolerance=SETTLED / len(problem.observations.value),
-            )  # fmt: skip
-            x, free = found.x, self._rows(problem, found.x)
-        assert scales is not None
-        linear = free.only(np.searchsorted(ordinary, reduction.kept))
-        return JointFit(found, reduction, scales, linear)
+        reduction = reduction.seen(own.free, free.factor.R, sizes)
+        kept = np.searchsorted(own.free, reduction.kept)
+        prior = free.only(kept).posterior(scales)
+        columns = np.append(reduction.kept, f.columns[prior.own])
+        known = PriorRows(prior.P, prior.P @ self.model.nominal[columns])
+        found = least_squares(
+            problem, columns, x, sizes, known=known, max_steps=STEPS,
+            tolerance=SETTLED / len(problem.observations.value),
+        )  # fmt: skip
+        return JointFit(found, reduction, scales, self._rows(problem, found.x).only(kept))
 
     def _rows(self, problem: Problem, x: Array) -> LinearRows:
         factor = evaluate(self.model, problem.parts, x, problem.free).r_factor
         return self.functions.rows(factor, x)
 
-    def _chosen(self, free: LinearRows, scales: Scales) -> Reduction:
-        problem, marginal = self.sound.problem, free.posterior(scales).marginal
-        return choose(problem, self.every.sizes, marginal, scales.sigma, WORTH_A_COLUMN)
-
-    def _started(self, x: Array, reduction: Reduction) -> Array:
-        """x with what is not fitted at its start, and its share moved over; other functions
-        nominal."""
-        kept, dropped, x0 = reduction.kept, reduction.dropped, self.sound.problem.x0
-        moved, out = x.copy(), self.model.shrunk.copy()
-        moved[kept] += reduction.mixing @ (x[dropped] - x0[dropped])
-        moved[dropped] = x0[dropped]
-        out[self.functions.columns] = False
-        moved[out] = x0[out]
-        return moved
-
-    def crossed(self, fit: JointFit, scales: Scales | None = None) -> tuple[Array, Array]:
+    def crossed(self, fit: JointFit, scales: Scales) -> tuple[Array, Array]:
         """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
-        where there is none), and leverage (rows,) of each; with other `scales` of the model
-        linearised at the fit."""
-        found, f, posterior, step = fit.found, self.functions, fit.posterior, None
-        if scales is not None:
-            posterior, k = fit.linear.posterior(scales), fit.linear.ordinary
-            # α is a step; b counts from nominal.
-            step, b = np.zeros(len(found.x)), np.zeros(len(f.columns))
-            step[fit.reduction.kept], b[posterior.own] = np.split(posterior.step, [k])
-            step[f.columns] = f.nominal + b - found.x[f.columns]
-        columns = np.append(fit.reduction.kept, f.columns[posterior.own])
-        model, parts = found.problem.model, found.problem.parts
-        return held_out_by_parts(model, parts, found.x, columns, posterior.half, step)
+        where there is none), and leverage (rows,) of each, by the model linearised at the fit with
+        functions of these `scales`."""
+        found, f, posterior = fit.found, self.functions, fit.linear.posterior(scales)
+        columns, x = np.append(fit.reduction.kept, f.columns[posterior.own]), found.x.copy()
+        x[f.columns] = f.nominal
+        x[columns] += posterior.step  # of functions from nominal
+        model, parts, half = found.problem.model, found.problem.parts, posterior.half
+        return held_out_by_parts(model, parts, found.x, columns, half, x - found.x)
 
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
         noise: NoiseFit | None = None
-        x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
-        level, shape = np.inf, (-1, self.observed.size)
+        x, reduction, scales, level = self.sound.fit.x, self.sound.reduction, None, np.inf
         for k in range(ROUNDS):
             fitted = good if self.options.sets_aside(~good) else np.ones_like(good)
             part = self.chosen(noise, fitted)
@@ -517,16 +453,15 @@ class _Course:
             )
             fit = self.joint(problem, x, reduction, scales)
             x, reduction, scales = fit.found.x, fit.reduction, fit.scales
-            still, level = abs(scales.variance - level) < STILL, scales.variance
-            self.standard[fitted] = fit.standardised().reshape(shape)
+            still, level = abs(scales.variance / level - 1) < STILL, scales.variance
+            self.standard[fitted] = fit.standardised()
             if not fitted.all():
-                rest = fit.standardised(self.chosen(noise, ~fitted))
-                self.standard[~fitted] = rest.reshape(shape)
+                self.standard[~fitted] = fit.standardised(self.chosen(noise, ~fitted))
             before, kind = good, None if noise is None else noise.kind
             noise, good = self.judged(noise, good, k)
             good = self.corroborated(fit, noise, fitted, good)
-            same = noise is None or (still and noise.kind == kind)
-            if same and np.array_equal(before, good):
+            same = noise is None or noise.kind == kind
+            if still and same and np.array_equal(before, good):
                 break
             if noise is not None:  # in units of which rows are whitened next
                 scales = replace(scales, variance=1.0)
@@ -573,70 +508,63 @@ class _Course:
     def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, tuple[Array, Array]]:
         """Without the functions that the readings do not show, or that predict held-out
         configurations worse than none; the least supported is tried first."""
-        size, scales, cross = self.observed.size, fit.scales, self.crossed(fit)
+        size, scales, cross = self.observed.size, fit.scales, self.crossed(fit, fit.scales)
         for g in np.argsort(scales.gain[: len(self.functions.groups)]):
             if not scales.scale[g] or scales.gain[g] > CERTAIN:
                 continue
-            scale = scales.scale.copy()
-            scale[g] = 0.0
-            there = self.crossed(fit, replace(scales, scale=scale))
-            shown = scales.gain[g] > LEAST_GAIN
+            without = scales.without(g)
+            there, shown = self.crossed(fit, without), scales.gain[g] > LEAST_GAIN
             if shown and rms_3d(there[0], size) > rms_3d(cross[0], size):
                 continue
             if shown:
                 self.harmful.append(self.functions.groups[g].name)
-            scales, cross = replace(scales, scale=scale), there
+            scales, cross = without, there
         if (scales.scale > 0).all():
             return fit, cross
         found = fit.found
         fit = self.joint(found.problem, found.x, fit.reduction, scales, choosing=False)
-        return fit, self.crossed(fit)
+        return fit, self.crossed(fit, fit.scales)
 
     def result(
         self, fit: JointFit, cross: tuple[Array, Array], noise: NoiseFit | None, good: BoolArray
-    ) -> tuple[MethodResult, FunctionPrior]:
+    ) -> MethodResult:
         posterior, f, r, found = fit.posterior, self.functions, fit.reduction, fit.found
-        columns, x = found.columns, found.x
+        columns, model, k = found.columns, self.model, len(r.kept)
         problem = replace(found.problem, free=self.sound.problem.free)
         mixing = np.vstack([r.mixing, np.zeros((len(posterior.own), len(r.dropped)))])
         solution = replace(
-            self.sound, problem=problem, held=cross[0], nominal_rms=self.every.nominal_rms,
+            self.sound, held=cross[0], nominal_rms=self.every.nominal_rms,
             fit=replace(found, problem=problem, r_factor=posterior.marginal),
             reduction=replace(r, kept=columns, mixing=mixing, with_prior=f.columns),
         )  # fmt: skip
-        effective = float(posterior.effective.sum())
+        effective, share = float(posterior.effective.sum()), posterior.prior_share
         spare = max(len(found.whitened) - effective, 1.0)
         # The noise's variance is known as well as the readings that the fit has left over say.
-        dof = spare / np.maximum(1 - posterior.prior_share, 1e-3) ** 2
-        dof[: posterior.ordinary] = spare
+        dof = spare / np.maximum(1 - share, 1e-3) ** 2
+        dof[:k] = spare
         text = (
             "of readings and smooth functions together, the functions as random as their sizes "
             "say; assumes the noise model and normal noise"
         )
         matrix = fit.scales.variance * posterior.cofactor
         covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
-        shares = zip(columns.tolist(), posterior.prior_share.tolist(), strict=True)
         method = self.options.resolved
         if not self.estimating:
             method = "ols" if problem.weights.kind == "none" else "wls"
-        result = MethodResult(
+        own, shares = columns[k:], zip(columns[k:], share[k:].tolist(), strict=True)
+        sigma, std = fit.scales.sigma, fit.scales.sigma / np.diag(posterior.P[:, k:])
+        return MethodResult(
             method, solution, covariance, noise, good, leverage=cross[1], standard=self.standard,
-            prior_share={self.model.names[c]: s for c, s in shares if c in f.sized},
+            prior_share={model.names[c]: part for c, part in shares if not model.shrunk[c]},
             effective=round(effective), warnings=self._warnings(fit),
             smooth=self._parts(fit, covariance.matrix),
+            functions=FunctionPrior(own, model.nominal[own], std, sigma, spare),
         )  # fmt: skip
-        own = f.columns[posterior.own]
-        names, nominal = tuple(self.model.names[c] for c in own), f.nominal[posterior.own]
-        prior = GaussianPrior.independent(
-            names, nominal, fit.scales.sigma / np.diag(posterior.of_own)
-        )
-        stands = float(((posterior.of_own @ (x[own] - nominal)) ** 2).sum())
-        return result, FunctionPrior(prior, fit.scales.sigma, spare, stands)
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
         f, posterior, x = self.functions, fit.posterior, fit.found.x
         paid = np.zeros(len(f.columns))
-        paid[posterior.own] = posterior.effective[posterior.ordinary :]
+        paid[posterior.own] = posterior.effective[len(fit.reduction.kept) :]
         return tuple(
             SmoothPart(
                 group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),

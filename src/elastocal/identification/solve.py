@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -26,7 +27,6 @@ from elastocal.identification.weighted_problem import (
     Part,
     RFactor,
     each,
-    evaluate,
     least_norm,
     merge,
     regressor,
@@ -72,6 +72,21 @@ class Reduction:
             mixing=np.hstack([self.mixing[~lost], np.zeros((len(kept), len(gone)))]),
             invisible=np.append(self.invisible, gone) if invisible else self.invisible,
         )  # fmt: skip
+
+    def among(self, free: IntArray) -> Reduction:
+        """Of these parameters alone."""
+        kept, dropped = np.isin(self.kept, free), np.isin(self.dropped, free)
+        return replace(
+            self, kept=self.kept[kept], dropped=self.dropped[dropped],
+            mixing=self.mixing[kept][:, dropped], invisible=np.intersect1d(self.invisible, free),
+        )  # fmt: skip
+
+    def shifted(self, x: Array, x0: Array) -> Array:
+        """x (parameters,) with the dropped parameters at x0, their share moved to the kept ones."""
+        out = x.copy()
+        out[self.kept] += self.mixing @ (x - x0)[self.dropped]
+        out[self.dropped] = x0[self.dropped]
+        return out
 
     def seen(self, free: IntArray, R: Array, sizes: Array) -> Reduction:
         """Without the kept parameters that move nothing any more, R (…, free) being that of the
@@ -171,12 +186,6 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
     return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
 
 
-def free_r_factor(problem: Problem, found: Fit) -> RFactor:
-    if np.array_equal(found.columns, problem.free):
-        return found.r_factor
-    return evaluate(problem.model, problem.parts, found.x, problem.free).r_factor
-
-
 def choose(
     problem: Problem, sizes: Array, r_factor: RFactor, sigma: float, threshold: float
 ) -> Reduction:
@@ -201,31 +210,26 @@ def chosen_again(solution: Solution) -> Reduction:
     """The choice by the weights and at the values that the solution has come to."""
     problem, found = solution.problem, solution.fit
     sigma, threshold = residual_sigma(found, len(found.columns)), solution.reduction.threshold
-    return choose(problem, solution.sizes, free_r_factor(problem, found), sigma, threshold)
+    return choose(problem, solution.sizes, found.of_free, sigma, threshold)
 
 
 def fit_kept(
     problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60
 ) -> Fit:
     """Fit of the kept parameters, the others held at the start; their share moves over first."""
-    kept, dropped = chosen.kept, chosen.dropped
-    start = x.copy()
-    start[dropped] = problem.x0[dropped]
-    shifted = start.copy()
-    shifted[kept] += chosen.mixing @ (x[dropped] - problem.x0[dropped])
+    start, kept = x.copy(), chosen.kept
+    start[chosen.dropped] = problem.x0[chosen.dropped]
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
-    for trial in (shifted, start):
-        try:
+    for trial in (chosen.shifted(x, problem.x0), start):
+        with suppress(ElastocalError):
             return fit(problem, kept, trial, sizes, max_steps=max_steps)
-        except ElastocalError:
-            continue
     return fit(problem, kept, problem.x0, sizes, max_steps=max_steps)
 
 
-def looked_at(problem: Problem, found: Fit) -> tuple[Array, Array]:
+def looked_at(found: Fit) -> tuple[Array, Array]:
     """Residual (rows,) of each configuration under a fit to the others, under a drift of each block
     in time, as far off as readings of another day are; and leverage (rows,) in the fit."""
-    observed, weights = problem.observations, problem.weights
+    problem, observed, weights = found.problem, found.problem.observations, found.problem.weights
     held, leverage = held_out_by_parts(
         problem.model, problem.parts, found.x, found.columns, found.r_factor.half
     )
@@ -246,27 +250,25 @@ def fits_better(narrow: RFactor, wide: RFactor) -> bool:
     return bool(f_test(narrow.rest**2 - wide.rest**2, more, wide.rest**2, max(dof, 1))[1] < CHANCE)
 
 
-def prefer_wider(
-    problem: Problem, sizes: Array, found: Fit, reduction: Reduction, r_factor: RFactor
-) -> tuple[Fit, Reduction]:
+def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
-    free columns.
+    decides, first on the linearised model, then on the refitted one.
     """
-    observed, heldout = problem.observations, list[Array]()
+    problem, sizes, heldout = found.problem, found.sizes, list[Array]()
+    observed = problem.observations
 
     def predicts(wide: Array) -> bool:
         if not heldout:
-            heldout.append(looked_at(problem, found)[0])
+            heldout.append(looked_at(found)[0])
         own = observed.configuration, observed.size
         return predicts_better(heldout[-1], wide, problem.weights, *own)
 
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
-        wider = choose(problem, sizes, r_factor, sigma, threshold)
-        own = r_factor.of_columns(np.searchsorted(problem.free, wider.kept))
+        wider = choose(problem, sizes, found.of_free, sigma, threshold)
+        own = found.of_free.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
         start = moved(found.x, wider.kept, own.step(sizes[wider.kept]))
@@ -277,13 +279,13 @@ def prefer_wider(
             continue
         try:
             wide = fit_kept(problem, sizes, start, wider, max_steps=30)
-            after = looked_at(problem, wide)[0]
+            after = looked_at(wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
         if wide.converged and fits_better(found.r_factor, wide.r_factor) and predicts(after):
-            found, reduction, r_factor = wide, wider, free_r_factor(problem, wide)
+            found, reduction = wide, wider
             heldout.append(after)
     return found, reduction
 
@@ -313,12 +315,18 @@ class Solution:
     B and weights say.
     """
 
-    problem: Problem
     fit: Fit
     reduction: Reduction
-    sizes: Array
     nominal_rms: float
     held: Array | None = None
+
+    @property
+    def problem(self) -> Problem:
+        return self.fit.problem
+
+    @property
+    def sizes(self) -> Array:
+        return self.fit.sizes
 
     @property
     def exact(self) -> bool:
@@ -327,7 +335,7 @@ class Solution:
 
     @cached_property
     def _looked(self) -> tuple[Array, Array]:
-        return looked_at(self.problem, self.fit)
+        return looked_at(self.fit)
 
     @property
     def heldout(self) -> Array:
@@ -348,21 +356,20 @@ def solve(
     Raises InsufficientDataError where the data determine nothing.
     """
     sizes = sizes_and_check(problem)
-    problem, found, reduction, r_factor, placed = settle(problem, sizes, progress)
+    found, reduction, placed = settle(problem, sizes, progress)
     if try_wider:
         progress("comparing with wider sets")
-        found, reduction = prefer_wider(problem, sizes, found, reduction, r_factor)
-    nominal = rms_3d(placed, problem.observations.size)
-    return Solution(problem, found, reduction, sizes, nominal)
+        found, reduction = prefer_wider(found, reduction)
+    return Solution(found, reduction, rms_3d(placed, problem.observations.size))
 
 
 def settle(
     problem: Problem, sizes: Array, progress: Progress = lambda message: None
-) -> tuple[Problem, Fit, Reduction, RFactor, Array]:
+) -> tuple[Fit, Reduction, Array]:
     """Place base and markers, choose a minimal complete set of parameters and fit it.
 
-    Returns the problem with base and markers placed at x0, the fit, the set, the R factor of the
-    free columns at the fit, and the residual (rows,) of the nominal arm so placed.
+    Returns the fit, whose problem has base and markers placed at x0, the set, and the residual
+    (rows,) of the nominal arm so placed.
 
     Raises InsufficientDataError where the data determine nothing.
     """
@@ -392,12 +399,11 @@ def settle(
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
         found = fit_kept(problem, sizes, found.x, reduction)
-        sigma, r_factor = residual_sigma(found, len(kept)), free_r_factor(problem, found)
+        sigma, r_factor = residual_sigma(found, len(kept)), found.of_free
     left = reduction.seen(problem.free, r_factor.R, sizes)
     if left is not reduction:
         reduction, found = left, fit_kept(problem, sizes, found.x, left)
-        r_factor = free_r_factor(problem, found)
-    return problem, found, reduction, r_factor, nominal
+    return found, reduction, nominal
 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
