@@ -14,11 +14,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 HERE = Path(__file__).parent
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-T = TypeVar("T")
+PEERS = "ELASTOCAL_PEERS_PYTHON"
 
 
 def number(value: Any) -> str:
@@ -82,7 +82,7 @@ class Seconds:
         return cls(time.perf_counter() - wall, cpu)
 
 
-def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
+def timed(work: Callable[[], Any]) -> tuple[Any, Seconds]:
     start = Seconds.since()
     done = work()
     return done, Seconds.since(start.wall, start.cpu)
@@ -129,11 +129,9 @@ def race(
 
 
 @dataclass(frozen=True)
-class Ran:
-    """One process: seconds, peak resident memory in MB without that of its children."""
+class Ran(Seconds):
+    """One process, with its peak of resident memory in MB, without that of its children."""
 
-    wall: float
-    cpu: float
     peak_mb: float
 
 
@@ -152,9 +150,13 @@ def elastocal(*arguments: Any, **environment: str) -> Ran:
     return Ran(**found)
 
 
-def peer(python: Path, script: str, *arguments: Path | str) -> Any:
-    """Run a script in the peers' environment; what it wrote to the last of its arguments."""
-    command = [str(python), str(HERE / script), *map(str, arguments)]
+def peer(script: str, *arguments: Path | str, own: bool = False) -> Any:
+    """Run a script in the peers' environment (`own`: in this one); what it wrote to the last of its
+    arguments."""
+    python = sys.executable if own else os.environ.get(PEERS)
+    if python is None:
+        sys.exit(f"{PEERS} names no Python; benchmarks/README.md says how to make the environment")
+    command = [python, str(HERE / script), *map(str, arguments)]
     one = os.environ | ONE_THREAD | {"OMP_NUM_THREADS": "1"}
     ran = subprocess.run(command, capture_output=True, text=True, env=one)
     if ran.returncode:

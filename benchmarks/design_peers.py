@@ -1,16 +1,15 @@
 """Measurement plans beside those of FIGAROH: values and times in one run.
 
-    python benchmarks/design_peers.py [--figaroh-python PATH]
+    python benchmarks/design_peers.py
 
 D-optimal poses of a UR10 from a pool of 1000, on the regressor that FIGAROH computes.  FIGAROH
-runs in an environment of its own (README.md says how to make it) and exchanges arrays with this
-one.  Every process has one BLAS thread, nothing runs at the same time, and every value in a table
-is computed here, by the same function for all, but for that of FIGAROH's DetMax.
+runs in the environment of ELASTOCAL_PEERS_PYTHON (README.md says how to make it) and exchanges
+arrays with this one.  Every process has one BLAS thread, nothing runs at the same time, and every
+value in a table is computed here, by the same function for all, but for that of FIGAROH's DetMax.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -32,12 +31,12 @@ UR10 = "example-robot-data", "ur_description/urdf/ur10_robot.urdf"
 CLOCKS = ("wall, s", "CPU, s")
 
 
-def beside_figaroh(python: Path, folder: Path) -> None:
+def beside_figaroh(folder: Path) -> None:
     """The same regressor for both: relaxed weights, then exact plans of 30 poses."""
     given, out = folder / "ur10_pool.npz", folder / "figaroh.npz"
     q = np.random.default_rng(SEED).uniform(-np.pi, np.pi, (POOL, 6))
     np.savez(given, q=q, poses=POSES, seed=SEED)
-    theirs = peer(python, "figaroh_pool.py", packaged(*UR10), given, out)
+    theirs = peer("figaroh_pool.py", packaged(*UR10), given, out)
     R = theirs["regressor"]
     p = R.shape[2]
     columns = np.sqrt((R**2).mean(axis=(0, 1)))
@@ -99,24 +98,12 @@ def beside_figaroh(python: Path, folder: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--figaroh-python",
-        default=os.environ.get("ELASTOCAL_FIGAROH_PYTHON"),
-        help="Python with FIGAROH (default: ELASTOCAL_FIGAROH_PYTHON)",
-    )
-    chosen = parser.parse_args()
     if os.environ.get("OMP_NUM_THREADS") != "1":
         one = os.environ | ONE_THREAD | {"OMP_NUM_THREADS": "1"}
         os.execve(sys.executable, [sys.executable, *sys.argv], one)
-    if not chosen.figaroh_python or not Path(chosen.figaroh_python).exists():
-        parser.error(
-            "give --figaroh-python PATH or set ELASTOCAL_FIGAROH_PYTHON "
-            f"(benchmarks/README.md says how to make it); found {chosen.figaroh_python}"
-        )
     print(where())
     with tempfile.TemporaryDirectory() as name:
-        beside_figaroh(Path(chosen.figaroh_python), Path(name))
+        beside_figaroh(Path(name))
 
 
 if __name__ == "__main__":

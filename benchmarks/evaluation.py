@@ -16,12 +16,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
+from contextlib import chdir
 from functools import partial
 from pathlib import Path
 
 import casadi as ca
 import numpy as np
-from bench_arms import GEOMETRY, kr270, poses, truth
+from bench_arms import kr270, poses, truth
 from bench_tools import goal, race, table
 from numpy.typing import NDArray
 
@@ -57,16 +58,11 @@ class BareC:
     -O3; it reads and writes numpy's memory."""
 
     def __init__(self, loop: ca.Function, shapes: Sequence[tuple[int, ...]]) -> None:
-        here = os.getcwd()
-        with tempfile.TemporaryDirectory() as folder:
-            os.chdir(folder)  # CasADi writes to the current folder only
-            try:
-                loop.generate("bare.c")
-            finally:
-                os.chdir(here)
+        with tempfile.TemporaryDirectory() as folder, chdir(folder):
+            loop.generate("bare.c")  # CasADi writes to the current folder only
             flags = ("-O3", "-shared", "-fPIC", "-w", "bare.c", "-o", "bare.so", "-lm")
             command = [os.environ.get("CC") or "cc", *flags]
-            subprocess.run(command, cwd=folder, check=True, capture_output=True)
+            subprocess.run(command, check=True, capture_output=True)
             compiled = ca.external(loop.name(), str(Path(folder, "bare.so")))
         self.buffer, self.call = compiled.buffer()
         self.found = [np.empty(shape) for shape in shapes]
@@ -142,7 +138,7 @@ def main() -> None:
     size = parser.parse_args().size
     os.environ["OMP_NUM_THREADS"] = "1"
     with tempfile.TemporaryDirectory() as name:
-        model = kr270(Path(name), GEOMETRY)
+        model = kr270(Path(name))
     agreement(model)
     micro = {rows: timed(model, rows, size) for rows in ROWS[size]}
     columns = ["way", *[f"{rows} rows" for rows in ROWS[size]]]

@@ -1,19 +1,17 @@
 """Whole fits beside those of FIGAROH and pybotics: same readings, times and held-out errors.
 
-    python benchmarks/fits_peers.py [--peers-python PATH] [--quick]
+    python benchmarks/fits_peers.py [--quick]
 
 A UR10 with base and tool unknown, one marker, positions; 30, 100 and 300 random poses.  Every fit
 runs in a process of its own, one after the other in turns, with one BLAS thread; of each number of
 seconds the smallest of all rounds counts.  Errors are computed here, by one function for all, on
-500 poses that no fit has seen.  The peers run in an environment of their own (README.md says how
-to make it), named by --peers-python or ELASTOCAL_PEERS_PYTHON.
+500 poses that no fit has seen.  The peers run in the environment of ELASTOCAL_PEERS_PYTHON
+(README.md says how to make it).
 """
 
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -46,13 +44,10 @@ def rms_um(error: np.ndarray) -> float:
     return float(1e6 * np.sqrt((error**2).sum(axis=1).mean()))
 
 
-def fitted(
-    name: str, given: Campaign, folder: Path, python: Path | None, before: Found | None
-) -> Found:
+def fitted(name: str, given: Campaign, folder: Path, before: Found | None) -> Found:
     """One more round of a fit, with the least seconds so far."""
     side, how = CONTENDERS[name]
-    own = sys.executable if side == OURS else python
-    ran = peer(Path(str(own)), "fits_side.py", side, how, folder, folder / "found.npz")
+    ran = peer("fits_side.py", side, how, folder, folder / "found.npz", own=side == OURS)
     return {
         "parameters": int(ran["parameters"]),
         "exact": rms_um(ran["predicted"] - given.fresh_exact),
@@ -80,34 +75,19 @@ def judged(found: dict[str, Found]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "--peers-python",
-        default=os.environ.get("ELASTOCAL_PEERS_PYTHON"),
-        type=Path,
-        help="Python with FIGAROH and pybotics (default: ELASTOCAL_PEERS_PYTHON)",
-    )
     parser.add_argument("--quick", action="store_true", help="one truth, one round")
-    chosen = parser.parse_args()
-    python = chosen.peers_python
-    if python is None:
-        print(
-            "FIGAROH and pybotics: skipped, no environment; give --peers-python PATH or set "
-            "ELASTOCAL_PEERS_PYTHON (benchmarks/README.md says how to make it)"
-        )
-    elif not python.exists():
-        parser.error(f"--peers-python: there is no {python}")
-    names = [n for n, (side, _) in CONTENDERS.items() if side == OURS or python is not None]
+    quick = parser.parse_args().quick
     columns = ("fit", "parameters", "held-out, exact, µm", "held-out, as read, µm", "fit, CPU s",
                "fit, wall s", "reading, CPU s", "import, CPU s")  # fmt: skip
     print(where())
-    for truth in TRUTHS[: 1 if chosen.quick else 2]:
+    for truth in TRUTHS[: 1 if quick else 2]:
         for poses in SIZES:
             given, found = campaign(truth, poses, SEED), dict[str, Found]()
             with tempfile.TemporaryDirectory() as folder:
                 write(given, Path(folder))
-                for _ in range(1 if chosen.quick else 3):
-                    for n in names:
-                        found[n] = fitted(n, given, Path(folder), python, found.get(n))
+                for _ in range(1 if quick else 3):
+                    for n in CONTENDERS:
+                        found[n] = fitted(n, given, Path(folder), found.get(n))
             table(f"Truth {truth}, {poses} poses", columns, [
                 (n, f["parameters"], f"{f['exact']:.2f}", f"{f['read']:.2f}",
                  *(f"{f[clock]:.3f}" for clock in CLOCKS))

@@ -1,11 +1,11 @@
 """Measurement plans: error, bound, CPU, of each effort, and how they grow.
 
-    python benchmarks/plans.py [--beside SRC] [--efforts quick normal] [--only CELL …] [--growth]
-                               [--rounding]
+    python benchmarks/plans.py [--beside SRC] [--efforts quick normal] [--only CELL …]
+                               [--poses N …] [--growth]
 
 `--beside`: the source folder of another checkout, whose quick plans are made of the same cells.
-`--rounding`: normal plans of the first of the cells, of its number of poses and of three times as
-many: what of the distance to the bound goes with whole poses in place of weights.
+`--poses`: these numbers in place of a cell's own; what of the distance to the bound goes with more
+poses is that they are whole, and no weights.
 """
 
 from __future__ import annotations
@@ -122,31 +122,25 @@ def main() -> None:
     parser.add_argument("--efforts", nargs="+", default=["quick", "normal"])
     parser.add_argument("--only", nargs="+", default=list(CELLS), choices=CELLS, metavar="CELL")
     parser.add_argument("--growth", action="store_true")
-    parser.add_argument("--rounding", action="store_true")
+    parser.add_argument("--poses", nargs="+", type=int, default=[0])
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
-        if chosen.rounding:
-            return rounding(Path(name), chosen.only[0])
-        compared(Path(name), chosen.only, chosen.efforts, chosen.beside)
+        cells = [(title, poses) for title in chosen.only for poses in chosen.poses]
+        compared(Path(name), cells, chosen.efforts, chosen.beside)
         if chosen.growth:
             growth(Path(name))
 
 
-def rounding(folder: Path, title: str) -> None:
-    usual, rows = CELLS[title][2], []
-    for poses in (usual, 3 * usual):
-        plan = planned(folder, title, "normal", poses=poses)
-        rows.append([poses, len(plan["predicted"]), *figures(plan)])
-    table(f"Whole poses or weights: {title}, normal", ["poses", "parameters", *HEADS], rows)
-
-
-def compared(folder: Path, titles: list[str], efforts: list[str], source: Path | None) -> None:
+def compared(
+    folder: Path, cells: list[tuple[str, int]], efforts: list[str], source: Path | None
+) -> None:
     lower, ratios, rows = [], [], []
-    for title in titles:
-        found = {e: planned(folder, title, e) for e in efforts}
-        rows.append([title, *(f for plan in found.values() for f in figures(plan))])
+    for title, poses in cells:
+        found = {e: planned(folder, title, e, poses=poses) for e in efforts}
+        name = f"{title}, {poses} poses" if poses else title
+        rows.append([name, *(f for plan in found.values() for f in figures(plan))])
         if source and "quick" in found:
-            old = planned(folder, title, "quick", PYTHONPATH=str(source))
+            old = planned(folder, title, "quick", poses=poses, PYTHONPATH=str(source))
             rows[-1] += figures(old)[:2]
             ratios.append(found["quick"]["cpu"] / old["cpu"])
             lower.append(1 - found["quick"]["value"] / old["value"])

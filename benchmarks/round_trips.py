@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -45,15 +44,14 @@ POSES, FITTED = 40, 32
 PASSES = 1.3
 
 
-def packaged() -> Iterator[tuple[str, Path]]:
-    """Name and path of every URDF of the packages; of the same name the first."""
-    seen: set[str] = set()
+def packaged() -> dict[str, Path]:
+    """Every URDF of the packages by name; of the same name the first."""
+    found: dict[str, Path] = {}
     for package in PACKAGES:
-        distribution = metadata.distribution(package)
-        for file in sorted(distribution.files or (), key=str):
-            if str(file).endswith(".urdf") and file.stem not in seen:
-                seen.add(file.stem)
-                yield file.stem, Path(str(distribution.locate_file(file)))
+        for file in sorted(metadata.distribution(package).files or (), key=str):
+            if file.suffix == ".urdf":
+                found.setdefault(file.stem, Path(str(file.locate())))
+    return found
 
 
 @dataclass(frozen=True)
@@ -214,7 +212,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path)
     asked = parser.parse_args()
     trips, refused = [], {}
-    for name, path in packaged():
+    for name, path in packaged().items():
         if asked.arms and name not in asked.arms:
             continue
         with tempfile.TemporaryDirectory() as folder:

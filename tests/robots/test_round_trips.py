@@ -20,7 +20,7 @@ def trips():
 def one(name, folder):
     rounds = trips()
     try:
-        path = dict(rounds.packaged())[name]
+        path = rounds.packaged()[name]
     except Exception as error:  # a package that is not installed
         pytest.skip(str(error))
     made = rounds.trip(name, path, folder)
