@@ -10,14 +10,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.arm_description import (
-    CartesianNoise,
-    ModelSpec,
-    Nominal,
-    Robot,
-    Tool,
-    Tracker,
-)
+from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
 from elastocal.identification.solve import reduce
 from elastocal.measurements import Measurements, with_moves
@@ -181,14 +174,12 @@ class Campaign:
     @cached_property
     def joint_columns(self) -> np.ndarray:
         """∂(reading)/∂q (3n, 6) by central differences of the simulated arm."""
-        moved = [
-            self.at(self.exact.q + step * axis) for step in (1e-5, -1e-5) for axis in np.eye(6)
-        ]
-        return (np.stack(moved[:6], axis=-1) - np.stack(moved[6:], axis=-1)).reshape(-1, 6) / 2e-5
 
-    def at(self, q: np.ndarray) -> np.ndarray:
-        """Exact readings (n, 3) with the joints at q (n, 6) instead."""
-        return simulate(arm(), replace(self.exact, q=q), self.true, 0, False).position
+        def at(q: np.ndarray) -> np.ndarray:
+            return simulate(arm(), replace(self.exact, q=q), self.true, 0, False).position.ravel()
+
+        q, steps = self.exact.q, 1e-5 * np.eye(6)
+        return np.column_stack([(at(q + h) - at(q - h)) / 2e-5 for h in steps])
 
     @cached_property
     def test(self) -> Measurements:

@@ -18,21 +18,13 @@ from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import NoiseValues, project
-from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
-
-
-def read(model: Model, path: Path) -> Measurements:
-    cell = model.cell
-    return read_measurements(
-        path, joint_kinds=model.chain.kinds, marker_names=tuple(cell.tool.markers)
-    )
 
 
 def plain_fit(visible: Path) -> Baseline:
     """The cell's own effects fitted to the campaign."""
-    model = Model(read_cell(visible / "cell.toml"))
-    return fit_baseline(model, read(model, visible / "data.csv"))
+    model = Model(visible / "cell.toml")
+    return fit_baseline(model, model.read(visible / "data.csv"))
 
 
 def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> list[dict[str, Any]]:
@@ -88,7 +80,7 @@ def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh
     start |= {p["name"]: p["value"] for e in answer["effects"] for p in e["parameters"]}
     x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
     after = fit_baseline(model, base.observed.table, x0=x0)
-    table = read(base.model, fresh)
+    table = base.model.read(fresh)
     assert table.position is not None
     off = (fit.model.predict(table, fit.x) - table.position.ravel() for fit in (base, after))
     e0, e1 = (float(np.sqrt(np.mean(each**2))) for each in off)

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import atexit
 import json
 import secrets
 import shutil
 import tempfile
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +16,24 @@ from draw import MINUTES_PER_VISIT, World, draw_poses, draw_visits
 from score import Record, claims, shortened, truths
 from suites import Task
 from whole_score import NEW, judged, tested
-from worker import Worker
+from worker import run
 from world import Visits
 from world_files import write_table, write_world
 
 from elastocal.measurements import read_measurements
 
+DIAGNOSE = "diagnose", "cell.toml", "data.csv"
 ANSWER, CELL, PLAN = "diagnosis.json", "extended.toml", "extra.csv"
 MOST_EXTRA = 20  # a third of the campaign
 
 
-def diagnose_world(task: Task, worker: Worker, origin: dict[str, Any]) -> Record:
+def diagnose_world(task: Task, origin: dict[str, Any]) -> Record:
     """Write the world, have it diagnosed, and only then look at the truth.
 
     The two trees have nothing in common but the folder for temporary files; their names are drawn
-    at random, and the worker gets that of the visible one.  `origin` stands in the record.
+    at random, and the command gets that of the visible one.  `origin` stands in the record.
     """
-    visible = Path(tempfile.mkdtemp(prefix=secrets.token_hex(8)))
-    sealed = Path(tempfile.mkdtemp(prefix=secrets.token_hex(8)))
+    visible, sealed = (Path(tempfile.mkdtemp(prefix=secrets.token_hex(8))) for _ in range(2))
     try:
         world = task.recipe.draw()
         write_world(world, visible, sealed)
@@ -43,72 +41,61 @@ def diagnose_world(task: Task, worker: Worker, origin: dict[str, Any]) -> Record
         arguments += [a for name in task.without for a in ("--without", name)]
         if task.asked.plan:
             arguments += ["--plan", PLAN, "--poses", str(MOST_EXTRA)]
-        run = worker.diagnose(visible, *arguments)
+        done = run(visible, *DIAGNOSE, *arguments)
         answer = None
-        if run.exit == 0:
+        if done.exit == 0:
             answer = shortened(json.loads((visible / ANSWER).read_text(encoding="utf-8")))
         record: Record = origin | {
             "suite": task.suite,
             "world": world.name,
             "factor": task.recipe.factor,
-            "exit": run.exit,
-            "seconds": run.seconds,
-            "message": run.message if run.exit else "",
+            "exit": done.exit,
+            "seconds": done.seconds,
+            "message": done.message if done.exit else "",
             "truth": json.loads((sealed / "truth.json").read_text(encoding="utf-8")),
             "answer": answer,
         }
         if task.asked.distance or task.asked.reduction:
-            record |= _afterwards(task, world, record, visible, sealed)
+            base = plain_fit(visible)
+        if task.asked.distance:
+            record["distances"] = distances(base, world, task.without)
+        found = [said[0] for said in claims(answer)]
+        if task.asked.reduction and found and found == truths(record["truth"]):
+            fresh = sealed / "fresh.csv"
+            record["reduction"] = true_reduction(base, answer, visible / CELL, fresh)
         if task.asked.left_out and answer is not None:
             shutil.copyfile(sealed / "fresh.csv", visible / NEW)
-            record["dearer"] = _dearer(visible, worker)
+            record["dearer"] = _dearer(visible)
         if task.asked.whole:
-            fresh = sealed / "fresh.csv"
-            record["whole"] = judged(
-                world, visible, fresh, lambda *a: worker.run(visible, *a).exit, answer, CELL
-            )
+            record["whole"] = judged(world, visible, sealed / "fresh.csv", answer, CELL)
         if task.asked.plan and (visible / PLAN).exists():
-            record["extra"] = with_extra_poses(world, visible, PLAN, worker)
+            record["extra"] = with_extra_poses(world, visible)
         return record
     finally:
         shutil.rmtree(visible)
         shutil.rmtree(sealed)
 
 
-def _afterwards(
-    task: Task, world: World, record: Record, visible: Path, sealed: Path
-) -> dict[str, Any]:
-    """d of the true effects, and the shrinkage where exactly they were found."""
-    base, answer, out = plain_fit(visible), record["answer"], dict[str, Any]()
-    if task.asked.distance:
-        out["distances"] = distances(base, world, task.without)
-    found = [said[0] for said in claims(answer)]
-    if task.asked.reduction and answer is not None and found == truths(record["truth"]):
-        out["reduction"] = true_reduction(base, answer, visible / CELL, sealed / "fresh.csv")
-    return out
-
-
-def _dearer(visible: Path, worker: Worker) -> float | None:
+def _dearer(visible: Path) -> float | None:
     """The error at new poses of the cell that a diagnosis without the effect wrote, over that of
     one with the whole catalogue."""
-    if worker.diagnose(visible, "-o", "all.json", "--cell-out", "all.toml").exit != 0:
+    if run(visible, *DIAGNOSE, "-o", "all.json", "--cell-out", "all.toml").exit != 0:
         return None
-    cells = (CELL, "all.toml")
-    without, whole = (tested(visible, lambda *a: worker.run(visible, *a).exit, c) for c in cells)
+    without, whole = (tested(visible, cell) for cell in (CELL, "all.toml"))
     return without / whole if without and whole else None
 
 
 # The poses that `diagnose --plan` proposes, measured by the simulator, against random ones.
 
 
-def with_extra_poses(world: World, visible: Path, plan: str, worker: Worker) -> dict[str, Any]:
+def with_extra_poses(world: World, visible: Path) -> dict[str, Any]:
     """Answers with the planned poses, and with as many random ones."""
-    planned = read_visits(world, visible / plan)
+    planned = read_visits(world, visible / PLAN)
     n = len(np.unique(planned.q, axis=0))
     rng = np.random.default_rng((*world.seed, 3))
     campaigns = {"planned": planned, "random": random_visits(world, n, rng)}
     return {"n_poses": n} | {
-        name: _diagnosed(world, visits, visible, worker, rng) for name, visits in campaigns.items()
+        name: _diagnosed(world, visits, visible, rng) for name, visits in campaigns.items()
     }
 
 
@@ -139,7 +126,7 @@ def _later(world: World, visits: Visits) -> Visits:
 
 
 def _diagnosed(
-    world: World, extra: Visits, visible: Path, worker: Worker, rng: np.random.Generator
+    world: World, extra: Visits, visible: Path, rng: np.random.Generator
 ) -> Record | None:
     """The answer to the campaign's own readings and the extra ones in one table, no pose shared."""
     own = world.visits
@@ -150,18 +137,6 @@ def _diagnosed(
         for file in ("arm.urdf", "cell.toml"):
             shutil.copyfile(visible / file, folder / file)
         write_table(world, both, readings, folder / "data.csv")
-        if worker.diagnose(folder, "-o", ANSWER).exit != 0:
+        if run(folder, *DIAGNOSE, "-o", ANSWER).exit != 0:
             return None
         return shortened(json.loads((folder / ANSWER).read_text(encoding="utf-8")))
-
-
-@cache
-def _own_worker() -> Worker:
-    worker = Worker()
-    atexit.register(worker.close)
-    return worker
-
-
-def in_own_worker(task: Task, origin: dict[str, Any]) -> Record:
-    """The same by this process's worker.  A module's function: processes are sent its name."""
-    return diagnose_world(task, _own_worker(), origin)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from one_world import in_own_worker
+from one_world import diagnose_world
 from suites import SUITES, named
 from suites import tasks as suite_tasks
 from table import records_of, report
@@ -34,7 +34,7 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
     """The world's record as JSON.  A world follows from the study's seed, its suite and its name,
     so that a part of the study draws the same worlds as the whole."""
     seed = int(rng.bit_generator.seed_seq.entropy)  # type: ignore[attr-defined]
-    record = in_own_worker(named(task["suite"], seed, task["world"]), {"seed": seed})
+    record = diagnose_world(named(task["suite"], seed, task["world"]), {"seed": seed})
     answer = record["answer"]
     return {
         "verdict": None if answer is None else answer["verdict"],

@@ -4,28 +4,24 @@
 
 Rms errors at 200 new poses and loads, in mm: of the cell's own model, of what `diagnose --cell-out`
 added, both by `identify --test`; of the oracle; their ratio, what is claimed and how long it took.
-With `--keep FOLDER` cell, readings and answers stay there, with the truth; `--first K` begins with
-world K.  `--withhold` diagnoses each arm once more without the kind of effect that does most on
+`--withhold` diagnoses each arm once more without the kind of effect that does most on
 it, and prints its verdict, its wrong names, and its error over that with the kind in.
-Blindness is the study's matter: here all runs in one process.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnose_many import run
 from whole_draw import WholeRecipe
 from whole_score import judged, kind_of, over_oracle
+from worker import run
 from world_files import write_world
 
 COLUMNS = (
@@ -45,22 +41,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--worlds", type=int, default=5)
-    parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--poses", type=int, default=60)
-    parser.add_argument("--keep", type=Path)
     parser.add_argument("--withhold", action="store_true")
     asked = parser.parse_args()
     head = COLUMNS + WITHHELD * asked.withhold
     print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}", flush=True)
     ratios = []
-    for k in range(asked.first, asked.first + asked.worlds):
+    for k in range(asked.worlds):
         recipe = WholeRecipe(f"whole-{asked.poses}-{k:03d}", (asked.seed, 9, k), asked.poses)
-        folder = Path(tempfile.mkdtemp()) if asked.keep is None else asked.keep / recipe.name
-        try:
-            cells, ratio = one_world(recipe, folder, asked.withhold)
-        finally:
-            if asked.keep is None:
-                shutil.rmtree(folder)
+        with tempfile.TemporaryDirectory() as folder:
+            cells, ratio = one_world(recipe, Path(folder), asked.withhold)
         print(f"| {' | '.join([str(k), *cells])} |", flush=True)
         ratios.append(ratio)
     known = np.array([r for r in ratios if np.isfinite(r)])
@@ -74,24 +64,16 @@ def one_world(recipe: WholeRecipe, folder: Path, withhold: bool) -> tuple[list[s
     observed, sealed = folder / "seen", folder / "sealed"
     write_world(world, observed, sealed)
 
-    def command(*arguments: str) -> int:
-        done = run(str(observed), list(arguments))
-        if done["exit"] != 0:
-            told = str(done["message"]).strip()[-300:]
-            print(f"{arguments[0]}: {told}", file=sys.stderr, flush=True)
-        return int(str(done["exit"]))
-
     def diagnosed(out: str, *more: str) -> tuple[Mapping[str, Any] | None, dict[str, Any], float]:
-        start, answer = time.perf_counter(), None
         options = ("-o", "diagnosis.json", "--cell-out", out, *more)
-        if command("diagnose", "cell.toml", "data.csv", *options) == 0:
+        done, answer = run(observed, "diagnose", "cell.toml", "data.csv", *options), None
+        if done.exit == 0:
             answer = json.loads((observed / "diagnosis.json").read_text(encoding="utf-8"))
-        seconds = time.perf_counter() - start
-        fresh = sealed / "fresh.csv"
-        return answer, judged(world, observed, fresh, command, answer, out), seconds
+        else:
+            print(done.message.strip()[-300:], file=sys.stderr, flush=True)
+        return answer, judged(world, observed, sealed / "fresh.csv", answer, out), done.seconds
 
     answer, whole, seconds = diagnosed("extended.toml")
-    (folder / "judged.json").write_text(json.dumps(whole, indent=2), encoding="utf-8")
     errors = [whole[key] or np.nan for key in ("geometry_mm", "tool_mm", "oracle_mm")]
     ratio = over_oracle(whole)
     cells = [world.spec.name, f"{1e6 * world.noise.level:.0f}"]

@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from draw import World
 from whole_oracle import Gap, Sights, gap_of, oracle_error
+from worker import run
 
 Json = Mapping[str, Any]
 Part = tuple[str, str]
-# Runs `elastocal ARGUMENTS` in the visible folder; its exit code.
-Command = Callable[..., int]
 
 NEW, RESULT = "new.csv", "result.json"
 SMALL = 0.01  # of the gap, in mean squares: what is less need not be found
@@ -51,12 +50,7 @@ NAMELESS = (
 
 
 def judged(
-    world: World,
-    visible: Path,
-    fresh: Path,
-    command: Command,
-    answer: Json | None,
-    extended: str,
+    world: World, visible: Path, fresh: Path, answer: Json | None, extended: str
 ) -> dict[str, Any]:
     """What the campaign's answer is worth; the new poses are shown to the tool only now.
 
@@ -75,8 +69,8 @@ def judged(
     covered = [p for key in stated for p in matching(gap, key)]
     strengths = {part: gap.strength([part]) for part in gap.parts}
     return {
-        "geometry_mm": tested(visible, command, "cell.toml"),
-        "tool_mm": None if answer is None else tested(visible, command, extended),
+        "geometry_mm": tested(visible, "cell.toml"),
+        "tool_mm": None if answer is None else tested(visible, extended),
         "oracle_mm": 1e3 * oracle_error(sights),
         "gap_um": 1e6 * gap.rms,
         "strengths": {":".join(part): size for part, size in strengths.items()},
@@ -101,9 +95,9 @@ def over_oracle(whole: Json, key: str = "tool_mm") -> float:
     return np.inf if whole[key] is None else float(whole[key] / whole["oracle_mm"])
 
 
-def tested(visible: Path, command: Command, cell: str) -> float | None:
+def tested(visible: Path, cell: str) -> float | None:
     """Rms error in mm of the identified `cell` at the NEW poses in the visible folder."""
-    if command("identify", cell, "data.csv", "--test", NEW, "-o", RESULT) != 0:
+    if run(visible, "identify", cell, "data.csv", "--test", NEW, "-o", RESULT).exit != 0:
         return None
     result = json.loads((visible / RESULT).read_text(encoding="utf-8"))
     return float(result["test"]["rms_um"]) / 1e3

@@ -4,26 +4,23 @@
 
 The arms of the blind check (`../blind_diagnosis`: errors of base, offsets, links, markers and
 compliances, the weights of the links, a tracker anywhere, joints that settle anew at each visit)
-are measured with and without their payload, identified by `elastocal identify`, and commanded by
-`elastocal compensate` to targets in the tracker's frame, under the load.  MuJoCo says where the
+are measured with and without their payload, identified by `identify`, and commanded by
+`compensate` to targets in the tracker's frame, under the load.  MuJoCo says where the
 tool really goes.  Writes result.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from joblib import Parallel, delayed
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from elastocal.compensation.compensate import compensate, read_targets
-from elastocal.model.calibrated import read_calibrated, tool_point
+import elastocal as ec
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "blind_diagnosis"))
@@ -74,33 +71,28 @@ def one_arm(name: str, seed: int, count: int) -> tuple[np.ndarray, np.ndarray, n
     with tempfile.TemporaryDirectory() as folder:
         seen = Path(folder) / "seen"
         write_world(world, seen, Path(folder) / "sealed")
-        command = ["-m", "elastocal", "identify", "cell.toml", "data.csv", "-o", "result.json"]
-        subprocess.run([sys.executable, *command, "-q"], check=True, capture_output=True, cwd=seen)
-        arm = read_calibrated(seen / "cell.toml", seen / "result.json")
-        write_targets(world, count, seen / "targets.csv")
-        wanted = read_targets(seen / "targets.csv", arm.model.chain.kinds, "tracker")
-        found = compensate(arm, wanted, tool_point(arm.model.cell, "M1"))
+        fit = ec.identify(seen / "cell.toml", seen / "data.csv")
+    wanted, load = targets(world, count), [0.0, 0.0, -world.spec.payload]
+    found = ec.compensate(fit, wanted, load=load, frame="tracker", point="M1")
     good = np.flatnonzero(found.reached)
     before, after = (
-        at_rest(world, q[good]) - wanted.position[good] for q in (found.nominal, found.q)
+        at_rest(world, q[good]) - wanted[good, :3, 3] for q in (found.nominal, found.q)
     )
     return before, after, found.uncertainty.covariance[good]
 
 
-def write_targets(world: World, count: int, path: Path) -> None:
-    """Where a perfect arm with this tool, seen by this tracker, would have marker M1 at random
-    poses."""
+def targets(world: World, count: int) -> np.ndarray:
+    """Where (n, 4, 4) a perfect arm with this tool, seen by this tracker, would have marker M1 at
+    random poses."""
     rng, true = np.random.default_rng((*world.seed, 5)), world.specimen.true
     q = draw_poses(world.spec, 3 * count, rng)
     q = q[np.abs(np.sin(q[:, -2])) > SINGULAR][:count]
     R, p = world.spec.skeleton.forward(q)
-    turn = true.base_rotation @ R[:, -1]
-    position = true.base_position + p[:, -1] @ true.base_rotation.T + turn @ true.markers[0]
-    turned = Rotation.from_matrix(turn).as_rotvec(degrees=True)
-    force = np.tile([0.0, 0.0, -world.spec.payload], (len(q), 1))
-    head = "x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,force_x_N,force_y_N,force_z_N"
-    values = np.hstack([position * 1e3, turned, force])
-    np.savetxt(path, values, fmt="%.12g", delimiter=",", header=head, comments="")
+    T = np.tile(np.eye(4), (len(q), 1, 1))
+    T[:, :3, :3] = true.base_rotation @ R[:, -1]
+    T[:, :3, 3] = true.base_position + p[:, -1] @ true.base_rotation.T
+    T[:, :3, 3] += T[:, :3, :3] @ true.markers[0]
+    return T
 
 
 def at_rest(world: World, q: np.ndarray) -> np.ndarray:

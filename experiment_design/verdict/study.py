@@ -28,7 +28,7 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.identify import identify
 from elastocal.identification.residuals import rms_3d
 from elastocal.measurements import Measurements
-from elastocal.model.chain import Chain, finite_ranges
+from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.model.urdf import read_urdf
@@ -122,7 +122,7 @@ def campaign(number: int) -> tuple[Model, Measurements, Measurements, dict[str, 
     added = (EffectChoice(hidden, joint),) if hidden in ("backlash", "gear_eccentricity") else ()
     real = fitted.with_effects(fitted.cell.model.effects + added)
     x = _true(real, rng, scale, size, weight)
-    low, high = finite_ranges(chain, *_limits(chain))
+    low, high = _limits(chain)
     middle = low + rng.uniform(share / 2, 1 - share / 2, len(low)) * (high - low)
     near = middle + share / 2 * (high - low) * rng.uniform(-1, 1, (poses, len(low)))
     load = None if what == "geometry" else np.array([0.0, 0.0, -weight])

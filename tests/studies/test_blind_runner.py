@@ -72,36 +72,29 @@ def test_one_effect(given, outcome, outright):
 # --- nothing leaks, nothing is lost -----------------------------------------------------------
 
 
-class Blindfold(worker.Worker):
-    """Answers without the tool, and looks around in what it was given."""
-
-    def __init__(self):
-        super().__init__()
-        self.observed = []
-
-    def diagnose(self, folder, *arguments):
-        self.observed.append((folder, arguments, sorted(p.name for p in folder.iterdir())))
-        given = dict.fromkeys(score.KEPT) | NOTHING | {"candidates": [{}] * 99}
-        (folder / one_world.ANSWER).write_text(json.dumps(given))
-        return worker.Run(0, 1.0, "")
-
-
 def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch):
-    folders, make = [], one_world.tempfile.mkdtemp
+    folders, make, observed = [], one_world.tempfile.mkdtemp, []
 
     def made(**given):
         folders.append(Path(make(**given)))
         return str(folders[-1])
 
+    def blindfold(folder, *arguments):
+        """Answers without the tool, and looks around in what it was given."""
+        observed.append((folder, arguments, sorted(p.name for p in folder.iterdir())))
+        given = dict.fromkeys(score.KEPT) | NOTHING | {"candidates": [{}] * 99}
+        (folder / one_world.ANSWER).write_text(json.dumps(given))
+        return worker.Run(0, 1.0, "")
+
     monkeypatch.setattr(one_world.tempfile, "mkdtemp", made)
+    monkeypatch.setattr(one_world, "run", blindfold)
     recipe = Recipe("encoder_scale-8-000", (5, 1), ("encoder_scale",), poses=8)
-    blind = Blindfold()
-    record = one_world.diagnose_world(suites.Task("left_out", recipe), blind, {"seed": 5})
-    ((visible, arguments, files),) = blind.observed
+    record = one_world.diagnose_world(suites.Task("left_out", recipe), {"seed": 5})
+    ((visible, arguments, files),) = observed
     sealed = next(f for f in folders if f != visible)
     assert files == ["arm.urdf", "cell.toml", "data.csv"]
     written = ("-o", one_world.ANSWER, "--cell-out", one_world.CELL)
-    assert arguments == (*written, "--without", "encoder_scale")
+    assert arguments == (*one_world.DIAGNOSE, *written, "--without", "encoder_scale")
     assert not visible.is_relative_to(sealed) and not sealed.is_relative_to(visible)
     assert "encoder" not in str(visible) and visible.name[:6] != sealed.name[:6]
     assert record["truth"]["effects"][0]["effect"] == "encoder_scale"
@@ -109,24 +102,19 @@ def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch)
     assert not visible.exists() and not sealed.exists()
 
 
-def test_the_worker_is_given_no_environment_and_cannot_import_the_study(tmp_path, monkeypatch):
-    """It runs a stand-in for the script that tells what a process of its kind can reach."""
-    probe = tmp_path / "probe.py"
-    probe.write_text(
+def test_the_command_is_given_no_environment_and_cannot_import_the_study(tmp_path, monkeypatch):
+    """A stand-in for it tells what a process of its kind can reach."""
+    probe = (
         "import importlib.util, json, os, sys\n"
-        "for line in sys.stdin:\n"
-        "    told = [sorted(os.environ), importlib.util.find_spec('draw') is None, os.getcwd()]\n"
-        "    done = {'exit': 0, 'seconds': 0.0, 'message': json.dumps(told)}\n"
-        "    print(json.dumps(done), flush=True)\n"
+        "told = [sorted(os.environ), importlib.util.find_spec('draw') is None, os.getcwd()]\n"
+        "sys.exit(json.dumps(told))"
     )
-    monkeypatch.setattr(worker, "SCRIPT", probe)
+    monkeypatch.setattr(worker, "COMMAND", (*worker.COMMAND[:2], "-c", probe))
     monkeypatch.setenv("SEED_OF_THE_STUDY", "5")
     monkeypatch.setenv("PYTHONPATH", str(FOLDER))
-    asked = worker.Worker()
-    environment, cannot_import, cwd = json.loads(asked.diagnose(tmp_path).message)
-    asked.close()
+    environment, cannot_import, cwd = json.loads(worker.run(tmp_path).message)
     assert set(environment) <= {*worker.KEPT, "OPENBLAS_NUM_THREADS", "LC_CTYPE"}
-    assert cannot_import and Path(cwd) != FOLDER
+    assert cannot_import and Path(cwd) == tmp_path
 
 
 # --- the study ---------------------------------------------------------------------------------
@@ -144,7 +132,7 @@ def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypat
         drawn.append(task)
         return origin | {"suite": task.suite, "answer": None, "seconds": 1.0}
 
-    monkeypatch.setattr(study, "in_own_worker", one)
+    monkeypatch.setattr(study, "diagnose_world", one)
     every = list(study.tasks(OPTIONS))
     ends = [{given["suite"]: given for given in order} for order in (every, every[::-1])]
     chosen = [given for end in ends for given in end.values()]

@@ -6,9 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
-
-from elastocal.cli.main import app
+from support.design_commands import elastocal
 
 FOLDER = Path(__file__).parents[2] / "experiment_design" / "real_arms"
 
@@ -36,20 +34,16 @@ def folder(tmp_path_factory):
 
 
 def ran(verb, folder, cell, data, *options):
-    arguments = [verb, str(folder / cell), str(folder / "data" / data), "-q", "--json"]
-    arguments += [str(folder / "data" / o) if o.endswith(".csv") else o for o in options]
-    done = CliRunner().invoke(app, arguments)
+    arguments = [verb, folder / cell, folder / "data" / data, "-q", "--json"]
+    arguments += [folder / "data" / o if o.endswith(".csv") else o for o in options]
+    done = elastocal(*arguments)
     assert done.exit_code == 0, done.stderr
     return json.loads(done.stdout)
 
 
-def identified(folder, cell, data, *options):
-    return ran("identify", folder, cell, data, *options)
-
-
 def test_wam_is_no_matter_of_geometry_alone(folder):
     """A cable drive: fitted like the others, and what is left is far above any tracker."""
-    found = identified(folder, "wam.toml", "wam_grid.csv", "--test", "wam_random.csv")
+    found = ran("identify", folder, "wam.toml", "wam_grid.csv", "--test", "wam_random.csv")
     assert found["test_mean_um"] < 3300
     assert found["heldout_rms_um"] > 1000
 
@@ -57,9 +51,9 @@ def test_wam_is_no_matter_of_geometry_alone(folder):
 def test_iiwa_bends_at_its_joints(folder):
     """Three payloads, one tool point each, springs driven by the measured torques; of more
     parameters than the readings show, those stay without which the fit settles."""
-    rigid = identified(folder, "iiwa7_rigid.toml", "iiwa7.csv")
-    soft = identified(folder, "iiwa7.toml", "iiwa7.csv")
-    one = identified(folder, "iiwa7_joint2.toml", "iiwa7.csv")
+    rigid = ran("identify", folder, "iiwa7_rigid.toml", "iiwa7.csv")
+    soft = ran("identify", folder, "iiwa7.toml", "iiwa7.csv")
+    one = ran("identify", folder, "iiwa7_joint2.toml", "iiwa7.csv")
     assert rigid["heldout_rms_um"] == pytest.approx(1600, rel=0.1)
     assert soft["converged"]
     assert soft["heldout_rms_um"] <= 450 and one["heldout_rms_um"] <= 450
@@ -69,15 +63,12 @@ def test_iiwa_bends_at_its_joints(folder):
 
 def test_the_faulty_block_of_the_cable_data_is_found(folder):
     """A shift by some 4 mm over lines 142 to 507, seen by the tool itself."""
-    as_is = identified(folder, "irb120.toml", "irb120.csv", "--outliers", "keep")
+    as_is = ran("identify", folder, "irb120.toml", "irb120.csv", "--outliers", "keep")
     assert as_is["excluded"] == [] and len(as_is["outliers"]) > 300
-    clean = identified(folder, "irb120.toml", "irb120.csv")
+    clean = ran("identify", folder, "irb120.toml", "irb120.csv")
     left_out = {o["line"] for o in clean["excluded"]}
     assert len(left_out & set(range(142, 508))) > 350 and len(left_out) < 400
     assert clean["heldout_rms_um"] < 620 < as_is["heldout_rms_um"]
-
-
-# Diagnosis
 
 
 def of_written_cell(folder, cell, train, test=None):
@@ -85,11 +76,11 @@ def of_written_cell(folder, cell, train, test=None):
     diagnosis of its training table writes."""
     data, written = folder / "data", folder / f"written_{Path(train).stem}.toml"
     arguments = ["diagnose", folder / cell, data / train, "--cell-out", written, "-q"]
-    assert CliRunner().invoke(app, [str(a) for a in arguments]).exit_code == 0
+    assert elastocal(*arguments).exit_code == 0
     errors = []
     for file in (folder / cell, written):
         arguments = ["identify", file, data / train, *(("--test", data / test) if test else ())]
-        done = CliRunner().invoke(app, [*(str(a) for a in arguments), "-q", "--json"])
+        done = elastocal(*arguments, "-q", "--json")
         assert done.exit_code == 0, done.stderr
         found = json.loads(done.stdout)
         errors.append(found["test"]["rms_um"] if test else found["heldout_rms_um"])
@@ -111,16 +102,12 @@ def test_what_is_diagnosed_corrects_poses_never_fitted(folder, cell, train, test
     assert corrected <= bar and corrected < 0.8 * geometry
 
 
-def diagnosed(folder, cell, data):
-    return ran("diagnose", folder, cell, data)
-
-
 @pytest.mark.parametrize(
     "cell, calibrated", [("iiwa7_rigid.toml", 1650), ("iiwa7_rigid_scale.toml", 990)]
 )
 def test_iiwa_without_springs_is_found_to_bend_at_joint_2(folder, cell, calibrated):
     """What identification shows (README): 1.6 to 0.4 mm with one compliance near 1e-4."""
-    found = diagnosed(folder, cell, "iiwa7.csv")
+    found = ran("diagnose", folder, cell, "iiwa7.csv")
     first = found["effects"][0]
     assert (first["effect"], first["where"]) == ("joint_compliance", "joint2")
     assert first["probability"] > 0.85
