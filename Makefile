@@ -7,7 +7,6 @@ WORKERS ?= 2
 PYTEST_ARGS ?=
 VERSIONS_ARGS ?=
 BENCH_ARGS ?=
-MUTANTS_ARGS ?=
 GOLDEN ?=
 
 VENV := .venv
@@ -26,7 +25,7 @@ NOT_AT_HOME := not-at-home
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long golden golden-accept test-versions mutants bench lint docs docs-figures clean not-at-home
+.PHONY: help demo test test-long golden golden-accept test-versions bench lint docs docs-figures clean not-at-home
 .DELETE_ON_ERROR:
 
 help:
@@ -37,7 +36,6 @@ help:
 	@echo "make golden-accept  takes what differs as meant                          (GOLDEN=\"demo\", GOLDEN=all)"
 	@echo "make test-versions  the wheel with every other supported Python that is found (VERSIONS_ARGS=--one), then a"
 	@echo "                    slice of the tests with the oldest and the newest of what it needs"
-	@echo "make mutants    do the tests notice wrong lines?  60 drawn; about an hour (MUTANTS_ARGS=\"--count 20\")"
 	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"
 	@echo "make docs       the documentation as pages in site/ (strict: a broken link is an error)"
@@ -73,10 +71,7 @@ golden-accept: $(TEST_TOOLS)
 
 test-versions: $(RUN_TIME)
 	$(BIN)/python tests/versions.py $(VERSIONS_ARGS)
-	$(BIN)/python tests/versions.py --floors --newest
-
-mutants: $(TEST_TOOLS)
-	$(BIN)/python tests/mutation.py $(MUTANTS_ARGS)
+	$(BIN)/python tests/versions.py --slices
 
 bench: $(RUN_TIME)
 	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)

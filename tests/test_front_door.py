@@ -14,12 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from support.design_commands import elastocal as command
 
 import elastocal as ec
 from elastocal import plugins
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cli.main import app
 from elastocal.demo.example import LOAD_N, run_demo
 from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.errors import options_as_flags
@@ -41,7 +40,7 @@ def folder(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(made)
         result = command("simulate", "cell.toml", "plan.csv", "-o", "kept_back.csv", "--seed", "7",
-                         "--load", *map(str, LOAD), "--repeats", "2",
+                         "--load", *LOAD, "--repeats", "2",
                          "--set", "joint3.compliance=4.1e-7")  # fmt: skip
         assert result.exit_code == 0
     return made
@@ -71,10 +70,6 @@ def plan(model):
         loads=[LOAD], levels={"joint2": np.radians([-25.24, -99.85])}, candidates=60,
         effort="quick", fixed="joint1",
     )  # fmt: skip
-
-
-def command(*words):
-    return CliRunner().invoke(app, list(words))
 
 
 # Names
@@ -180,13 +175,13 @@ def test_a_plan_of_several_loads_states_those_of_each_row_as_they_were_asked_for
 
 def test_diagnose_is_that_of_the_command_line(folder):
     why = ec.diagnose(ec.Model(folder / "cell.toml"), "data.csv", seed=1)
-    done = command("diagnose", "cell.toml", "data.csv", "-o", "line.json", "--seed", "1", "-q")
+    given = ("cell.toml", "data.csv", "-o", "line.json", "--cell-out", "line.toml", "--seed", "1")
+    done = command("diagnose", *given, "-q")
     assert done.exit_code == 0, done.output
     with options_as_flags():  # its remedies name options
         why.save("front.json")
     assert Path("front.json").read_text() == Path("line.json").read_text()
     assert why.budget and why.verdict == "nothing_significant"  # nothing is missing in the demo
-    command("diagnose", "cell.toml", "data.csv", "--cell-out", "line.toml", "--seed", "1", "-q")
     with pytest.raises(ec.InputError, match="is the cell that was diagnosed"):
         why.save(why.model.cell.path)
     why.save("front.toml")
@@ -215,7 +210,7 @@ def test_compensate_is_that_of_the_command_line(fit):
     rows = [",".join(f"{v * 1e3:g}" for v in target) for target in TARGETS]
     Path("targets.csv").write_text("x_mm,y_mm,z_mm\n" + "\n".join(rows) + "\n")
     done = command("compensate", "cell.toml", "result.json", "targets.csv", "-o", "line.csv",
-                   "--load", *map(str, LOAD), "-q")  # fmt: skip
+                   "--load", *LOAD, "-q")  # fmt: skip
     assert done.exit_code == 0, done.output
     commands = ec.compensate(fit, "targets.csv", load=LOAD)
     commands.save("front.csv")

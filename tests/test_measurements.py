@@ -9,10 +9,7 @@ import pytest
 
 from elastocal import tables
 from elastocal.errors import InputError
-from elastocal.measurements import (
-    read_measurements,
-    write_measurements,
-)
+from elastocal.measurements import read_measurements, write_measurements
 
 HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
 ROW = "1,2,3,4,5"
@@ -177,11 +174,7 @@ def test_what_is_observed_decides_the_columns_needed(refusal, observe, needed):
 
 @pytest.mark.parametrize(
     ("cell", "told"),
-    [
-        ("-inf", "not a finite number"),
-        ("1e999", "too large"),
-        ("１", "not a number"),
-    ],
+    [("-inf", "not a finite number"), ("1e999", "too large"), ("１", "not a number")],
 )
 def test_bad_cell_is_told_with_line_column_and_text(refusal, cell, told):
     message = refusal(table(ROW, ROW.replace("3", "7"), f"1,2,3,{cell},5"))

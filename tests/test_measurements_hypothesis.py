@@ -12,12 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from elastocal.errors import InputError
-from elastocal.measurements import (
-    Measurements,
-    read_measurements,
-    with_moves,
-    write_measurements,
-)
+from elastocal.measurements import Measurements, read_measurements, with_moves, write_measurements
 from elastocal.text import is_label
 
 SETTINGS = settings(

@@ -48,31 +48,13 @@ DATASET_FOLDERS = {
     "ur5_wam_tsinghua", "iiwa7_payload_torque", "robotcali_irb120_cable", "ur10_ipa_leica",
 }  # fmt: skip
 
-GENERATED = {"__pycache__", "build", "dist", "demo_out", "node_modules", "site"}
-
 
 def repository_files() -> list[Path]:
-    """What is, or would be, committed; every file that is not generated where git cannot tell."""
-    if (ROOT / ".git").exists():
-        command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
-        try:
-            listed = subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout
-        except (OSError, subprocess.CalledProcessError):
-            pass  # no git, or a tree that belongs to somebody else
-        else:
-            names = os.fsdecode(listed).split("\0")
-            return [path for name in names if name and (path := ROOT / name).is_file()]
-    return list(_walk(ROOT))
-
-
-def _walk(folder: Path) -> Iterator[Path]:
-    for path in sorted(folder.iterdir()):
-        if path.is_dir():
-            hidden = path.name.startswith(".") and path.name != ".ci"
-            if not (hidden or path.name in GENERATED or path.suffix == ".egg-info"):
-                yield from _walk(path)
-        elif path.is_file():
-            yield path
+    """What is, or would be, committed; nothing where git cannot tell."""
+    command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True).stdout
+    names = os.fsdecode(listed).split("\0")
+    return [path for name in names if name and (path := ROOT / name).is_file()]
 
 
 FILES = repository_files()

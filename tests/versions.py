@@ -1,12 +1,12 @@
 """The wheel on every supported Python of this machine: python tests/versions.py.
 
-With --floors and --newest: a slice of the tests in an environment with the oldest versions that
-pyproject.toml allows, all together, and in one with the newest that there are.
+With --slices: a slice of the tests in an environment with the oldest versions that pyproject.toml
+allows, all together, and in one with the newest that there are.
 
 Each of VERSIONS that is found by name, or among pyenv's, gets an empty environment outside the
 checkout, the wheel with the tested versions of what it needs, and then runs as a user would: demo,
-identify, a report.  The one that runs this is left to `make test`.  What is missing is said and
-left out; exit code 1 where something breaks.
+identify, a report.  The one that runs this is left to `make test`.  What is missing is left out;
+exit code 1 where something breaks.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from functools import partial
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -58,8 +59,12 @@ def run(folder: Path, *words: object) -> str:
     return done.stdout
 
 
-def tried(python: str, source: Path, folder: Path) -> str:
+def tried(python: str, folder: Path) -> str:
     """Install and run; returns what was made with what."""
+    source = folder / "source"  # pip builds where the sources are
+    shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copyfile(ROOT / name, source / name)
     run(folder, python, "-m", "venv", "venv")
     own = folder / "venv" / "bin"
     # Not --compile: of what is installed a tenth is imported, and what is gets compiled then.
@@ -72,7 +77,7 @@ def tried(python: str, source: Path, folder: Path) -> str:
     assert "wrote report.html" in told
     size = (folder / "report.html").stat().st_size
     assert size > 100_000, f"a report of {size} bytes"
-    return f"{run(folder, own / 'python', '--version').strip()}: demo, identify, report"
+    return "demo, identify, report"
 
 
 def floors() -> list[str]:
@@ -95,51 +100,27 @@ def sliced(which: str, folder: Path) -> str:
     told = run(folder, "env", f"PYTHONPATH={ROOT / 'src'}", own, "-m", "pytest", "--rootdir",
                ROOT, "-c", ROOT / "pyproject.toml", "-q", "-p", "no:cacheprovider", "--tb=short",
                "--disable-warnings", *(ROOT / each for each in SLICE))  # fmt: skip
-    return f"{which}: {told.strip().splitlines()[-1]}"
+    return told.strip().splitlines()[-1]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    own = "{}.{}".format(*sys.version_info)
-    others = [version for version in VERSIONS if version != own]
-    parser.add_argument("versions", nargs="*", default=others, help="default: all but this one")
-    parser.add_argument("--one", action="store_true", help="only the newest that is found")
-    for which in ("floors", "newest"):
-        parser.add_argument(f"--{which}", action="store_true", help=f"the tests with the {which}")
-    asked, failed = parser.parse_args(), 0
-    slices = [which for which in ("floors", "newest") if getattr(asked, which)]
-    for which in slices:
-        with tempfile.TemporaryDirectory(prefix=f"elastocal-{which}-") as place:
+    parser.add_argument("--one", action="store_true", help="only the newest Python that is found")
+    parser.add_argument("--slices", action="store_true", help="tests with oldest and newest needs")
+    asked, own, failed = parser.parse_args(), "{}.{}".format(*sys.version_info), 0
+    found = {v: python for v in VERSIONS if v != own and (python := interpreter(v))}
+    work = {f"Python {v}": partial(tried, python) for v, python in found.items()}
+    if asked.slices:
+        work = {which: partial(sliced, which) for which in ("floors", "newest")}
+    for name in list(work)[-1:] if asked.one else work:
+        begun = time.monotonic()
+        with tempfile.TemporaryDirectory(prefix="elastocal-versions-") as place:
             try:
-                print(sliced(which, Path(place)), flush=True)
-            except subprocess.CalledProcessError as error:
-                failed += 1
-                print(f"{which}: {error}", flush=True)
-    if slices:
-        return int(bool(failed))
-    with tempfile.TemporaryDirectory(prefix="elastocal-versions-") as place:
-        source = Path(place, "source")  # pip builds where the sources are
-        shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
-        for name in ("pyproject.toml", "README.md", "LICENSE"):
-            shutil.copyfile(ROOT / name, source / name)
-        for version in asked.versions[::-1] if asked.one else asked.versions:
-            begun, python = (time.monotonic(), os.times()), interpreter(version)
-            if python is None:
-                print(f"Python {version}: left out, there is none on this machine", flush=True)
-                continue
-            folder = Path(place, version)
-            folder.mkdir()
-            try:
-                told = tried(python, source, folder)
-                spent = sum(os.times()[2:4]) - sum(begun[1][2:4])
-                print(f"{told}; {time.monotonic() - begun[0]:.0f} s, {spent:.0f} of processor time")
+                told = work[name](Path(place))
             except (subprocess.CalledProcessError, AssertionError) as error:
-                failed += 1
-                print(f"Python {version}: {error}")
-            shutil.rmtree(folder, ignore_errors=True)
-            if asked.one:
-                break
-    return int(bool(failed))
+                failed, told = failed + 1, str(error)
+        print(f"{name}: {told}; {time.monotonic() - begun:.0f} s", flush=True)
+    return int(failed > 0)
 
 
 if __name__ == "__main__":

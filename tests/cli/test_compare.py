@@ -6,10 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from support.design_commands import elastocal
 
 import elastocal as ec
-from elastocal.cli.main import app
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
 CELL = """\
@@ -54,7 +53,7 @@ def in_folder(folder, monkeypatch):
 
 
 def run(*words):
-    done = CliRunner().invoke(app, ["compare", *words])
+    done = elastocal("compare", *words)
     return done.exit_code, done.stdout, done.stderr
 
 

@@ -7,10 +7,9 @@ import json
 
 import numpy as np
 import pytest
+from support.design_commands import elastocal
 from support.robots import KR270
-from typer.testing import CliRunner
 
-from elastocal.cli.main import app
 from elastocal.model.manipulator import Model
 
 CELL = f"""
@@ -52,10 +51,8 @@ def folder(tmp_path):
 
 
 def run(folder, *arguments):
-    files = [str(folder / "cell.toml"), str(folder / "result.json")]
-    outcome = CliRunner().invoke(
-        app, ["compensate", *files, *map(str, arguments), "-q"], catch_exceptions=False
-    )
+    files = (folder / "cell.toml", folder / "result.json")
+    outcome = elastocal("compensate", *files, *arguments, "-q")
     assert "Traceback" not in outcome.stderr
     return outcome
 
@@ -68,8 +65,7 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
     assert "3 of 3 targets reached by the marker [bold]M2" in told
     assert "Next: Run commands.csv and measure some. 95 % of the targets" in told
     sets = [v for name, value in TRUTH.items() for v in ("--set", f"{name}={value}")]
-    words = ["simulate", folder / "cell.toml", out, "-o", seen, "--no-noise", *sets]
-    CliRunner().invoke(app, [*map(str, words)])
+    elastocal("simulate", folder / "cell.toml", out, "-o", seen, "--no-noise", *sets)
     rows = csv.DictReader(seen.open())
     x = [float(row["x_m"]) for row in rows if row["marker"] == "[bold]M2"]
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.design_commands import (
     DEFLECTION,
+    PROGRAM,
     altered,
     design,
     elastocal,
@@ -19,11 +20,6 @@ from support.design_commands import (
 from elastocal.planning import checkpoint
 
 GOING_ON = "resuming the interrupted design"
-# A child may inherit that SIGINT is ignored; here it must not.
-PROGRAM = (
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from elastocal.cli.main import main; main()"
-)
 
 
 @pytest.fixture(scope="module")

@@ -62,11 +62,7 @@ def test_everything_missing_at_once(campaign, tmp_path):
 
 @pytest.mark.parametrize(
     ("shell", "code"),
-    [
-        ('"$@" | head -n 1 > /dev/null', 0),
-        ('"$@" >&-', 0),
-        ('"$@" > /dev/full', 2),
-    ],
+    [('"$@" | head -n 1 > /dev/null', 0), ('"$@" >&-', 0), ('"$@" > /dev/full', 2)],
 )
 def test_streams_that_are_closed_or_full(campaign, tmp_path, shell, code):
     if "full" in shell and not Path("/dev/full").exists():

@@ -9,10 +9,8 @@ from pathlib import Path
 import pytest
 from support.design_commands import design, elastocal, write_cell
 from support.mjcf_text import write_arm
-from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.main import app
 from elastocal.model.manipulator import Model
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
@@ -27,7 +25,7 @@ def arms(tmp_path, monkeypatch):
 
 
 def run(*words):
-    done = CliRunner().invoke(app, list(map(str, words)))
+    done = elastocal(*words)
     assert done.exit_code == 0, done.stderr
     return done.stdout
 

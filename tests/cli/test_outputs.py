@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 from fuzz import campaign
 from fuzz.campaign import ALL, COMMANDS
-from typer.testing import CliRunner
-
-from elastocal.cli.main import app
+from support.design_commands import elastocal
 
 WRITING = {c.verb: c for c in reversed(COMMANDS) if c.outputs}
 PR_CAPBSET_DROP, CAP_DAC_OVERRIDE = 24, 1
@@ -43,7 +41,7 @@ def test_no_output_goes_over_an_input(inputs, monkeypatch, tmp_path, verb, how):
     words[option] = place or target.name
     monkeypatch.chdir(inputs)
     before = sorted(os.listdir(inputs))
-    done = CliRunner().invoke(app, [verb, *words])
+    done = elastocal(verb, *words)
     assert done.exit_code == 2 and target.read_bytes() == content
     assert sorted(os.listdir(inputs)) == before
 
@@ -64,7 +62,7 @@ def test_an_output_is_refused_before_anything_is_read(tmp_path, monkeypatch, ver
     words, at = EVERY[verb, option]
     spoilt = str(spoil(Path(words[at])))
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(app, [verb, *words[:at], spoilt, *words[at + 1 :]])
+    done = elastocal(verb, *words[:at], spoilt, *words[at + 1 :])
     assert (done.exit_code, os.listdir(tmp_path)) == (2, [])
     assert spoilt in done.stderr and words[0] not in done.stderr.replace(spoilt, "")
 
@@ -75,8 +73,8 @@ def test_limits_of_the_cell_have_an_exit_code_of_their_own(inputs, monkeypatch, 
     strict = strict.replace('"arm.urdf"', f'"{inputs / "arm.urdf"}"')
     (tmp_path / "strict.toml").write_text(strict)
     words = ["identify", str(tmp_path / "strict.toml"), "placed.csv", "-q"]
-    assert CliRunner().invoke(app, words).exit_code == 3
-    assert CliRunner().invoke(app, [*words, "--require", "heldout=1e6"]).exit_code == 0
+    assert elastocal(*words).exit_code == 3
+    assert elastocal(*words, "--require", "heldout=1e6").exit_code == 0
 
 
 def without_override() -> None:

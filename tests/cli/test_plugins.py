@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.cells import kr270_chain, random_poses, table_of
+from support.design_commands import elastocal
 from support.registered import forgotten, write_example
 from support.robots import KR270
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
 import elastocal as ec
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.main import app
 from elastocal.errors import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
@@ -81,8 +81,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run(*arguments: object, plugins: bool = True) -> Result:
-    words = [str(a) for a in arguments] + ["--plugins"] * plugins
-    return CliRunner().invoke(app, words, catch_exceptions=False)
+    return elastocal(*arguments, *["--plugins"] * plugins)
 
 
 def test_identify_fits_it_and_export_leaves_it_out(folder: Path) -> None:

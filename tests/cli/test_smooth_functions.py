@@ -8,61 +8,30 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.robots import KR270
-from typer.testing import CliRunner, Result
+from fuzz import campaign
+from golden.door import curved
+from support.design_commands import elastocal
+from typer.testing import Result
 
-from elastocal.cli.main import app
 from elastocal.model.manipulator import Model, smooth_groups
-
-CELL = """
-name = "curved"
-[robot]
-urdf = "arm.urdf"
-[tool]
-markers_m = { M1 = [0.1, 0.05, 0.2] }
-[tracker]
-sigma_um = 20
-[model]
-observe = "position"
-effects = [
-    "base_frame", "marker_position", "joint_offset", "joint_curve:joint1", "joint_curve:joint2",
-]
-[model.nominal.settings.joint1]
-curve_size_rad = 4e-4
-curve_length_rad = 0.5
-curve_low_rad = -1.5
-curve_high_rad = 1.5
-[model.nominal.settings.joint2]
-curve_size_rad = 4e-4
-curve_length_rad = 0.4
-curve_low_rad = -1.8
-curve_high_rad = -0.4
-"""
 
 
 def run(*words: object) -> Result:
-    done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "200"})
+    done = elastocal(*words, COLUMNS="200")
     assert done.exit_code == 0, done.output
     return done
-
-
-def poses(path: Path, n: int, seed: int) -> None:
-    low, high = [-1.5, -1.8, 0.2, -2.0, -1.5, -2.0], [1.5, -0.4, 2.0, 2.0, 1.5, 2.0]
-    q = np.random.default_rng(seed).uniform(low, high, (n, 6))
-    header = ",".join(f"q{i + 1}_rad" for i in range(6))
-    np.savetxt(path, q, delimiter=",", header=header, comments="")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cell, readings of an arm with curves drawn at random, and its calibration."""
     here = tmp_path_factory.mktemp("curved")
-    (here / "arm.urdf").write_bytes(KR270.read_bytes())
-    cell, data = here / "cell.toml", here / "data.csv"
-    cell.write_text(CELL)
-    poses(here / "poses.csv", 90, 0)
-    truth = ("--draw", 1, "--truth", here / "truth.json")
-    run("simulate", cell, here / "poses.csv", "-o", data, *truth)
+    campaign.write(here)
+    curved(here)
+    cell, data = here / "curved.toml", here / "data.csv"
+    cell.write_text(cell.read_text().replace('"link_weights", ', ""))
+    truth = ("--draw", 1, "--truth", here / "truth.json", "--seed", 1)
+    run("simulate", cell, here / "turns.csv", "-o", data, *truth)
     run("identify", cell, data, "-o", here / "result.json")
     return here
 
@@ -74,7 +43,7 @@ def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
     )
     out = folder / "far_commands.csv"
     done = run(
-        "compensate", folder / "cell.toml", folder / "result.json", folder / "far.csv", "-o", out
+        "compensate", folder / "curved.toml", folder / "result.json", folder / "far.csv", "-o", out
     )
     assert "joint1 stands outside -85.9° to 85.9°" in done.output
     near, far = (float(row["std_um"]) for row in csv.DictReader(out.open()))
@@ -84,7 +53,7 @@ def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
 def test_export_writes_them_as_corrections(folder: Path) -> None:
     out = folder / "corrections.csv"
     done = run(
-        "export", folder / "cell.toml", folder / "result.json", "-o", out, "--format",
+        "export", folder / "curved.toml", folder / "result.json", "-o", out, "--format",
         "corrections", "--poses", 20,
     )  # fmt: skip
     assert "joint curve" in done.output
@@ -97,7 +66,7 @@ def test_export_writes_them_as_corrections(folder: Path) -> None:
     assert float(own[-1]["position_deg"]) == pytest.approx(np.degrees(-0.4), abs=1e-3)
     # Beside the truth, less what offsets stand for.
     truth = json.loads((folder / "truth.json").read_text())
-    model = Model(folder / "cell.toml")
+    model = Model(folder / "curved.toml")
     group = smooth_groups(model)[1]
     x = np.radians([float(row["position_deg"]) for row in own])
     assert group.basis is not None

@@ -11,17 +11,11 @@ from contextlib import nullcontext
 
 import pandas as pd
 import pytest
+from support.design_commands import PROGRAM, elastocal
 from support.study_folders import SCRIPT, numbers, run_study, write_study
-from typer.testing import CliRunner
 
-from elastocal.cli.main import app
 from elastocal.studies import read_results
 
-# A child may inherit that SIGINT is ignored; here it must not.
-PROGRAM = (
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from elastocal.cli.main import main; main()"
-)
 SUMMARY = """
 
 def summary(frame):
@@ -39,7 +33,7 @@ posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 
 
 def study(*arguments):
-    return CliRunner().invoke(app, ["study", *map(str, arguments)])
+    return elastocal("study", *arguments)
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""What every verb owes: its line in --help, options that are checked, messages that blame right."""
+"""What every verb owes: options that are checked, messages that blame right."""
 
 from __future__ import annotations
 
@@ -9,24 +9,11 @@ from pathlib import Path
 
 import pytest
 from fuzz.campaign import write
+from support.design_commands import elastocal as run
 from support.registered import forgotten
 from support.tracker_exports import kr270_readings, krl, spatialanalyzer
-from typer.testing import CliRunner, Result
 
-from elastocal.cli.app import VERBS
-from elastocal.cli.main import app
 from elastocal.model.evaluate import VARIABLE, chosen_backend
-
-
-def run(*words: object) -> Result:
-    return CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
-
-
-def test_help_lists_every_verb_in_the_order_of_the_work_with_a_whole_sentence() -> None:
-    shown = run("--help").stdout.partition("Commands:")[2].strip().splitlines()
-    assert [line.split()[0] for line in shown] == list(VERBS)
-    for line in shown:
-        assert len(line.split()) > 3 and not line.endswith("..."), line
 
 
 def test_an_option_without_effect_is_taken_and_not_offered() -> None:

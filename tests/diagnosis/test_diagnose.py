@@ -99,6 +99,7 @@ def test_where_another_effect_looks_the_same_the_answer_is_both(name: str) -> No
     assert (d.effects[0].effect, d.effects[0].where) == found[0]
 
 
+@pytest.mark.long  # of every day is the golden diagnose_nothing
 def test_nothing_is_claimed_on_an_arm_without_faults_though_all_is_tried() -> None:
     d = diagnosed()
     assert d.verdict == "nothing_significant"
@@ -161,7 +162,8 @@ def test_the_shape_of_an_unknown_dependence_is_drawn() -> None:
 # What the table records drives the effect as it drove the arm.
 
 
-@pytest.mark.parametrize("side", sometimes(("load", "load_and_approach"), "load"))
+@pytest.mark.long  # of every day is the golden diagnose_one
+@pytest.mark.parametrize("side", ["load", "load_and_approach"])
 def test_the_readings_tell_the_backlash_model(side: str) -> None:
     chain, play = kr270_chain(), Fault("backlash", "joint3", {"backlash": 3e-4})
     table = measured(chain, cell(play_side=side), [play], plan(chain, 40, 3), 3)

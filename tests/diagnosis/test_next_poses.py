@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from support.design_commands import elastocal
 
-import elastocal as ec
-from elastocal.cli.main import app
 from elastocal.demo.example import run_demo
 from elastocal.diagnosis.next_poses import verdict_of
 from elastocal.planning.plan import Gain
@@ -31,8 +29,8 @@ def test_measuring_ends_where_enough_is_kept_or_nothing_is_won() -> None:
 def test_enough_is_said_and_no_plan_is_written(tmp_path) -> None:
     run_demo(tmp_path)
     path = tmp_path / "none.csv"
-    words = ["next", str(tmp_path / "cell.toml"), str(tmp_path / "data.csv"), "-o", str(path)]
-    done = CliRunner().invoke(app, [*words, "--require", "new_poses=1000", *FEW])
+    words = ("next", tmp_path / "cell.toml", tmp_path / "data.csv", "-o", path)
+    done = elastocal(*words, "--require", "new_poses=1000", *FEW)
     told = " ".join(done.output.split())
     assert done.exit_code == 0 and not path.exists() and "not written" in told
     assert "no further pose is needed: the required error is kept with 95 %" in told
@@ -41,13 +39,6 @@ def test_enough_is_said_and_no_plan_is_written(tmp_path) -> None:
 
 @pytest.mark.parametrize("limit", ["heldout=50", "new_poses=0", "50"])
 def test_another_limit_is_refused(tmp_path, limit) -> None:
-    words = ["next", *(str(INPUTS / name) for name in ("wished.toml", "data.csv"))]
-    words += ["-o", str(tmp_path / "n.csv")]
-    done = CliRunner().invoke(app, [*words, "--require", limit])
+    words = ("next", INPUTS / "wished.toml", INPUTS / "data.csv", "-o", tmp_path / "n.csv")
+    done = elastocal(*words, "--require", limit)
     assert done.exit_code == 2 and "NAME one of new_poses" in " ".join(done.output.split())
-
-
-def test_options_are_named_by_their_keyword() -> None:
-    for wrong in ({"batch": 0}, {"require": -1.0}):
-        with pytest.raises(ec.InputError, match=f"`{next(iter(wrong))}` takes"):
-            ec.next_poses("cell.toml", "data.csv", **wrong)

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.calibration import random_chain
 from support.cells import kr270_chain
-from support.diagnosis_data import Fault, campaign, cell, measured, plan, zigzag
+from support.diagnosis_data import Fault, campaign, cell, measured, plan
 
 import elastocal as ec
 from elastocal import Diagnosis
@@ -56,7 +57,7 @@ def test_positions_without_load_time_approach_and_further_markers() -> None:
 
 
 def test_arms_of_other_numbers_of_joints(n_joints: int = 4) -> None:
-    chain = zigzag(n_joints)
+    chain = random_chain(3, n_joints)
     plain = cell(nominal=Nominal(joint_compliance=(1e-6,) * n_joints), link_gravity=False)
     fault = Fault(
         "gear_eccentricity", "joint3", {"eccentricity_sin": 2e-4, "eccentricity_cos": -1.5e-4}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
+from support.design_commands import elastocal
 
 ROOT = Path(__file__).parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial"
@@ -32,14 +32,12 @@ def ran(command: str, folder: Path) -> str:
     """What a shell prints of a command; ours runs in this process, where it stands alone."""
     import console_blocks
 
-    from elastocal.cli.main import app
-
     words = shlex.split(command.replace("\\\n", " "))
     if words[0] != "elastocal" or {"|", ">", ">>", "&&", ";"} & {*words}:
         return console_blocks.run(command, folder)
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        done = CliRunner().invoke(app, words[1:], env={"COLUMNS": "100", "NO_COLOR": "1"})
+        done = elastocal(*words[1:], COLUMNS="100", NO_COLOR="1")
     assert done.exit_code == 0, f"$ {command}\n{done.output}"
     return done.stdout
 

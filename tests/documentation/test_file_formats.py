@@ -7,9 +7,8 @@ from pathlib import Path
 
 import cell_keys_page
 import pytest
-from typer.testing import CliRunner
+from support.design_commands import elastocal
 
-from elastocal.cli.main import app
 from elastocal.config import keys_of, tables_in
 from elastocal.diagnosis.diagnosis import Curve, RivalPair, Untested
 from elastocal.identification.faulty_readings import FaultyGroup
@@ -112,7 +111,7 @@ def test_every_key_of_plans_and_of_what_is_done_with_a_result_is_on_the_page(
     monkeypatch.chdir(course.folder)
     answer = Path("extra.json").read_text(encoding="utf-8")
     if command:
-        done = CliRunner().invoke(app, [*command.split(), "--json", "--quiet"])
+        done = elastocal(*command.split(), "--json", "--quiet")
         assert done.exit_code == 0, done.output
         answer = done.stdout
     assert not missing(keys(json.loads(answer)), section(heading))

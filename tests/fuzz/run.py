@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import platform
 import shutil
 import sys
 import tempfile
@@ -29,22 +28,18 @@ from fuzz import campaign, harness, kills, mutations  # noqa: E402
 
 from elastocal.cli.app import VERBS  # noqa: E402
 
-BEGIN, END = "<!-- cases: written by tests/fuzz/run.py -->", "<!-- end of cases -->"
-COLUMNS = ("exit 0", "exit 1", "exit 2", *kills.HARMS)
-Done = tuple[str, str, str]  # verb, column of the table, what broke
+Done = tuple[str, str]  # exit code or harm, what broke
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--cases", type=int, default=1000, help="most cases to run")
-    parser.add_argument("--seconds", type=float, default=float("inf"), help="longest time")
     parser.add_argument("--seed", type=int, default=0, help="number of the first case")
     parser.add_argument("--verb", action="append", default=[], help="only this verb; repeatable")
     parser.add_argument("--kills", type=int, default=0, help="kill each command so many times")
     parser.add_argument("--full", type=int, default=0, help="fill its disk so many times")
     parser.add_argument("--interrupts", type=int, default=0, help="Ctrl-C in each so many times")
     parser.add_argument("--jobs", type=int, default=1, help="processes that share the work")
-    parser.add_argument("--write", type=Path, help="page whose table this run replaces")
     parser.add_argument("--case", type=int, help="run one case and show it")
     asked = parser.parse_args()
     folder, begun = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-")), time.monotonic()
@@ -53,37 +48,26 @@ def main() -> int:
     harness.load_everything()
     if asked.case is not None:
         asked.seed, asked.cases = asked.case, 1
-    until = begun + asked.seconds
     times = dict(zip(kills.HARMS, (asked.kills, asked.full, asked.interrupts), strict=True))
-    count, broken = Counter[tuple[str, str]](), 0
+    count, broken = Counter[str](), 0
     with ProcessPoolExecutor(asked.jobs, multiprocessing.get_context("fork")) as pool:
-        spoilt = partial(case, folder, asked.verb, until, asked.case is not None)
-        harm = partial(harms, folder, asked.seed, times, until)
+        spoilt = partial(case, folder, asked.verb, asked.case is not None)
+        harm = partial(harms, folder, asked.seed, times)
         verbs = [v for v in kills.KILLED if not asked.verb or v in asked.verb]
         for work in (pool.map(spoilt, range(asked.seed, asked.seed + asked.cases)),
                      pool.map(harm, verbs if any(times.values()) else ())):  # fmt: skip
-            for verb, column, told in (each for found in work for each in found):
-                count[verb, column] += 1
+            for end, told in (each for found in work for each in found):
+                count[end] += 1
                 broken += bool(told)
                 print(told, end="", flush=True)
     shutil.rmtree(folder)
-    cases = sum(n for (_, column), n in count.items() if column not in kills.HARMS)
-    run = f"{cases} cases from {asked.seed} on, {count.total() - cases} kills, interrupts and full "
-    run += f"disks, with Python {platform.python_version()}: {broken} with a finding; "
-    run += f"{time.monotonic() - begun:.0f} s in all."
-    told = f"{table(count)}\n\n{run}"
-    print(told)
-    if asked.write is not None:
-        before, rest = asked.write.read_text(encoding="utf-8").split(f"{BEGIN}\n")
-        page = f"{before}{BEGIN}\n\n{told}\n\n{END}{rest.split(END)[1]}"
-        asked.write.write_text(page, encoding="utf-8")
+    ends = ", ".join(f"{end} {n}" for end, n in sorted(count.items()))
+    print(f"{ends}; {broken} with a finding; {time.monotonic() - begun:.0f} s in all.")
     return int(broken > 0)
 
 
-def case(folder: Path, verbs: list[str], until: float, show: bool, seed: int) -> list[Done]:
+def case(folder: Path, verbs: list[str], show: bool, seed: int) -> list[Done]:
     """The spoilt command of a seed, in a copy of the campaign."""
-    if time.monotonic() > until:
-        return []
     rng, place = Random(seed), folder / str(seed)
     work = place / "a" / "b" / "c"  # what `..` names stays within the case
     shutil.copytree(folder / "campaign", work)
@@ -100,41 +84,28 @@ def case(folder: Path, verbs: list[str], until: float, show: bool, seed: int) ->
     found = "; ".join(harness.complaints(ended, before, work))
     shutil.rmtree(place)
     told = f"--- case {seed}: {found}\n    {done}\n{ended.told()}"
-    return [(verb, f"exit {ended.code}", told if found or show else "")]
+    return [(f"exit {ended.code}", told if found or show else "")]
 
 
-def harms(folder: Path, seed: int, times: dict[str, int], until: float, verb: str) -> list[Done]:
+def harms(folder: Path, seed: int, times: dict[str, int], verb: str) -> list[Done]:
     """Do to a verb what `times` says so many times: a few to its first command, many to all."""
     each = sorted((k / many, harm, k) for harm, many in times.items() for k in range(many))
     commands = [c for c in campaign.COMMANDS if c.verb == verb][: 1 + len(each) // 20]
     victims = [kills.Victim(c, folder / "campaign", folder / f"{verb}{i}")
                for i, c in enumerate(commands)]  # fmt: skip
     return [
-        (verb, harm, told)
+        (harm, told)
         for i, (_, harm, k) in enumerate(each)
-        for told in harmed(
-            victims[i % len(victims)], harm, Random(f"{seed} {verb} {harm} {k}"), until
-        )
+        for told in harmed(victims[i % len(victims)], harm, Random(f"{seed} {verb} {harm} {k}"))
     ]
 
 
-def harmed(victim: kills.Victim, harm: str, rng: Random, until: float) -> Iterator[str]:
+def harmed(victim: kills.Victim, harm: str, rng: Random) -> Iterator[str]:
     for _ in range(20):  # one that ends before it is killed does not count
-        if time.monotonic() > until:
-            return
         where, found, met = victim.harmed(harm, rng)
         if found or met:
             yield f"--- {victim.command.line}\n    {where}: {'; '.join(found)}\n" if found else ""
             return
-
-
-def table(count: Counter[tuple[str, str]]) -> str:
-    """One row per verb (Markdown)."""
-    rows = ["| verb | " + " | ".join(COLUMNS) + " |", "|---" * (len(COLUMNS) + 1) + "|"]
-    for verb in sorted({verb for verb, _ in count}):
-        numbers = (count[verb, column] for column in COLUMNS)
-        rows.append(f"| `{verb}` | " + " | ".join(str(n or "") for n in numbers) + " |")
-    return "\n".join(rows)
 
 
 if __name__ == "__main__":

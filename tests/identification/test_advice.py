@@ -1,4 +1,5 @@
-"""Warnings: each appears when its cause is there, and none on a clean, adequate case."""
+"""Warnings: each appears when its cause is there.  Tables that contradict the robot are refused
+before anything is fitted, with the remedy."""
 
 from dataclasses import replace
 
@@ -18,7 +19,9 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import Nominal
+from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.identify import identify
+from elastocal.identification.start import check_limits
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
@@ -27,10 +30,6 @@ SIGMA = 5e-5
 def identified(effects, change=lambda table: table, **how):
     model, table, _ = campaign(effects, **how)
     return identify(model, change(table))
-
-
-def test_a_clean_adequate_case_has_no_warning():
-    assert identified(GEOMETRY, seed=2, poses=40).warnings == ()
 
 
 def test_few_poses():
@@ -101,3 +100,66 @@ def test_a_missing_effect_in_one_load_state_is_no_shift():
     rigid = Model.assembled(true.chain, cell_of(PLACED))
     result = identify(rigid, measured(true, plan, true_values(true, rng), SIGMA, rng))
     assert result.excluded == () and not result.verdict.trusted
+
+
+# What is refused before anything is fitted
+
+
+@pytest.fixture
+def model():
+    return Model.assembled(planar_chain(), cell_of(GEOMETRY))
+
+
+def table_for(model, n=20, seed=0, q=None):
+    rng = np.random.default_rng(seed)
+    plan = table_at(random_poses(model.chain, n, seed) if q is None else q)
+    return measured(model, plan, true_values(model, rng), 5e-5, rng)
+
+
+def refused(model, table, error, told, **more):
+    with pytest.raises(error, match=told) as caught:
+        identify(model, table, **more)
+    assert caught.value.exit_code == (1 if error is InsufficientDataError else 2)
+
+
+def test_the_cells_limits_narrow_the_robots():
+    cell = replace(cell_of(GEOMETRY), limits={"joint2": (-0.5, 0.5), "joint3": (-9.0, 9.0)})
+    model, q = Model.assembled(planar_chain(), cell), np.zeros((20, 3))
+    q[3, 1] = 0.5 + np.radians(0.4)  # controllers overshoot a little
+    check_limits(model, table_at(q))
+    q[3, 1] = 0.6
+    with pytest.raises(InputError, match=r"line 5: joint2 \(q2\) at 34\.38° is beyond its limits"):
+        check_limits(model, table_at(q))
+    q[3, 1:] = 0.5, 2.6
+    with pytest.raises(InputError, match=r"joint3 \(q3\) at 149° is beyond its limits"):
+        check_limits(model, table_at(q))
+
+
+def test_small_angles_in_degrees_taken_for_radians(model):
+    """±5° read as ±5 rad: no turn is wound, but most lines lie beyond the limits."""
+    q = np.random.default_rng(0).uniform(-5, 5, (20, 3))
+    q[:, 0] = np.linspace(3.5, 6, 20)
+    told = "most lines are beyond.*probably degrees given as radians .or the reverse., or another"
+    refused(model, table_for(model, q=q), InputError, told)
+
+
+def test_fewer_equations_than_parameters(model):
+    told = (
+        rf"^table.csv: 12 equations from 4 readings cannot determine the model's {len(model.names)}"
+        " parameters and their uncertainty; measure more poses.*or fit fewer effects"
+    )
+    refused(model, table_for(model, n=4), InsufficientDataError, told)
+
+
+def test_the_test_table_is_checked_too(model):
+    other = table_for(model, seed=1)
+    wrong = replace(other, position=other.position * 1e3, source="other.csv")
+    told = r"other\.csv: the readings extend over .* millimetres"
+    refused(model, table_for(model), InputError, told, test=wrong)
+
+
+def test_readings_that_depend_on_nothing_that_is_fitted():
+    """Compliances without any load: not one parameter is seen."""
+    model = Model.assembled(planar_chain(), cell_of(("joint_compliance",)))
+    told = "do not depend on any parameter.*measure other poses or loads, or choose other effects"
+    refused(model, table_for(model), InsufficientDataError, told)

@@ -5,14 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.calibration import (
-    GEOMETRY,
-    campaign,
-    cell_of,
-    combination_truth,
-    measured,
-    table_at,
-)
+from support.calibration import GEOMETRY, campaign, cell_of, combination_truth, measured, table_at
 from support.cells import kr270_chain, random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker

@@ -1,4 +1,4 @@
-"""Covariances of a fit: clusters against statsmodels and clubSandwich, bad input, t intervals.
+"""Covariances of a fit: clusters against statsmodels and clubSandwich, bad input, mixtures.
 
 The printed values are outputs in the documentation of the R package clubSandwich (Pustejovsky;
 reference pages vcovCR.lm and vcovCR.lm_robust) for R's data set ChickWeight (Crowder & Hand 1990):
@@ -13,12 +13,7 @@ import statsmodels.api as sm
 from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.least_squares import (
-    Covariance,
-    cluster_robust,
-    clustered,
-    orthogonal,
-)
+from elastocal.identification.least_squares import Covariance, cluster_robust, clustered, orthogonal
 
 
 def hc(B, e, kind):
@@ -120,16 +115,6 @@ def test_clubsandwich_vcov_of_chick_weights():
     low, high = found.interval(x).T
     np.testing.assert_allclose(low, [23.874, 5.703, -0.837, 1.524, 1.317], atol=5.1e-4)
     np.testing.assert_allclose(high[[0, 1]], [31.84, 8.40], atol=5.1e-3)
-
-
-def test_each_parameter_has_its_own_t():
-    matrix = np.array([[4.0, 1.0, 0.0], [1.0, 9.0, 0.0], [0.0, 0.0, 1.0]])
-    found = Covariance("x", matrix, np.array([5.0, np.inf, 0.0]), "")
-    x = np.array([1.0, 2.0, 3.0])
-    t, z = stats.t.ppf(0.95, 5), stats.norm.ppf(0.95)
-    expected = [[1 - 2 * t, 1 + 2 * t], [2 - 3 * z, 2 + 3 * z], [-np.inf, np.inf]]
-    np.testing.assert_allclose(found.interval(x, 0.9), expected, rtol=1e-12)
-    np.testing.assert_array_equal(found.std, [2.0, 3.0, np.inf])
 
 
 @pytest.mark.parametrize("sizes", [(1.0, 1.0, 1.0), (0.3, 1.0, 4.0)])

@@ -104,9 +104,7 @@ def test_an_equality_is_the_fit_in_fewer_parameters():
     model, table = drives(), readings(drives(), 8)
     alike = LinearEquality({"joint2.compliance": 1.0, "joint3.compliance": -1.0})
     found = identify(
-        model,
-        table,
-        Options(method="ols", constraints=Constraints(equalities=(alike,))),
+        model, table, Options(method="ols", constraints=Constraints(equalities=(alike,)))
     )
     columns = np.arange(1, 6)
     at = model.regressor(table, model.nominal, columns, found.observations)

@@ -4,14 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.calibration import (
-    campaign,
-    cell_of,
-    measured,
-    planar_chain,
-    table_at,
-    with_values,
-)
+from support.calibration import campaign, cell_of, measured, planar_chain, table_at, with_values
 from support.cells import random_poses
 
 from elastocal.identification.identify import identify

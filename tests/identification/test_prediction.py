@@ -31,7 +31,7 @@ def fitted(seed: int):
 
 @pytest.fixture(scope="module")
 def fits():
-    return [fitted(seed) for seed in range(8)]
+    return [fitted(seed) for seed in range(5)]
 
 
 def test_regions_hold_the_tool_as_often_as_they_say(fits):
@@ -69,7 +69,7 @@ def test_predicted_error_is_that_at_new_poses(fits):
         assert low < fit.predicted.rms < high
         assert fit.predicted.rms < fit.heldout_rms  # which includes the noise of a reading
     assert 0.3 < np.mean(ratios) < 1.5
-    assert sum(inside) >= 7
+    assert sum(inside) >= 4
 
 
 @pytest.mark.parametrize("sideways", [0.0, 300.0])

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 from scipy import linalg
-from support.calibration import (
-    GEOMETRY,
-    campaign,
-    cell_of,
-    planar_chain,
-    random_chain,
-    table_at,
-)
+from support.calibration import GEOMETRY, campaign, cell_of, planar_chain, random_chain, table_at
 from support.cells import kr270_chain, random_poses
 
 from elastocal.cell.arm_description import Nominal

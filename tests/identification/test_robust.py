@@ -8,13 +8,7 @@ import pytest
 import statsmodels.api as sm
 from scipy import integrate, stats
 
-from elastocal.identification.outliers import (
-    HUBER,
-    L1,
-    covariance_of,
-    huber,
-    majority,
-)
+from elastocal.identification.outliers import HUBER, L1, covariance_of, huber, majority
 
 
 @pytest.mark.parametrize("size", range(1, 7))

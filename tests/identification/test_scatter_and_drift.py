@@ -13,7 +13,6 @@ from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
 from elastocal.identification.noise_structure import in_random_order
 from elastocal.identification.options import Options
-from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation import simulate
@@ -22,6 +21,7 @@ SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 1e-4, 1e-4, 0.2
 MARKERS = {"M1": np.array([0.3, 0, 0.1]), "M2": np.array([-0.2, 0.2, 0.1])}
 
 
+@cache
 def identified(
     scatter=0.0, drift=0.0, timed=True, ordered=False, stated=True, seed=0, repeats=1, options=None
 ):
@@ -47,11 +47,6 @@ def identified(
     return identify(model, replace(read, time=time if timed else None), options)
 
 
-@cache
-def steady_drift() -> Calibration:
-    return identified(drift=DRIFT)
-
-
 def test_joints_that_settle_anew_are_told_with_their_size():
     result = identified(scatter=SCATTER)
     finding = result.finding("joint_scatter")
@@ -66,7 +61,7 @@ def test_joints_that_settle_anew_are_told_with_their_size():
 
 
 def test_a_drift_is_told_and_whole_blocks_are_left_out():
-    result = steady_drift()
+    result = identified(drift=DRIFT)
     finding = result.finding("drift")
     assert finding is not None and finding.severity == "care" and "time" in result.noise.kind
     assert finding.numbers["by"] == "times" and finding.number("lasting_s") > 60
@@ -83,7 +78,7 @@ def test_a_drift_is_told_and_whole_blocks_are_left_out():
 
 
 def test_how_long_a_drift_lasts_is_not_taken_for_known_unless_the_cell_states_it():
-    stated = steady_drift()
+    stated = identified(drift=DRIFT)
     drift, (_, only) = stated.noise.drift, *stated.spread.among
     assert drift is not None and drift.ends and drift.seconds == LASTING * 60 * 35
     np.testing.assert_allclose(only, stated.spread.matrix)
@@ -119,7 +114,7 @@ def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of
 def test_the_stated_noise_is_all_that_the_cell_states():
     """Its scatter of joints and drift are in the data: nothing is missing, nothing to be stated."""
     for options in (None, Options(method="wls")):
-        fit = identified(scatter=SCATTER, drift=DRIFT, repeats=3, options=options)
+        fit = identified(scatter=SCATTER, drift=DRIFT, repeats=2, options=options)
         assert fit.finding("residual_agrees_with_stated_noise") is not None
         assert 0.85 < fit.noise.ratio_to_stated < 1.15
         # But that on wls, whose intervals do not count what readings share.

@@ -1,10 +1,14 @@
-"""Smooth functions in the whole identification, on a small arm whose joints have error curves."""
+"""Smooth functions in the whole identification: error curves, and weights that nobody knows."""
 
 from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
+import pytest
 from support.calibration import PLACED, cell_of, measured, planar_chain, table_at
+from support.cells import kr270_cell, kr270_chain, random_table
+from support.stick import model as of_stick
+from support.stick import stick
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
@@ -46,9 +50,10 @@ def true(model: Model, rng: np.random.Generator, curves: float = 1.0) -> Array:
 
 
 def readings(
-    model: Model, x: Array, n: int, rng: np.random.Generator, sigma: float = SIGMA
-) -> Measurements:
-    table = table_at(rng.uniform(-HALF, HALF, (n, 3)))
+    model: Model, x: Array, n: int, rng: np.random.Generator, sigma: float = SIGMA,
+    loads: tuple = ((0, 0, 0),), marker: str = "M1",
+) -> Measurements:  # fmt: skip
+    table = table_at(rng.uniform(-HALF, HALF, (n, 3)), loads, (marker,))
     return measured(model, table, x, sigma, rng)
 
 
@@ -115,12 +120,61 @@ def test_nothing_is_claimed_where_there_are_no_curves():
         assert "do not show" in note
 
 
-def test_faulty_readings_are_judged_beside_the_curves():
-    """0.3 mm hide in what curves of 0.5 mrad leave a model without them, not beside them."""
-    table, test, clean = campaign()
-    position = np.asarray(table.position).copy()
-    position[[5, 40]] += [[3e-4, 0, 0], [0, 0, -4e-4]]
-    fit = identify(arm(), replace(table, position=position), test=test)
-    assert {o.line for o in fit.excluded} == set(table.row[[5, 40]])
-    assert not clean.faulty
-    assert fit.test.rms < 1.2 * clean.test.rms
+# Weights that nobody knows and the compliances that they bend: a product, fitted as one.
+
+SMALL = 1e-5  # m
+STATED = (1e-5, 2e-5, 3e-5)  # rad/(N m)
+LOADS = ((0.0, 0.0, 0.0), (0.0, 0.0, -60.0))
+
+
+def sagging_arm(*effects: str) -> Model:
+    chain = stick("zyy", (0.3, 0.8, 0.6))
+    nominal = Nominal(joint_compliance=STATED)
+    return of_stick(chain, "joint_offset", *effects, tip=(0.1, 0.05, 0.1), nominal=nominal)
+
+
+def sagging(m: Model) -> Array:
+    """Springs off by a third, and moments of some 10 kg m."""
+    x = m.nominal.copy()
+    for name, factor in zip(("joint1", "joint2", "joint3"), (1.0, 1.35, 0.7), strict=True):
+        x[m.names.index(f"{name}.compliance")] *= factor
+    values = {"link2_moment_x": 9.0, "link2_moment_y": 0.4, "link3_moment_x": -2.5}
+    for key, value in values.items():
+        x[m.names.index(f"arm.{key}")] = value
+    return x
+
+
+def test_loads_tell_the_springs_and_these_the_moments() -> None:
+    m = sagging_arm("joint_compliance", "link_weights")
+    x = sagging(m)
+    table, test = (
+        readings(m, x, n, np.random.default_rng(n), sigma, LOADS, "tip")
+        for n, sigma in ((40, SMALL), (100, 0.0))
+    )
+    found = identify(m, table, test=test)
+    assert found.converged and found.test.rms < 1.5 * SMALL
+    sag = identify(sagging_arm("joint_compliance", "gravity_sag"), table, test=test)
+    assert found.test.rms < sag.test.rms, "each joint's own functions have more to fit"
+    for name in ("joint2.compliance", "joint3.compliance", "arm.link2_moment_x"):
+        estimate = found[name]
+        assert abs(estimate.value - x[m.names.index(name)]) < 4.5 * estimate.std
+    (part,) = found.smooth
+    assert part.group.effect == "link_weights" and part.group.units == ("kg*m",)
+
+
+@pytest.mark.long
+def test_a_compliance_whose_weights_are_held_at_zero_is_left_out() -> None:
+    """Without loads a spring shows by the weights alone: where their errors are dropped it moves
+    nothing, though it was chosen beside them."""
+    effects = ["base_frame", "joint_offset", "joint_compliance", "link_mass_error", "gravity_sag"]
+    chain, rng = kr270_chain(), np.random.default_rng(1)
+    m = Model.assembled(chain, kr270_cell(effects))
+    poses = random_table(chain, 12, seed=1)
+    table = replace(poses, force=np.zeros_like(poses.force), distance=None)
+    x = m.nominal.copy()
+    for k, p in enumerate(m.parameters):
+        x[k] += (p.typical or 1e-7) * rng.normal() * (0.3 if p.lower < 0 else 0.0)
+    position = m.predict(table, x).reshape(-1, 3) + 3e-5 * rng.normal(size=(len(table), 3))
+    found = identify(m, replace(table, position=position))
+    assert found.converged
+    assert found["joint5.compliance"].std is None

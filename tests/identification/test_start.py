@@ -3,15 +3,7 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.calibration import (
-    BASE,
-    PLACED,
-    cell_of,
-    measured,
-    random_chain,
-    table_at,
-    true_values,
-)
+from support.calibration import BASE, PLACED, cell_of, measured, random_chain, table_at, true_values
 from support.cells import random_poses
 
 from elastocal.identification.start import start_values

@@ -15,7 +15,7 @@ from elastocal.cell.plan_wishes import DesignSpec
 DEMO = Path(ec.__file__).parent / "demo"
 MARKERS = {"M1": [0.25, 0.0, 0.05], "M2": [-0.12, 0.22, 0.10]}
 EFFECTS = ["base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position"]
-SEEDS = (101, 102, 103)  # near enough, flattered, and joint 1 held at its bound, as it once was
+SEEDS = (102, 103)  # flattered, and joint 1 held at its bound, as it once was
 
 
 @pytest.mark.parametrize(("markers", "tone"), [(2, "good"), (1, "care")])

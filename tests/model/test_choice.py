@@ -115,8 +115,7 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
     )
     names = set(CATALOGUE) - {"joint_compliance"}
     all_of_it = Model.assembled(
-        chain,
-        kr270_cell(["joint_compliance", *names], nominal=nominal, link_gravity=True),
+        chain, kr270_cell(["joint_compliance", *names], nominal=nominal, link_gravity=True)
     )
     difference = all_of_it.predict(table) - plain.predict(table)
     assert np.abs(difference).max() < 1e-14

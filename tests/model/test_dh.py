@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 import pytest
 from support.robot_files import told_by_init
@@ -13,7 +12,7 @@ import elastocal as ec
 from elastocal.errors import InputError
 from elastocal.model.chain import Chain
 from elastocal.model.dh import read_dh
-from elastocal.model.rigid import nominal_flange, nominal_flanges
+from elastocal.model.rigid import nominal_flanges
 
 HEADER = "theta0_rad,d_m,a_m,alpha_rad"
 # UR5, https://www.universal-robots.com: d, a in m and α in rad, standard convention.
@@ -34,8 +33,7 @@ def write(path: Path, header: str, rows: list) -> Path:
 
 
 def evaluate(chain: Chain, q: np.ndarray) -> np.ndarray:
-    symbol = ca.SX.sym("q", chain.n_joints)
-    return ca.Function("T", [symbol], [nominal_flange(chain, symbol)])(q).full()
+    return nominal_flanges(chain, q[None])[0]
 
 
 def turn_x(angle: float) -> np.ndarray:

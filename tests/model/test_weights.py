@@ -7,9 +7,9 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from model.test_agreement_with_pinocchio import random_configurations, standing_arm
+from model.test_agreement_with_pinocchio import standing_arm
 from scipy.spatial.transform import Rotation
-from support.cells import kr270_cell, kr270_chain, random_table
+from support.cells import kr270_cell, kr270_chain, random_poses, random_table
 from support.stick import model, positions, rows, stick
 
 from elastocal.cell.arm_description import Nominal
@@ -57,7 +57,7 @@ def test_the_torques_of_any_weights_are_sums_of_them(tmp_path: Path, seed: int) 
     """Masses, branches, prismatic joints and tilted bases, weighed by pinocchio: of each joint
     with functions of its own, and of all with one set of moments."""
     chain, cell, reference = standing_arm(tmp_path, seed)
-    q = random_configurations(chain, 160, seed)
+    q = random_poses(chain, 160, seed)
     weighed = -np.array([reference.gravity_torques(each) for each in q])
     for place in SAG.places(chain, cell):
         tau = weighed[:, int(place[5:]) - 1]
@@ -72,7 +72,7 @@ def test_the_moments_are_independent_but_for_what_an_upright_base_carries_anyway
     chain, cell = kr270_chain(), kr270_cell()
     specs = WEIGHTS.parameters("arm", chain, cell)
     assert [s.key for s in specs] == [f"link{k}_moment_{a}" for k in range(1, 7) for a in "xy"]
-    D = torques(chain, cell, random_configurations(chain, 60, 3)).reshape(-1, 12)
+    D = torques(chain, cell, random_poses(chain, 60, 3)).reshape(-1, 12)
     assert np.abs(D[:, :2]).max() < 1e-9  # joint 1 turns about the vertical
     shown = D[:, 2:] * np.array([s.typical for s in specs])[2:]
     assert np.linalg.cond(shown / np.linalg.norm(shown, axis=0)) < 20

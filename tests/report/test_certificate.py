@@ -14,10 +14,7 @@ from support.pages import Page
 
 from elastocal.cell.work_cell import CertificateEntries
 from elastocal.errors import InputError
-from elastocal.report.smaller_views import (
-    Certified,
-    pose_repeatability,
-)
+from elastocal.report.smaller_views import Certified, pose_repeatability
 
 ENTRIES = CertificateEntries(
     number="<b>17</b>", laboratory="Laboratory", country="DE", customer="Customer",

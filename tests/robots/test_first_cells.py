@@ -4,12 +4,11 @@ import re
 
 import numpy as np
 import pytest
+from support.design_commands import elastocal
 from support.robot_files import told_by_init, urdf
 from support.robots import KR270
-from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.main import app
 
 SCARA = (
     "type,theta0_deg,d_mm,a_mm,alpha_deg,lower_mm,upper_mm\nrevolute,0,210,260,0,,\n"
@@ -19,7 +18,7 @@ PLAN = "configuration,q1_deg,q2_deg,q3_mm,q4_deg\n1,10,20,50,0\n2,-40,60,120,30\
 
 
 def run(*words):
-    done = CliRunner().invoke(app, list(map(str, words)))
+    done = elastocal(*words)
     return done.exit_code, " ".join(done.stdout.split()), " ".join(done.stderr.split())
 
 

@@ -7,16 +7,15 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
 from support.robots import KR270
 
 from elastocal.cell.arm_description import EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import Chain
-from elastocal.model.rigid import nominal_flange
+from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import read_urdf
 from elastocal.units import Array
 
@@ -41,26 +40,9 @@ COMPENSATOR = {
 DOWN = np.array([0.0, 0.0, -2600.0])
 SLANTED = np.array([900.0, -1500.0, -2600.0])
 
-# Table 2 of Klimchik et al. (2013): the 15 measurement configurations, joint angles in degrees.
-TABLE_2 = np.radians(
-    [
-        [79.2, -0.01, -5.57, 51, -97.52, -91.67],
-        [63, -0.01, -12.22, -56.49, 41.42, 150.55],
-        [63, -0.01, -47.98, -70.04, -61.55, 177.16],
-        [95, -25.24, 33, 129.69, -98.1, 90.57],
-        [95, -25.24, -107.01, 109.95, -61.19, 174.21],
-        [105, -25.24, 14.3, 55.21, 41.26, -152.97],
-        [56.6, -56.9, 44.54, -55.11, 41.9, 152.06],
-        [56.6, -56.9, 64.73, -129.65, -98.26, -90.55],
-        [144.8, -56.9, 104.49, -69.41, 61.67, -6.33],
-        [-41, -99.85, -91.68, 55.12, 41.53, -152.48],
-        [-143, -99.85, -32.64, 110.31, -61.47, -6.29],
-        [-143, -99.85, -72.01, 129.65, -98.09, 90.82],
-        [133, -140, 147.68, 129.64, -97.9, 90.99],
-        [-60, -140, 7.59, -110.09, -61.36, -174.09],
-        [-60, -140, -52, -124.89, -41.62, 27.78],
-    ]
-)
+# Table 2 of Klimchik et al. (2013): the 15 measurement configurations, (15, 6) rad.
+PLAN = KR270.with_name("plan.csv")
+TABLE_2 = read_measurements(PLAN, joint_kinds=("revolute",) * 6, observe="plan").q
 
 
 @lru_cache
@@ -132,11 +114,7 @@ def table_of(
 
 
 def random_table(
-    chain: Chain,
-    n: int,
-    seed: int,
-    force: Array = SLANTED,
-    markers: Sequence[str] = tuple(MARKERS),
+    chain: Chain, n: int, seed: int, force: Array = SLANTED, markers: Sequence[str] = tuple(MARKERS)
 ) -> Measurements:
     """`n` random poses, each unloaded and loaded, with every column a model may ask for.
 
@@ -159,10 +137,3 @@ def random_table(
         approach=rng.choice([-1.0, 1.0], (rows, chain.n_joints)),
         temperature=rng.uniform(18.0, 26.0, rows),
     )
-
-
-def nominal_flanges(chain: Chain, q: Array) -> Array:
-    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
-    symbol = ca.SX.sym("q", chain.n_joints)
-    function = ca.Function("T", [symbol], [nominal_flange(chain, symbol)])
-    return np.array([function(row).full() for row in q])

@@ -12,6 +12,11 @@ from typer.testing import CliRunner, Result
 
 from elastocal.cli.main import app
 
+# The command in a process: a child may inherit that SIGINT is ignored; here it must not.
+PROGRAM = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+    "from elastocal.cli.main import main; main()"
+)
 TEST_POSES = """
 [[design.test_pose]]
 q_deg = [0, -90, 90, 0, 30, 0]
@@ -66,9 +71,10 @@ def write_cell(folder: Path, text: str = DEFLECTION) -> Path:
     return path
 
 
-def elastocal(*arguments: object) -> Result:
+def elastocal(*arguments: object, **environment: str) -> Result:
     """A command in this process; whatever is not a clean exit is an error of ours."""
-    return CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+    words = [str(a) for a in arguments]
+    return CliRunner().invoke(app, words, env=environment, catch_exceptions=False)
 
 
 def design(cell: Path, *extra: object, output: str = "plan.csv", quiet: bool = True) -> Result:

@@ -26,7 +26,7 @@ from elastocal import Diagnosis
 from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
-from elastocal.model.chain import Chain, Joint
+from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.simulation import draw_errors, simulate, values_from
 
@@ -56,14 +56,10 @@ FAULTS = {
     for f in (
         Fault("encoder_scale", "joint3", {"encoder_scale": 2e-4}),
         Fault(
-            "gear_eccentricity",
-            "joint2",
-            {"eccentricity_sin": 1e-4, "eccentricity_cos": -1.2e-4},
+            "gear_eccentricity", "joint2", {"eccentricity_sin": 1e-4, "eccentricity_cos": -1.2e-4}
         ),
         Fault(
-            "gear_eccentricity",
-            "joint4",
-            {"eccentricity_sin": 1.5e-4, "eccentricity_cos": -1e-4},
+            "gear_eccentricity", "joint4", {"eccentricity_sin": 1.5e-4, "eccentricity_cos": -1e-4}
         ),
         Fault(
             "gear_ripple",
@@ -90,12 +86,7 @@ FAULTS = {
             "tracker",
             {"azimuth_sin": 5e-5, "azimuth_cos": -4e-5, "elevation_sin": 5e-5},
         ),
-        Fault(
-            "thermal_expansion",
-            "link2",
-            {"expansion": 2e-4},
-            {"time_constant_s": 1200.0},
-        ),
+        Fault("thermal_expansion", "link2", {"expansion": 2e-4}, {"time_constant_s": 1200.0}),
     )
 }
 
@@ -160,16 +151,3 @@ def campaign(
 @lru_cache
 def diagnosed(*names: str, without: tuple[str, ...] = (), n: int = 40, seed: int = 1) -> Diagnosis:
     return ec.diagnose(*campaign(*names, n=n, seed=seed), without=without)
-
-
-def zigzag(n_joints: int) -> Chain:
-    """An arm of 0.35 m links whose axes turn by turns about z, y, y, x."""
-    axes = np.array([[0.0, 0, 1], [0, 1, 0], [0, 1, 0], [1, 0, 0]])
-    joints = []
-    for k in range(n_joints):
-        placement = np.eye(4)
-        placement[:3, 3] = [0.25, 0.05, 0.25] if k else [0, 0, 0.4]
-        joints.append(Joint(f"j{k + 1}", "revolute", placement, axes[k % 4], -2.2, 2.2))
-    flange = np.eye(4)
-    flange[:3, 3] = [0.2, 0.0, 0.1]
-    return Chain("zigzag", tuple(joints), flange)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from typer.testing import CliRunner
-
-from elastocal.cli.main import app
+from support.design_commands import elastocal
 
 # Axis, offset from the joint before, both in its frame at zero.
 JOINTS = (
@@ -17,8 +15,7 @@ JOINTS = (
 
 def told_by_init(path: Path, *options: str) -> tuple[int, str, str]:
     """Exit code, output and errors of `elastocal init`, which writes cell.toml beside the file."""
-    words = ["init", str(path), "-o", str(path.with_name("cell.toml")), "--force", *options]
-    done = CliRunner().invoke(app, words)
+    done = elastocal("init", path, "-o", path.with_name("cell.toml"), "--force", *options)
     return done.exit_code, " ".join(done.stdout.split()), " ".join(done.stderr.split())
 
 

@@ -8,18 +8,12 @@ from __future__ import annotations
 import importlib.util
 import sys
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 
-def study_of(folder: Path) -> ModuleType:
+def study_of(folder: Path) -> Any:
     """study.py of the folder, whose other scripts it can import."""
-    name = f"study_of_{folder.name}"
-    if name not in sys.modules:
-        if str(folder) not in sys.path:
-            sys.path.insert(0, str(folder))
-        spec = importlib.util.spec_from_file_location(name, folder / "study.py")
-        assert spec is not None and spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module
-        spec.loader.exec_module(module)
-    return sys.modules[name]
+    spec: Any = importlib.util.spec_from_file_location(f"{folder.name}_study", folder / "study.py")
+    sys.modules[spec.name] = module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
