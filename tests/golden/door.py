@@ -31,10 +31,14 @@ def append_side(folder: Path) -> None:
 
 def spoil_three(folder: Path) -> None:
     """Three faulty readings in placed.csv, 0.4 to 3 mm off."""
-    path = folder / "placed.csv"
+    _spoil(folder / "placed.csv", (5, "x_m", 3e-3), (18, "z_m", -1e-3), (33, "y_m", 4e-4))
+
+
+def _spoil(path: Path, *faults: tuple[int, str, float]) -> None:
+    """Move the reading of a row and column, in m."""
     with open(path, newline="", encoding="utf-8") as handle:
         header, *rows = csv.reader(handle)
-    for row, name, off in ((5, "x_m", 3e-3), (18, "z_m", -1e-3), (33, "y_m", 4e-4)):
+    for row, name, off in faults:
         k = header.index(name)
         rows[row][k] = f"{float(rows[row][k]) + off:.8f}"
     path.write_text("\n".join(",".join(r) for r in (header, *rows)) + "\n", encoding="utf-8")
@@ -68,13 +72,7 @@ curve_high_rad = {high}
 
 def spoil_two(folder: Path) -> None:
     """Two faulty readings in curved.csv, as far off as its curves move the arm."""
-    path = folder / "curved.csv"
-    with open(path, newline="", encoding="utf-8") as handle:
-        header, *rows = csv.reader(handle)
-    for row, name in ((12, "x_m"), (61, "z_m")):
-        k = header.index(name)
-        rows[row][k] = f"{float(rows[row][k]) + 4e-4:.8f}"
-    path.write_text("\n".join(",".join(r) for r in (header, *rows)) + "\n", encoding="utf-8")
+    _spoil(folder / "curved.csv", (12, "x_m", 4e-4), (61, "z_m", 4e-4))
 
 
 def equal_noise(folder: Path) -> None:
