@@ -88,13 +88,15 @@ def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch)
 
     monkeypatch.setattr(one_world.tempfile, "mkdtemp", made)
     monkeypatch.setattr(one_world, "run", blindfold)
+    monkeypatch.setattr(one_world, "tested", lambda folder, cell: len(cell))
     recipe = Recipe("encoder_scale-8-000", (5, 1), ("encoder_scale",), poses=8)
     record = one_world.diagnose_world(suites.Task("left_out", recipe), {"seed": 5})
-    ((visible, arguments, files),) = observed
+    (visible, arguments, files), (_, whole, _) = observed
     sealed = next(f for f in folders if f != visible)
     assert files == ["arm.urdf", "cell.toml", "data.csv"]
     written = ("-o", one_world.ANSWER, "--cell-out", one_world.CELL)
     assert arguments == (*one_world.DIAGNOSE, *written, "--without", "encoder_scale")
+    assert "--without" not in whole and record["dearer"] == len(one_world.CELL) / len("all.toml")
     assert not visible.is_relative_to(sealed) and not sealed.is_relative_to(visible)
     assert "encoder" not in str(visible) and visible.name[:6] != sealed.name[:6]
     assert record["truth"]["effects"][0]["effect"] == "encoder_scale"
