@@ -18,17 +18,7 @@ from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Severity
-from elastocal.identification.sentences import (
-    AT_BOUND,
-    LACKING,
-    NAMED,
-    STATE_NOISE,
-    TURN_ROUND,
-    USE,
-    WANDERS,
-    made,
-    more_poses,
-)
+from elastocal.identification.sentences import AT_BOUND, STATE_NOISE, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, linear_fits
 from elastocal.measurements import Measurements, firsts, numbered
@@ -130,7 +120,11 @@ def _trust(found: list[Finding]) -> Finding:
         if any(f.severity == severity for f in found):
             worst = severity
     doubts = tuple(f.kind for f in found if f.severity == worst) if worst != "good" else ()
-    return made(worst, "trust", USE if worst == "good" else "", because=doubts)
+    use = (
+        "Use it (elastocal compensate, elastocal export) where poses and loads are like those "
+        "measured."
+    )
+    return made(worst, "trust", use if worst == "good" else "", because=doubts)
 
 
 def _spoilt(result: Calibration) -> Iterator[Finding]:
@@ -221,8 +215,13 @@ def _impossible(result: Calibration) -> Iterator[Finding]:
     turned = [p for p, _ in found if p.effect == JointCompliance.name]
     signs = 2 * len(turned) > len(springs) and bool(result.observations.table.force.any())
     parameters, estimates = zip(*found, strict=True)
+    turn_round = (
+        "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
+        "negative. Turn the sign round in the table if it is wrong (torque columns too), and "
+        "identify again."
+    )
     yield (_poor if signs else _care)(
-        "impossible_values", TURN_ROUND if signs else AT_BOUND,
+        "impossible_values", turn_round if signs else AT_BOUND,
         parameters=tuple(p.name for p in parameters), values=tuple(e.held for e in estimates),
         units=tuple(p.unit for p in parameters),
         likely="the sign of the force columns" if signs else "",
@@ -417,7 +416,16 @@ def _lacking(result: Calibration) -> str:
     effects = dict.fromkeys(p.effect for p in result.model.parameters)
     named = [e.replace("_", " ") for e in effects
              if e not in STATED_BY_FILE and not effect_of(e).registered]  # fmt: skip
-    return NAMED.format(listed(named, 3)) if named else LACKING
+    if named:
+        return (
+            f"The cell has {listed(named, 3)} already. If diagnose named that, it has no name for "
+            "what is left: repeat some poses, which tell noise and repeatability from what the "
+            "model lacks."
+        )
+    return (
+        "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
+        "nothing, the excess is the robot's repeatability, or noise larger than stated ([tracker])."
+    )
 
 
 def _lacks_fit(result: Calibration) -> bool:
@@ -434,7 +442,9 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
     sizes = [s for s in noise.sizes or () if s.part == CONFIGURATION]
     shared = {s.name: s.sigma for s in sizes if s.sigma is not None}
     if test is not None:
-        counted = "the intervals" if noise.intervals_by_configuration else "nothing"
+        # These hold where the readings of a configuration are correlated.
+        clustered = noise.interval_kind.lower().startswith("cr")
+        counted = "the intervals" if clustered else "nothing"
         if shared or noise.drift is not None:
             counted = "the noise model"
         say, kind, doing = _good, "repeats_agree", ""
@@ -498,11 +508,17 @@ def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -
 
 def _drift(drift: Drift, size: NoiseSize, p: float, remedy: str) -> Finding:
     timed = drift.seconds is not None
-    return _care(
-        "drift",
+    remedy = (
         "Measure poses and loads in random order, return to a reference pose every ten poses, "
-        + ("" if timed else "record times, ")
-        + f"and let arm and tracker warm up. {remedy}" + ("" if drift.ends else WANDERS),
+        f"{'' if timed else 'record times, '}and let arm and tracker warm up. {remedy}"
+    )
+    if not drift.ends:
+        remedy += (
+            " It may last as long as the campaign: these readings do not tell it from a random "
+            "walk, nor where the base is on another day; measure for longer, or on several days."
+        )
+    return _care(
+        "drift", remedy,
         sigma_um=size.sigma or 0.0, p=p, lasting_s=drift.seconds, lasting_share=drift.share,
         by="times" if timed else "order of the rows",
     )  # fmt: skip

@@ -80,7 +80,6 @@ from elastocal.identification.weighted_problem import (
     partition,
     regressor,
     residual_at,
-    scaled_by_component,
     weights_for,
 )
 from elastocal.measurements import NEVER_YET, Measurements, order_contradicted, ranked
@@ -127,7 +126,7 @@ def identify(
     every, sound, found = _fitted(model, table, observed, options, progress)
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
-    result = summarise(model, every, sound, found, outliers, new_poses, copies)
+    result = summarise(every, sound, found, outliers, new_poses, copies)
     body = solved_body(table, float(found.solution.fit.residual.std()))
     told = (*told, *_disordered(model, table, test), *_fallen(model, table, result.x))
     result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
@@ -202,9 +201,11 @@ def _solution(
     solution = solve(problem, progress, try_wider)
     if observed.kind == "pose" and weights.kind == "none" and kind == "auto":
         # Without stated noise, metres and radians get their relative weight from a first fit.
-        parts = solution.fit.residual.reshape(-1, 6)
-        sigma = np.repeat([parts[:, :3].std(), parts[:, 3:].std()], 3)
-        weights = scaled_by_component(observed, np.maximum(sigma, 1e-12))
+        parts = solution.fit.residual.reshape(-1, 2, 3)
+        sigma = np.broadcast_to(np.maximum(parts.std(axis=(0, 2)), 1e-12)[:, None], parts.shape)
+        text = "position and rotation weighted by the spread of their residuals in a first fit"
+        whiten = sparse.csr_array(sparse.diags_array(1 / sigma.ravel()))
+        weights = Weights("component", whiten, False, text)
         solution = solve(replace(problem, weights=weights), progress, try_wider)
     return solution
 
@@ -236,8 +237,8 @@ NOT_SHOWN = "held: the readings do not show the smooth function that it is part 
 
 
 def summarise(
-    model: Model, every: Solution, sound: Solution, found: MethodResult,
-    faulty: tuple[Outlier, ...], new_poses: NewPoses | None = None, copies: tuple[int, ...] = (),
+    every: Solution, sound: Solution, found: MethodResult, faulty: tuple[Outlier, ...],
+    new_poses: NewPoses | None, copies: tuple[int, ...],
 ) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
@@ -245,18 +246,17 @@ def summarise(
     noise.  `new_poses`: where the arm will be used, by default the workspace.
     """
     solution, final, covariance = found.solution, found.solution.fit, found.spread.matrix
-    kept, observed, weights = (
-        solution.reduction.kept, solution.problem.observations, solution.problem.weights
-    )  # fmt: skip
+    kept, problem = solution.reduction.kept, solution.problem
+    model, observed, weights = problem.model, problem.observations, problem.weights
     spent = len(kept) if found.effective is None else found.effective
     sigma = residual_sigma(final, spent)
     noise, parts = noise_of(found, sigma)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
-    estimates, combinations = _estimates(model, solution, found, left_out)
+    estimates, combinations = _estimates(found, left_out)
     determined = tuple(model.names[c] for c in kept)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     leverage = found.leverage  # None of a large table
-    if leverage is None and not solution.problem.large:
+    if leverage is None and not problem.large:
         leverage = solution.leverage
     report = None
     if not every.exact:
@@ -280,21 +280,15 @@ def summarise(
         smooth=found.smooth, left=left_open(solution, found.limits), copies=copies,
         shown=_shown(solution, covariance, leverage),
     )  # fmt: skip
-    poses = new_poses or over_the_workspace(model.cell, model, observed.table)
-    return _judged(result, found, poses, every.problem.observations.table)
-
-
-def _judged(
-    result: Calibration, found: MethodResult, poses: NewPoses, whole: Measurements
-) -> Calibration:
-    solution = found.solution
     predicted = predicted_error(
-        result.arm, result.observations, result.excess, result.spread, poses,
+        result.arm, observed, result.excess, found.spread,
+        new_poses or over_the_workspace(model.cell, model, observed.table),
         np.random.default_rng(0), _unchecked(result),
     )  # fmt: skip
     result = replace(result, predicted=predicted)
+    whole = every.problem.observations.table
     result = judged(result, of_solution(result, solution, whole))
-    told = tuple(f"The robot's file: {note}." for note in result.model.chain.notes)
+    told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
 
@@ -341,8 +335,9 @@ def _shown(solution: Solution, covariance: Array, leverage: Array | None) -> Sho
 
 
 def _estimates(
-    model: Model, solution: Solution, method: MethodResult, left_out: set[int]
+    method: MethodResult, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
+    solution, model = method.solution, method.solution.problem.model
     reduction, x, every_end = solution.reduction, solution.fit.x, method.ci95
     std, dof = method.spread.std, method.spread.dof
     bends = bent(solution, method.spread.matrix)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -380,7 +379,8 @@ MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
 FEWEST_VISITS, SEVERAL = 8, 2
 
 
-class Trial(NamedTuple):
+@dataclass(frozen=True)
+class Trial:
     """One noise model that was tried: how many variances it has, and its criterion."""
 
     kind: str
@@ -388,7 +388,8 @@ class Trial(NamedTuple):
     criterion: float
 
 
-class NoiseTest(NamedTuple):
+@dataclass(frozen=True)
+class NoiseTest:
     """A further part of the noise that was looked for, JOINTS or TIME, and the p-value of its being
     none beside the model that was chosen without it."""
 

@@ -241,14 +241,17 @@ class Noise:
         drifts, since neighbours in time err alike; the error is then that of another day."""
         return "configurations" if self.drift is None else "blocks in time"
 
-    @property
-    def intervals_by_configuration(self) -> bool:
-        """Whether the intervals hold where the readings of a configuration are correlated."""
-        return self.interval_kind.lower().startswith("cr")
-
     def to_json(self) -> dict[str, Any]:
         """JSON-ready: lengths in µm, and only what is known of a noise that was not estimated."""
-        content: dict[str, Any] = {
+        known = {
+            "single_readings": self.single,
+            "reason": self.reason,
+            "variances": self.sizes and [size.to_json() for size in self.sizes],
+            "tests": self.tests or None,
+            "drift": self.drift,
+            "tried": self.tried,
+        }
+        return {
             "kind": self.kind,
             "description": self.description,
             "sigma_um": microns(self.sigma),
@@ -256,20 +259,8 @@ class Noise:
             "lack_of_fit": self.lack_of_fit,
             "held_out_by": self.held_out_by,
             "intervals": {"kind": self.interval_kind, "description": self.interval_description},
+            **{name: value for name, value in known.items() if value is not None},
         }
-        if self.single is not None:
-            content["single_readings"] = self.single
-        if self.reason is not None:
-            content["reason"] = self.reason
-        if self.sizes is not None:
-            content["variances"] = [size.to_json() for size in self.sizes]
-        if self.tests:
-            content["tests"] = [t._asdict() for t in self.tests]
-        if self.drift is not None:
-            content["drift"] = self.drift
-        if self.tried is not None:
-            content["tried"] = [t._asdict() for t in self.tried]
-        return content
 
 
 def noise_of(found: MethodResult, sigma: float) -> tuple[Noise, dict[str, float]]:

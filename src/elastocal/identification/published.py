@@ -60,9 +60,14 @@ def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> Publ
     Covariance by eq. (11), (BᵀW²B)⁻¹ BᵀW²Σ²W²B (BᵀW²B)⁻¹, with the σ given; without σ by the
     corrected eq. (13), (BᵀΣ⁻²B)⁻¹ with σ = 1/w, which is what (11) becomes where WΣ = I.
     """
-    B, dp = _given(B, dp)
+    B, dp = _finite("B", B, 2), _finite("dp", dp, 1)
+    if len(dp) != len(B):
+        raise InputError(f"dp must have shape ({len(B)},), as B has {len(B)} rows; got {dp.shape}")
     w = _positive("weights", weights, len(dp))
-    x, covariance = _solve(B, dp, w)
+    factors, x = orthogonal(w[:, None] * B), np.zeros(B.shape[1])
+    for _ in range(3):  # refined twice
+        x = x + factors.V @ (factors.Q.T @ (w * (dp - B @ x)))
+    covariance = factors.V @ factors.V.T
     if sigma is not None:
         middle = B * (w**2 * _positive("sigma", sigma, len(dp)))[:, None]
         covariance = covariance @ (middle.T @ middle) @ covariance
@@ -139,22 +144,6 @@ def eq14(
 
 def _sigma(residual: Array, group: NDArray[np.int64] | None) -> Array:
     return np.abs(residual) if group is None else group_sigma(residual, group)
-
-
-def _solve(B: Array, dp: Array, w: Array) -> tuple[Array, Array]:
-    """x with the least Σ (w_i (B x − Δp)_i)², refined twice, and (BᵀW²B)⁻¹."""
-    factors = orthogonal(w[:, None] * B)
-    x = np.zeros(B.shape[1])
-    for _ in range(3):
-        x = x + factors.V @ (factors.Q.T @ (w * (dp - B @ x)))
-    return x, factors.V @ factors.V.T
-
-
-def _given(B: Array, dp: Array) -> tuple[Array, Array]:
-    B, dp = _finite("B", B, 2), _finite("dp", dp, 1)
-    if len(dp) != len(B):
-        raise InputError(f"dp must have shape ({len(B)},), as B has {len(B)} rows; got {dp.shape}")
-    return B, dp
 
 
 def _finite(name: str, values: Array, dimensions: int) -> Array:

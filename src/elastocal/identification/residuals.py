@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -480,16 +479,12 @@ class _Table:
 
         They reach to the largest value, or to 6 robust deviations where some lie far beyond.
         """
-        spread, largest = self._spread
+        low, high = np.quantile(self.z, [0.25, 0.75])
+        largest = float(np.abs(self.z).max())
+        spread = float(high - low) or largest
         reach = min(1.0001 * largest, 6 * spread / 1.349)
         bins = int(np.clip(np.ceil(reach / (spread * n ** (-1 / 3))), 3, MOST_BINS))
         return np.linspace(-reach, reach, (bins | 1) + 1)  # 0 in the middle of a bin
-
-    @cached_property
-    def _spread(self) -> tuple[float, float]:
-        low, high = np.quantile(self.z, [0.25, 0.75])
-        largest = float(np.abs(self.z).max())
-        return float(high - low) or largest, largest
 
     def summary(
         self, name: str, rows: NDArray[np.int64] | slice, edges: Array, holm: float | None

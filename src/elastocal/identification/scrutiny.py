@@ -239,47 +239,45 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     apart = at[reduce(white[:, at], typical[at], parameters, 1.0, 0.0).kept]
     # As many columns as rows fit anything.
     every = np.isin(np.arange(len(stage)), apart) if len(apart) < len(white) else fitted
-    named: list[tuple[str, BoolArray]] = [
-        ("base and markers", fitted & (stage == 0)),
-        ("with geometry", fitted & (stage <= 1)),
-        ("with compliance", fitted & (stage != 1)),
-        (CHOSEN, fitted),
-        ("all that readings tell apart", every),
-    ]
-    seen: dict[bytes, tuple[str, BoolArray]] = {}
-    for name, chosen in named:
-        if chosen.any() and (name == CHOSEN or chosen.tobytes() not in seen):
-            seen[chosen.tobytes()] = (name, chosen)
-    sets = list(seen.values())
-    if len(sets) < 2:
+    named = {
+        "base and markers": fitted & (stage == 0),
+        "with geometry": fitted & (stage <= 1),
+        "with compliance": fitted & (stage != 1),
+        CHOSEN: fitted,
+        "all that readings tell apart": every,
+    }
+    names: dict[bytes, str] = {}
+    for name, chosen in named.items():
+        if chosen.any() and (name == CHOSEN or chosen.tobytes() not in names):
+            names[chosen.tobytes()] = name
+    if len(names) < 2:
         return ()
     moves = np.where(fitted & (stage > 0), fit.x - model.nominal, 0.0)
     y = fit.residual + fit.B @ moves
     e, target = weights.apply(fit.residual), weights.apply(y)
     s2 = float(e @ e) / max(fit.dof, 1)
-    held, plain = [], []
-    for _, chosen in sets:
+    held, plain, likelihood = [], {}, {}
+    for name in names.values():
+        chosen = named[name]
         # Whole rows count by the fit's weights, whatever the set.
         left, own = _refitted(fit, y, np.flatnonzero(chosen), weights)
-        plain.append(rms_3d(left, size))
+        plain[name] = rms_3d(left, size)
         held.append((own.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
-    likelihood = [
-        _restricted(white, target, chosen & (stage == 0), chosen & (stage > 0), typical, s2)
-        for _, chosen in sets
-    ]
-    first = next(k for k, (name, _) in enumerate(sets) if name == CHOSEN)
+        placed, others = chosen & (stage == 0), chosen & (stage > 0)
+        likelihood[name] = _restricted(white, target, placed, others, typical, s2)
     _, code = np.unique(observed.configuration, return_inverse=True)
     squares = np.array([np.bincount(code, h) for h in held])
-    rms = _drawn_rms(squares, np.bincount(code), np.random.default_rng(0))
+    drawn = _drawn_rms(squares, np.bincount(code), np.random.default_rng(0))
+    rms = [float(np.sqrt(h.mean())) for h in held]
+    first = list(names.values()).index(CHOSEN)
     found = []
-    for k, (name, chosen) in enumerate(sets):
-        over = rms[k] - rms[first] if np.isfinite(held[k]).all() else np.full(DRAWS, np.inf)
+    for k, name in enumerate(names.values()):
+        over = drawn[k] - drawn[first] if np.isfinite(held[k]).all() else np.full(DRAWS, np.inf)
         low, high = (float(v) for v in np.quantile(over, [0.025, 0.975], method="nearest"))
-        whole = float(np.sqrt(held[k].mean())), float(np.sqrt(held[first].mean()))
         found.append(
             ParameterSet(
-                name, int(chosen.sum()), plain[k], whole[0], whole[0] - whole[1], (low, high),
-                likelihood[k] - likelihood[first],
+                name, int(named[name].sum()), plain[name], rms[k], rms[k] - rms[first],
+                (low, high), likelihood[name] - likelihood[CHOSEN],
             )
         )  # fmt: skip
     return tuple(found)

@@ -12,33 +12,13 @@ from elastocal.text import gathered, listed
 
 # What to do about a finding.
 
-LACKING = (
-    "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
-    "nothing, the excess is the robot's repeatability, or noise larger than stated ([tracker])."
-)
-NAMED = (
-    "The cell has {} already. If diagnose named that, it has no name for what is left: repeat some "
-    "poses, which tell noise and repeatability from what the model lacks."
-)
 STATE_NOISE = (
     "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
     "it does the residual say whether the model lacks something. elastocal diagnose looks for "
     "that either way."
 )
-WANDERS = (
-    " It may last as long as the campaign: these readings do not tell it from a random walk, "
-    "nor where the base is on another day; measure for longer, or on several days."
-)
-TURN_ROUND = (
-    "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
-    "negative. Turn the sign round in the table if it is wrong (torque columns too), and identify "
-    "again."
-)
 AT_BOUND = (
     "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
-)
-USE = (
-    "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
 )
 
 
@@ -190,8 +170,11 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
     if f.kind == "faulty_readings":
         yield from _faulty_readings(result)
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
-        words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
-                 for k, v in f.numbers.items()}  # fmt: skip
+        words = {
+            k: ", ".join(one if isinstance(one, str) else f"{one:.3g}" for one in v)
+            if isinstance(v, tuple) else v
+            for k, v in f.numbers.items()
+        }  # fmt: skip
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
         default = "the default method, whose noise model has this scatter, or "
         words["count"] = "" if result.noise.estimated else default
@@ -204,10 +187,6 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         pairs = (f"{o.numbers.get('value', 0):.3g} ± {o.numbers.get('std', 0):.2g}" for o in same)
         words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
         yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
-
-
-def _word(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def _faulty_readings(result: Calibration) -> list[str]:

@@ -142,17 +142,6 @@ def stated_by_observation(observed: Observations, tracker: Tracker) -> Array | N
     return np.asarray(stated).reshape(-1, observed.size, observed.size)
 
 
-def scaled_by_component(observed: Observations, sigma: Array) -> Weights:
-    """Weights from one sigma per component (size,), known up to a common factor.
-
-    For full poses without stated noise: positions in m and rotations in rad need a relative
-    weight, which is estimated from the residuals of a first fit.
-    """
-    diagonal = np.tile(1.0 / sigma, len(observed.lead))
-    text = "position and rotation weighted by the spread of their residuals in a first fit"
-    return Weights("component", sparse.csr_array(sparse.diags_array(diagonal)), False, text)
-
-
 def _available(observed: Observations, tracker: Tracker) -> str:
     if observed.kind == "distance":
         return "none" if tracker.distance_sigma is None else "axis"
