@@ -14,7 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
-from elastocal import ROOMS
 from elastocal.above import checked_arguments, later, whole
 from elastocal.errors import InputError, option, require
 from elastocal.text import quoted
@@ -24,35 +23,37 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from pandas import DataFrame
 
-    from elastocal import (
-        CalibratedArm,
-        Calibration,
-        Cell,
-        Compensation,
-        Diagnosis,
-        Knowledge,
-        Measurements,
-        Model,
-        Plan,
-    )  # fmt: skip
     from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
-    from elastocal.compensation.compensate import Targets
-    from elastocal.identification.knowledge import Constraints, GaussianPrior
+    from elastocal.cell.work_cell import Cell
+    from elastocal.compensation.compensate import Compensation, Targets
+    from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, IntervalKind, Method
+    from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
+    from elastocal.measurements import Measurements
+    from elastocal.model.calibrated import CalibratedArm
+    from elastocal.model.manipulator import Model
     from elastocal.planning.design import DesignOptions, Effort
+    from elastocal.planning.plan import Plan
     from elastocal.units import Array
 else:
     globals().update(later(
-        *(f"elastocal.{room} {told}" for room, told in ROOMS.items() if room != "errors"),
         "numpy.typing ArrayLike",
         "pandas DataFrame",
         "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.compensation.compensate Targets",
-        "elastocal.identification.knowledge Constraints GaussianPrior",
+        "elastocal.cell.work_cell Cell",
+        "elastocal.compensation.compensate Compensation Targets",
+        "elastocal.diagnosis.diagnosis Diagnosis",
+        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
         "elastocal.identification.options FaultyReadings IntervalKind Method",
+        "elastocal.identification.result Calibration",
         "elastocal.identification.weighted_problem WeightKind",
+        "elastocal.measurements Measurements",
+        "elastocal.model.calibrated CalibratedArm",
+        "elastocal.model.manipulator Model",
         "elastocal.planning.design Effort",
+        "elastocal.planning.plan Plan",
         "numpy.random Generator",
     ))  # fmt: skip
 
