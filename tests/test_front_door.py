@@ -24,6 +24,8 @@ from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.errors import options_as_flags
 from elastocal.identification.options import Options
 from elastocal.planning.design import DesignOptions
+from elastocal.report.renderers import FRAMES
+from elastocal.saving import WRITERS
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)
@@ -420,6 +422,14 @@ def test_type_hints_of_all_that_is_public_are_resolved(door):
             assert not unresolved, f"{told}: {unresolved}"
     assert typing.get_type_hints(ec.identify)["return"] is ec.Calibration
     assert ec.Knowledge in typing.get_args(typing.get_type_hints(ec.design)["knowledge"])
+
+
+def test_whatever_a_verb_returns_is_a_result():
+    """Its `save`, `report`, `plot` and `to_dataframe` find what they need by the class's name."""
+    returned = {inspect.signature(getattr(ec, name)).return_annotation
+                for name in ("design", "simulate", "identify", "diagnose", "compensate", "compare",
+                             "next_poses")}  # fmt: skip
+    assert returned == set(FRAMES) == set(WRITERS) - {"CalibratedArm"}
 
 
 @pytest.mark.parametrize(
