@@ -20,7 +20,7 @@ import numpy as np
 from bench_tools import ONE_THREAD, Seconds, packaged, peer, required, table, timed, where
 
 from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.relaxation import DesignProblem, balanced, exact_plan, relax
+from elastocal.planning.relaxation import DesignProblem, exact_plan, relax
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10
@@ -51,7 +51,7 @@ def beside_figaroh(folder: Path) -> None:
     def problem(poses: int) -> DesignProblem:
         criterion, group = DeterminantCriterion(np.eye(p)), np.zeros(POOL, dtype=np.int64)
         shares = np.array([poses])
-        return balanced(DesignProblem(R / columns, np.zeros((p, p)), group, shares, criterion))
+        return DesignProblem(R / columns, np.zeros((p, p)), group, shares, criterion).balanced()
 
     print(f"\n## UR10: {POOL} poses, {p} parameters, regressor of FIGAROH")
     # FIGAROH's weights of sum 1 have no upper limit, as those of a plan of one pose.

@@ -25,7 +25,7 @@ from elastocal.planning.candidates import draw
 from elastocal.planning.choices import single_ways
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, plan_forces
-from elastocal.planning.relaxation import balanced, relax
+from elastocal.planning.relaxation import relax
 from elastocal.planning.setup import set_up
 from elastocal.planning.test_poses import test_poses
 
@@ -107,7 +107,7 @@ def unequal(cell: Cell, poses: int, times: int = 3) -> float:
     q = draw(rules, plan_forces(cell), 1000, 0)
     setup = set_up(model, q.q, poses, test_poses(cell, model.chain, rules, 0), Known())
     setup = replace(setup, ways=single_ways(setup.information))
-    problem = balanced(setup.problem(setup.pool(q.q, q.group), np.array([poses])))
+    problem = setup.problem(setup.pool(q.q, q.group), np.array([poses])).balanced()
     once = relax(problem, 1e-3)
     some = problem.restricted(np.argsort(-once.weights)[:400])
     blocks, group = np.tile(some.blocks, (times, 1, 1)), np.tile(some.group, times)

@@ -10,13 +10,9 @@ from elastocal.errors import InsufficientDataError
 from elastocal.planning.criteria import CRITERIA, CriterionInputs
 from elastocal.planning.relaxation import (
     DesignProblem,
-    balanced,
-    check_enough,
     exact_plan,
     exchange,
     first_allowed,
-    in_terms,
-    random_plan,
     relax,
     sized_plans,
 )
@@ -73,7 +69,7 @@ def by_cone(problem, name):
 def test_the_relaxed_optimum_is_that_of_a_cone_solver(name, prior):
     for seed in range(2):
         problem = problem_of(name, seed, N=30, n=7, prior=prior)
-        found = relax(balanced(problem), 1e-5)
+        found = relax(problem.balanced(), 1e-5)
         expected = by_cone(problem, name)
         assert found.value == pytest.approx(expected, rel=1e-4)
         assert found.bound == pytest.approx(expected, rel=1e-4)
@@ -88,7 +84,7 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
     for seed in range(2):
         problem = problem_of(name, seed, prior=0.2 * (seed % 2))
         values = all_values(problem)
-        turned = balanced(problem)
+        turned = problem.balanced()
         relaxed = relax(turned)
         assert relaxed.bound <= values.min() * (1 + 1e-8)
         plan, value = exact_plan(turned, relaxed, starts=20)
@@ -97,10 +93,10 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
 
 
 def test_an_exchange_ends_where_no_single_pose_has_a_better_one():
-    problem = balanced(problem_of("test_pose", 4, N=40, n=6))
+    problem = problem_of("test_pose", 4, N=40, n=6).balanced()
     rng = np.random.default_rng(0)
     for _ in range(3):
-        plan, value = exchange(problem, random_plan(problem, rng))
+        plan, value = exchange(problem, problem.random(rng))
         for k, out in enumerate(plan):
             for into in np.flatnonzero(problem.group == problem.group[out]):
                 if into not in plan:
@@ -111,21 +107,21 @@ def test_an_exchange_ends_where_no_single_pose_has_a_better_one():
 
 def test_the_same_plan_in_parameters_of_any_scale():
     problem = problem_of("test_pose", 5, N=40, n=6)
-    other = in_terms(problem, np.diag(np.logspace(-6, 6, 5)))
+    other = problem.in_terms(np.diag(np.logspace(-6, 6, 5)))
     plans = []
     for one in (problem, other):
-        turned = balanced(one)
+        turned = one.balanced()
         plans.append(exact_plan(turned, relax(turned))[0].tolist())
     assert plans[0] == plans[1]
 
 
 def test_too_few_poses_and_pools_that_leave_something_open_are_refused():
     with pytest.raises(InsufficientDataError, match=r"1 poses of 3 readings give 3, for 5 param"):
-        check_enough(problem_of("D", 0, n=1))
+        problem_of("D", 0, n=1).check_enough()
     problem = problem_of("D", 0)
     problem.blocks[..., 4] = problem.blocks[..., 0]
     with pytest.raises(InsufficientDataError, match="do not determine the 5 parameters"):
-        balanced(problem)
+        problem.balanced()
 
 
 def test_sizes_fall_with_the_number_of_poses_and_bounds_tell_where_a_target_may_be_met():
@@ -138,5 +134,5 @@ def test_sizes_fall_with_the_number_of_poses_and_bounds_tell_where_a_target_may_
     assert all(bound <= value for value, bound in found.values())
     first = first_allowed(of, values[1] * 1.05, 3, 20)
     assert first <= 6
-    assert first == 3 or relax(balanced(of(first - 1)), 1e-3).bound > values[1] * 1.05
+    assert first == 3 or relax(of(first - 1).balanced(), 1e-3).bound > values[1] * 1.05
     assert first_allowed(of, values[2] / 100, 3, 20) == 21

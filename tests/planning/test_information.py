@@ -153,7 +153,7 @@ def test_the_same_campaign_again_halves_the_variances() -> None:
     told = []
     for setup in (once, twice):
         M = setup.gathered(setup.information.blocks(TABLE_2))
-        told.append(predicted(setup.information.model, setup.found, M, 270))
+        told.append(predicted(setup.found, M, 270))
         std = np.sqrt(np.diag(np.linalg.inv(M))) * setup.information.sizes
         assert [p.std for p in told[-1]] == pytest.approx(std)
         half = stats.t.ppf(0.975, 270 - len(std)) * std

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,8 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.polish import Searches
-from elastocal.planning.search import EFFORTS, Search, Selection, ordered
+from elastocal.planning.search import EFFORTS, Search, ordered
+from elastocal.planning.setup import FeasiblePool
 
 CHAIN = kr270_chain()
 CELL = plan_cell(("joint_compliance",), loads=DOWN[None])
@@ -37,14 +37,12 @@ class Walled(Feasibility):
         return (np.atleast_2d(q_from)[:, 0] < self.wall) & (np.atleast_2d(q_to)[:, 0] < self.wall)
 
 
-def selection() -> tuple[Any, Selection]:
+def selection() -> tuple[Any, FeasiblePool, Any]:
     q = random_poses(CHAIN, 60, seed=2)
     setup = setup_of(CELL, q)
     pool = setup.pool(q, np.zeros(len(q), dtype=np.int64))
     chosen = np.argsort(q[:, 0])[[0, 10, 20, 30, 40, 59]]
-    value = float(setup.criterion.of_information(setup.gathered(pool.blocks[chosen])))
-    certificate = Certificate(len(pool), value / 2, 0.5, value / 4, 0.25)
-    return setup, Selection(pool, chosen, value, certificate, 50)
+    return setup, pool, chosen
 
 
 def walled(wall: float) -> Walled:
@@ -53,18 +51,24 @@ def walled(wall: float) -> Walled:
     return feasibility
 
 
-def search(setup: Any, found: Selection, cell: Walled, effort: str) -> Search:
+def search(setup: Any, pool: FeasiblePool, chosen: Any, cell: Walled, effort: str) -> Search:
     searches = Searches(setup, joint_space(CELL, CHAIN), cell)
     quiet = Checkpoint(), lambda text: None
-    return Search(found.pool, searches, SHARES, EFFORTS[effort], 0, *quiet)
+    found = Search(pool, searches, SHARES, EFFORTS[effort], 0, *quiet)
+    value = found.value_of(chosen)
+    found.certificate = Certificate(len(pool), value / 2, bound_continuum=value / 4)
+    found.exchange(chosen)
+    return found
 
 
 @pytest.mark.parametrize("effort", ["batch", "quick"])
 def test_unreachable_poses_are_replaced_and_the_bound_still_holds(effort: str) -> None:
-    setup, found = selection()
-    wall = np.sort(found.pool.q[:, 0])[45]
+    setup, pool, chosen = selection()
+    wall = np.sort(pool.q[:, 0])[45]
     cell = walled(wall)
-    after, _, told = ordered(search(setup, found, cell, effort), found)
+    after = search(setup, pool, chosen, cell, effort)
+    bounds = after.certificate
+    _, _, told = ordered(after)
     assert max(cell.asked.values()) == 1, "each move is checked once, however often plans change"
     q = after.pool.q[after.chosen]
     assert (q[:, 0] < wall).all() and len(q) == 6
@@ -72,17 +76,15 @@ def test_unreachable_poses_are_replaced_and_the_bound_still_holds(effort: str) -
         float(setup.criterion.of_information(setup.gathered(after.pool.blocks[after.chosen])))
     )
     c = after.certificate
-    assert c.bound_pool == found.certificate.bound_pool
+    assert c.bound_pool == bounds.bound_pool
     assert c.efficiency_pool == pytest.approx(min(c.bound_pool / after.value, 1.0))
-    bound = found.certificate.bound_continuum
-    assert c.efficiency_continuum == pytest.approx(min(bound / after.value, 1.0))
+    assert c.efficiency_continuum == pytest.approx(min(bounds.bound_continuum / after.value, 1.0))
     assert len(told) == 1 and "left out" in told[0]
 
 
 def test_where_no_other_candidates_are_left_the_poses_are_named() -> None:
-    setup, found = selection()
-    pool = found.pool.take(found.chosen)
-    bare = replace(found, pool=pool, chosen=np.arange(6), first=6)
+    setup, pool, chosen = selection()
+    pool = pool.take(chosen)
     wall = np.sort(pool.q[:, 0])[4]
     with pytest.raises(Unreachable, match=r"pose \d+ \(joints .* cannot be reached"):
-        ordered(search(setup, found, walled(wall), "quick"), bare)
+        ordered(search(setup, pool, np.arange(6), walled(wall), "quick"))

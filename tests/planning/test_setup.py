@@ -32,7 +32,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.information import Known, PoseInformation, interest_of
+from elastocal.planning.information import Known, PoseInformation
 from elastocal.planning.test_poses import TargetPoses, prediction_rows
 from elastocal.simulation import expand_plan, simulate
 
@@ -178,7 +178,7 @@ def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any
     cell = plan_cell(FULL, "position", loads=BOTH, criterion="A", interest=interest)
     setup = setup_of(cell, POSES)
     model, kept = setup.information.model, setup.found.columns
-    chosen = interest_of(model, setup.found)
+    chosen = setup.found.interest
     expected = [k for k, c in enumerate(kept) if counted(model.parameters[c])]
     assert chosen.tolist() == expected
     V = np.linalg.inv(setup.gathered(setup.information.blocks(TABLE_2)))

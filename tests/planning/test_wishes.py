@@ -22,7 +22,7 @@ from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, _Design
 from elastocal.planning.information import Known
 from elastocal.planning.plan import Everywhere, Plan
-from elastocal.planning.relaxation import balanced, exact_plan, relax
+from elastocal.planning.relaxation import exact_plan, relax
 from elastocal.planning.setup import Setup, set_up, share_within
 from elastocal.planning.test_poses import ELSEWHERE, everywhere
 
@@ -52,12 +52,12 @@ def test_the_share_is_the_largest_that_the_cap_allows_and_no_plan_beats_the_boun
     pool = setup.pool(Q, np.zeros(60, dtype=np.int64))
     share = share_within(setup, pool, six, 0.05, lambda message: None)
     assert 0.02 < share < 0.9
-    own, least = setup.criterion, relax(balanced(setup.problem(pool, six))).value
+    own, least = setup.criterion, relax(setup.problem(pool, six).balanced()).value
 
     def price(share: float) -> float:
         """How much more error at the test poses the relaxed optimum leaves."""
         problem = replace(setup, share=share).problem(pool, six)
-        turned = balanced(problem)
+        turned = problem.balanced()
         relaxed = relax(turned)
         assert relaxed.bound <= exact_plan(turned, relaxed)[1]
         return float(np.sqrt(own.of_information(problem.at(relaxed.weights)) / least) - 1)

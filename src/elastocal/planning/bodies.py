@@ -366,7 +366,14 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     links that joints hold together whatever the pose, the rope with what holds it, and
     `ignored_pairs`."""
     workspace = cell.workspace
-    ignored = _ignored(cell, bodies)
+    valid = [body.name for body in bodies] + [space.name for space in workspace.keep_out]
+    for name in sum(workspace.ignored_pairs, ()):
+        require(
+            name in valid,
+            f"{cell.path or cell.name}: [workspace] ignored_pairs names '{name}', but the cell has "
+            f"no such body{did_you_mean(name, valid)}; valid: {listed(valid)}",
+        )
+    ignored = {frozenset(pair) for pair in workspace.ignored_pairs}
     moving = [body for body in bodies if body.carrier != WORLD]
     own = [body for body in bodies if body.kind != "obstacle"]
     obstacles = [body for body in bodies if body.kind == "obstacle"]
@@ -426,18 +433,6 @@ def _outline(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> Iterator[Bod
         yield Body(solid, chain.n_joints - 1, "carried")
 
 
-def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:
-    workspace = cell.workspace
-    valid = [body.name for body in bodies] + [space.name for space in workspace.keep_out]
-    for name in sum(workspace.ignored_pairs, ()):
-        require(
-            name in valid,
-            f"{cell.path or cell.name}: [workspace] ignored_pairs names '{name}', but the cell has "
-            f"no such body{did_you_mean(name, valid)}; valid: {listed(valid)}",
-        )
-    return {frozenset(pair) for pair in workspace.ignored_pairs}
-
-
 def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[str]) -> bool:
     if a.carrier == b.carrier:
         return True
@@ -448,17 +443,11 @@ def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[s
     if a.kind != "arm" or b.kind != "arm":
         return False
     i, j = sorted((a.carrier, b.carrier))
-    return j == i + 1 or _held_together(a, b, workspace, chain)
-
-
-def _held_together(a: Body, b: Body, workspace: Workspace, chain: Chain) -> bool:
-    """Skeleton links i < j whose ends are never further apart than the links between are long: in
-    contact at every pose, as in a spherical wrist."""
-    if workspace.urdf_geometry:
-        return False
-    i, j = sorted((a.carrier, b.carrier))
-    if any(chain.joints[k].kind == "prismatic" for k in range(i + 1, j + 1)):
-        return False
+    slides = any(chain.joints[k].kind == "prismatic" for k in range(i + 1, j + 1))
+    if j == i + 1 or workspace.urdf_geometry or slides:
+        return j == i + 1
+    # Links of a skeleton whose ends are never further apart than the links between are long are in
+    # contact at every pose, as in a spherical wrist.
     between = distal_placements(chain)[i + 1 : j]
     length = sum(float(np.linalg.norm(T[:3, 3])) for T in between)
     return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance

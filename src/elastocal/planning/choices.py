@@ -32,14 +32,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Plan, TimedSize
-from elastocal.planning.relaxation import (
-    Relaxed,
-    balanced,
-    check_enough,
-    exact_plan,
-    prospects,
-    relax,
-)
+from elastocal.planning.relaxation import Relaxed, exact_plan, prospects, relax
 from elastocal.planning.setup import FeasiblePool, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, BoolArray, IntArray, Progress
@@ -243,7 +236,7 @@ class Choice:
                 ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
                 setup = replace(setup, ways=ways)
             pool = setup.pool(drawn.q, drawn.group)
-            relaxed = relax(balanced(setup.problem(pool, shares)), GAIN / 10)
+            relaxed = relax(setup.problem(pool, shares).balanced(), GAIN / 10)
         except ElastocalError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)
@@ -362,8 +355,8 @@ def _fitting(
     if point is None:
         return []
     problem = point.setup.problem(point.pool, shares_of(point.cell))
-    check_enough(problem)
-    chosen, phi = exact_plan(balanced(problem), point.relaxed)
+    problem.check_enough()
+    chosen, phi = exact_plan(problem.balanced(), point.relaxed)
     took = _minutes(point.cell, point.pool.q[chosen], point.pool.readings[chosen])
     # Where a load is not hung there is time for more; Φ goes about as one over their number.
     more = max(int(poses * minutes / took), 1) / poses
@@ -433,7 +426,7 @@ def chosen_states(
 
     def relaxed(ways: IntArray) -> tuple[float, Array]:
         own = replace(setup, ways=ways)
-        problem = balanced(own.problem(own.pool(q[few], group[few]), shares))
+        problem = own.problem(own.pool(q[few], group[few]), shares).balanced()
         weights = prospects(problem, GAIN / 3).weights
         value = float(problem.criterion.of_information(problem.at(weights)))
         return value, weights.reshape(len(ways), -1).sum(axis=1)

@@ -304,10 +304,10 @@ class MotionBound:
     of the other body too if that moves.
     """
 
-    def __init__(
-        self, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
-    ) -> None:
+    def __init__(self, kinematics: Kinematics, pairs: Sequence[Pair]) -> None:
         chain, n = kinematics.chain, kinematics.chain.n_joints
+        kept_apart = (item for p in pairs for item in (p.body, p.other) if isinstance(item, Body))
+        bodies = {item.name: item for item in kept_apart}.values()
         # Two directions across each revolute axis, in the joint's frame.
         self._across = [
             null_space(joint.axis[None]).T if joint.kind == "revolute" else None
@@ -382,12 +382,11 @@ class Paths:
     """
 
     def __init__(
-        self, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair],
-        load: HangingLoad | None,
-    ) -> None:  # fmt: skip
+        self, kinematics: Kinematics, pairs: Sequence[Pair], load: HangingLoad | None
+    ) -> None:
         self._kinematics, self._load = kinematics, load
         self._collisions = Collisions(kinematics, pairs)
-        self._bound = MotionBound(kinematics, bodies, pairs)
+        self._bound = MotionBound(kinematics, pairs)
         revolute = [joint.kind == "revolute" for joint in kinematics.chain.joints]
         self._revolute = np.array(revolute, dtype=float)
 

@@ -99,9 +99,6 @@ class TangentBound:
         return self.value**2 / (float((self.G * prior).sum()) + reach)
 
 
-# What a criterion is made from, and what it is.
-
-
 @dataclass(frozen=True)
 class CriterionInputs:
     """What cell and model give a criterion: p scaled parameters y, x_i = `sizes`_i · y_i.  What is

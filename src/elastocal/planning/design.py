@@ -51,13 +51,8 @@ from elastocal.planning.plan import (
     reasons,
 )
 from elastocal.planning.polish import Searches
-from elastocal.planning.relaxation import (
-    DesignProblem,
-    first_allowed,
-    random_information,
-    sized_plans,
-)
-from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection, ordered
+from elastocal.planning.relaxation import DesignProblem, first_allowed, sized_plans
+from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, ordered
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
@@ -100,8 +95,6 @@ class DesignOptions:
             all(n >= 1 for n in self.curve), f"a curve takes numbers of poses, found {self.curve}"
         )
 
-
-# The course of a design.
 
 MOST_POSES = 100  # that a target is sought with
 
@@ -259,19 +252,19 @@ class _Design:
         if self.cell.design.candidates is None:  # the plan is one of the poses that were brought
             effort = SearchEffort(starts=0, rounds=0, exchanges=max(effort.starts, 1))
 
-        def sought(shares: IntArray, checkpoint: Checkpoint) -> tuple[Search, Selection]:
-            seek = Search(pool, searches, shares, effort, options.seed, checkpoint, progress)
-            return seek, seek.select()
+        def sought(shares: IntArray, checkpoint: Checkpoint) -> Search:
+            asked = pool, searches, shares, effort, options.seed, checkpoint, progress
+            return Search(*asked).select()
 
         curve = self._curve(setup, pool)
         if self.cell.design.target is None:
-            seek, found = sought(shares, self.checkpoint)
+            found = sought(shares, self.checkpoint)
         else:
-            seek, found, sizes = self._fewest(setup, pool, sought)
+            found, sizes = self._fewest(setup, pool, sought)
             curve = tuple(sorted((*curve, *sizes), key=lambda size: size.poses))
         progress("random plans beside it")
-        drawn = random_information(setup.problem(pool, seek.shares), options.seed)
-        return self._plan(setup, seek, found, counts, targets.source, curve, drawn)
+        drawn = setup.problem(pool, found.shares).random_information(options.seed)
+        return self._plan(setup, found, counts, targets.source, curve, drawn)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -347,9 +340,8 @@ class _Design:
         )
 
     def _fewest(
-        self, setup: Setup, pool: FeasiblePool,
-        sought: Callable[[IntArray, Checkpoint], tuple[Search, Selection]],
-    ) -> tuple[Search, Selection, tuple[PlanSize, ...]]:  # fmt: skip
+        self, setup: Setup, pool: FeasiblePool, sought: Callable[[IntArray, Checkpoint], Search]
+    ) -> tuple[Search, tuple[PlanSize, ...]]:
         """The plan of the fewest poses that meets the target, and the sizes that were tried: the
         bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
         wanted, figure = self.cell.design.target, setup.criterion.figure
@@ -370,7 +362,7 @@ class _Design:
             tried[most], low = PlanSize(most, figure(value), None), high
         while low < high:
             try:
-                seek, found = sought(self._shares(n), replace(self.checkpoint, prefix=f"{n}_"))
+                found = sought(self._shares(n), replace(self.checkpoint, prefix=f"{n}_"))
             except (InputError, InsufficientDataError):
                 if n == most:
                     raise
@@ -379,7 +371,7 @@ class _Design:
             bound = found.certificate.bound_pool
             tried[n] = PlanSize(n, figure(found.value), None if bound is None else figure(bound))
             if found.value <= target:
-                best, high = (seek, found), n
+                best, high = found, n
             else:
                 low = n + 1
             n = min(max(int(np.ceil(n * found.value / target)), low), high - 1)
@@ -390,7 +382,7 @@ class _Design:
                 f"the target of {wanted * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
                 "ask for less, measure more repeats, or take a better tracker"
             )
-        return *best, tuple(tried.values())
+        return best, tuple(tried.values())
 
     def _target(self, setup: Setup, target: float) -> float:
         metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
@@ -403,18 +395,18 @@ class _Design:
         return (target * 1e6 / setup.criterion.figure(1.0)) ** 2
 
     def _plan(
-        self, setup: Setup, seek: Search, found: Selection, counts: CandidateCounts, targets: str,
+        self, setup: Setup, found: Search, counts: CandidateCounts, targets: str,
         curve: tuple[PlanSize, ...], drawn: Array,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
-        found, execution, told = ordered(seek, found)
+        execution, alias, told = ordered(found)
         self.warnings += told
-        pool, chosen = found.pool, found.chosen
+        pool, chosen = found.whole(found.chosen)
         q, blocks, readings = pool.q[chosen], pool.blocks[chosen], pool.readings[chosen]
         spec, model, done = self.cell.design, setup.information.model, self.done
         M = setup.gathered(blocks)
         without = np.stack([setup.gathered(np.delete(blocks, k, axis=0)) for k in range(len(q))])
-        noise, alias, left = model.cell.noise, found.alias, M
+        noise, left = model.cell.noise, M
         if alias is not None and noise.drift:
             left = alias.information(M, execution.times(len(q), len(self.forces)), noise)
         seen, numbers = setup.information.seen(q), setup.information.numbers(q, readings)
@@ -436,23 +428,21 @@ class _Design:
             level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
             execution=execution,
             candidates=counts,
-            certificate=replace(
-                found.certificate, starts=tuple(map(figure, found.certificate.starts))
-            ),
-            predicted=predicted(model, setup.found, left, numbers),
+            certificate=found.certificate,
+            predicted=predicted(setup.found, left, numbers),
             reasons=reasons(
-                model, setup.found, blocks, setup.prior,
-                setup.criterion.of_information(without), found.value,
+                setup.information.names, blocks, M,
+                setup.criterion.of_information(without) / found.value,
             ),
             targets=f"test poses: {targets}",
             seed=self.options.seed,
-            polished=found.polished,
+            polished=int(((chosen >= found.first) & (chosen < len(found.pool))).sum()),
             curve=curve,
             bound_reported=None if bound is None else figure(bound),
             warnings=tuple(self.warnings),
             made_for="" if done is None else done.note,
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
-            names=self._names(found),
+            names=self._names(pool, chosen, len(found.pool)),
             chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=Everywhere.of(
                 R, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
@@ -463,18 +453,19 @@ class _Design:
             gain=gain,
         )  # fmt: skip
 
-    def _names(self, found: Selection) -> tuple[str, ...]:
-        """Those that stay keep theirs, and the others are numbered after all there have been."""
-        pins, q = self.options.pins, found.pool.q
-        crossed = len(np.unique(q[found.chosen], axis=0)) == len(found.chosen)
+    def _names(self, pool: FeasiblePool, chosen: IntArray, own: int) -> tuple[str, ...]:
+        """Those that stay, behind the `own` ones of the pool, keep theirs, and the others are
+        numbered after all there have been."""
+        pins, q = self.options.pins, pool.q
+        crossed = len(np.unique(q[chosen], axis=0)) == len(chosen)
         if pins is None and not self.taught and crossed:
             return ()
         labels = self.options.done.configuration_labels if self.options.done else ()
         kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
         new = count(next_number((*labels, *taken, *self.taught.values())))
-        own, names, read = len(found.pool) - found.pinned, list[str](), found.pool.readings > 0
+        names, read = list[str](), pool.readings > 0
         of_pose: dict[bytes, tuple[str, BoolArray]] = {}  # its name, and where it is read so far
-        for i in found.chosen:
+        for i in chosen:
             name = kept[i - own] if i >= own else self.taught.get(q[i].tobytes())
             same, before = of_pose.get(q[i].tobytes(), (None, read[i]))
             if same is not None and not (before & read[i]).any():

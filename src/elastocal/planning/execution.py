@@ -369,9 +369,6 @@ def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> lis
     return new
 
 
-# Reference poses: the same pose again and again, which shows a drift by itself.
-
-
 def with_references(
     tour: list[int], moves: Moves, travel: Array, every: int, paired: bool
 ) -> list[tuple[int, int]]:
@@ -403,9 +400,6 @@ def with_references(
     most = min((n for s, n in times.items() if not moves.loaded[s]), default=0)
     loaded = moves.loaded[moves.load]
     return [(v, again) for v, again in found if not paired or again <= most or not loaded[v - 1]]
-
-
-# The order of execution as it is handed on: stops, how to get to them, what it takes.
 
 
 @dataclass(frozen=True)
@@ -491,9 +485,6 @@ class Execution:
         return self.travel + waiting
 
 
-# From a tour over visits to the stops of an execution.
-
-
 def _stops(moves: Moves, u: int, v: int) -> list[Stop]:
     """The reading of node v after node u, or two where it is approached from both sides."""
     _, way = moves.way(u, v)
@@ -526,9 +517,6 @@ def nearest_first(cost: Array) -> list[int]:
         left[:, tour[-1]] = np.inf
         tour.append(int(np.argmin(left[tour[-1]])))
     return tour[1:]
-
-
-# The shortest execution of a plan: every pose in its load states, by collision-free moves.
 
 
 def schedule(

@@ -437,10 +437,7 @@ class Feasibility:
 
     @cached_property
     def _paths(self) -> Paths:
-        kept_apart = [item for p in self.pairs for item in (p.body, p.other)]
-        bodies = {item.name: item for item in kept_apart if isinstance(item, Body)}
-        load = self.cell.workspace.load
-        return Paths(self.kinematics, tuple(bodies.values()), self.pairs, load)
+        return Paths(self.kinematics, self.pairs, self.cell.workspace.load)
 
     def _poses(self, q: Array, force: Array) -> Poses:
         q = np.atleast_2d(np.asarray(q, dtype=float))

@@ -30,7 +30,6 @@ from elastocal.identification.weighted_problem import (
     whitener,
 )
 from elastocal.measurements import Measurements, load_states, numbered
-from elastocal.model.chain import joint_index
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import SIZE, Observations, available_noise, observe
@@ -245,7 +244,8 @@ class PoseInformation:
 # What a plan can make certain: the parameters that some feasible pose shows, and their scale.
 
 SURE = 1e3  # standard deviations that a typical deviation counts for where a prior is stated
-SAMPLE = 2000  # poses that show what is visible: more would not change a rank
+# Share of a test point's motion that may lie outside what the poses show: rounding, not physics.
+OUTSIDE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -270,10 +270,11 @@ class Known:
 
 @dataclass(frozen=True)
 class Estimable:
-    """`reduction` over all parameters (kept, dropped, mixing), `sizes` (parameters,) and
+    """Of the `model`'s parameters `reduction` (kept, dropped, mixing), `sizes` (parameters,) and
     `structure`: the reduction that any number of poses would come to.  What N poses show only below
     their noise identification holds: it is in `structure.kept` alone."""
 
+    model: Model
     reduction: Reduction
     sizes: Array
     structure: Reduction
@@ -281,6 +282,115 @@ class Estimable:
     @property
     def columns(self) -> IntArray:
         return self.reduction.kept
+
+    @property
+    def interest(self) -> IntArray:
+        """Indices into the kept parameters that D, A, E and the indices O count: those of `[design]
+        interest`, by default all but base and markers."""
+        model, wanted = self.model, self.model.cell.design.interest
+        kept = [model.parameters[c] for c in self.columns]
+        where = f"{model.cell.path or model.cell.name}: [design] interest"
+        if not wanted:
+            own = [k for k, p in enumerate(kept) if not effect_of(p.effect).registered]
+            return np.array(own or range(len(kept)), dtype=np.int64)
+        chosen: set[int] = set()
+        for name in wanted:
+            meant = model.meant_by(name)
+            if not meant:
+                valid = model.all_names
+                raise InputError(
+                    f"{where} names {quoted(name)}, which is no parameter, place or effect of the "
+                    f"model{did_you_mean(name, valid)}; there are {listed(valid)}"
+                )
+            here = [k for k, c in enumerate(self.columns) if c in meant]
+            if not here:
+                raise InsufficientDataError(f"{where} names {quoted(name)}; {self.why(meant[0])}")
+            chosen.update(here)
+        return np.array(sorted(chosen), dtype=np.int64)
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Which parameters no pose shows, in sentences."""
+        model, unseen = self.model, self.structure.invisible.tolist()
+        if len(unseen) < 2:
+            return tuple(self.why(i) for i in unseen)
+        names, loads = [model.names[i] for i in unseen], model.cell.design.loads
+        loaded, remedy = loads is not None and loads.any(), "state a load ([design] loads_N)"
+        remedy = "change the load's direction or the limits" if loaded else remedy
+        return (
+            f"no feasible pose shows {listed(names)}: they move no marker in any of them; "
+            f"{remedy}, or leave them out ({option('fixed', names[0])})",
+        )
+
+    @property
+    def combination(self) -> Array | None:
+        """[design] combination as factors (kept,) of the kept parameters, scaled."""
+        model, wanted = self.model, self.model.cell.design.combination
+        if not wanted:
+            return None
+        a = np.array([wanted.get(name, 0.0) for name in model.names])
+        lost = self.unpredictable(a[None, None])
+        if lost is not None:
+            raise InsufficientDataError(
+                f"{model.cell.path or model.cell.name}: [design] combination depends on "
+                f"{model.names[lost[1]]}; {self.why(lost[1])}"
+            )
+        return np.asarray((a * self.sizes)[self.columns])
+
+    def why(self, index: int) -> str:
+        """Why parameter `index` is not among the kept ones, and what would help."""
+        name, r, model = self.model.names[index], self.structure, self.model
+        if index in r.kept:
+            return (
+                f"so many poses show less of {name} than their noise, and identification would "
+                f"hold it; measure more poses or repeats, or state a prior ({option('knowledge')})"
+            )
+        if index in r.invisible:
+            return (
+                f"no feasible pose shows {name}: it moves no marker in any of them; change the "
+                f"load's direction or the limits, or leave it out ({option('fixed', name)})"
+            )
+        if index in r.dropped:
+            share = np.abs(r.mixing[:, list(r.dropped).index(index)]) / self.sizes[r.kept]
+            partner = model.names[r.kept[int(share.argmax())]]
+            return (
+                f"no set of poses separates {name} from others ({partner} moves the markers in "
+                f"the same way); ask for {partner} instead, or hold one of them "
+                f"({option('fixed', name)})"
+            )
+        return f"{name} is held; drop it from {option('fixed')}"
+
+    def on_kept(self, A: Array) -> Array:
+        """A (T, r, kept) on the kept parameters, scaled by their sizes.  A test point is
+        predictable where its motion by the dropped parameters is that by the kept ones they
+        combine with, A_D = A_K · mixing; where it is not, no number of poses would make that
+        position certain."""
+        cell, lost = self.model.cell, self.unpredictable(A)
+        if lost is not None:
+            raise InsufficientDataError(
+                f"{cell.path or cell.name}: the position at test pose {lost[0] + 1} depends on "
+                f"{self.model.names[lost[1]]}; {self.why(lost[1])}; or ask for parameters instead "
+                'of test poses (criterion = "D")'
+            )
+        return np.asarray(A[..., self.columns] * self.sizes[self.columns])
+
+    def unpredictable(self, A: Array) -> tuple[int, int] | None:
+        """A row of A (T, r, parameters) and a parameter by which no plan can predict it, if any."""
+        off = np.abs(self._unexplained(A, self.structure)).max(axis=1)
+        if off.max(initial=0.0) <= OUTSIDE * float(np.abs(A * self.sizes).max()):
+            return None
+        dropped = int(off.max(axis=0).argmax())
+        return int(off[:, dropped].argmax()), int(self.structure.dropped[dropped])
+
+    def remaining_bias(self, A: Array, weight: Array) -> float:
+        """Rms in m of what typical deviations of held parameters, which the poses show below their
+        noise, move the test points by, A (T, r, parameters) with `weight` (T,)."""
+        off = self._unexplained(A, self.reduction)
+        return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
+
+    def _unexplained(self, A: Array, r: Reduction) -> Array:
+        """(T, r, dropped): A_D − A_K · mixing, times the sizes."""
+        return np.asarray((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * self.sizes[r.dropped])
 
 
 def estimable(
@@ -311,70 +421,13 @@ def estimable(
         mixing = local.mixing * sizes[kept][:, None] / sizes[dropped][None, :]
         return Reduction(kept, dropped, mixing, free[local.invisible])
 
-    found = Estimable(reduced(WORTH_A_COLUMN), sizes, reduced(0.0))
+    found = Estimable(model, reduced(WORTH_A_COLUMN), sizes, reduced(0.0))
     if not len(found.columns):
         raise InsufficientDataError(
             f"{model.cell.path or model.cell.name}: no feasible pose shows any parameter of the "
             "model; state the load that will hang ([design] loads_N), or choose other effects"
         )
     return found, prior[np.ix_(found.columns, found.columns)]
-
-
-def interest_of(model: Model, found: Estimable) -> IntArray:
-    """Indices into the kept parameters that D, A, E and the indices O count: those of `[design]
-    interest`, by default all but base and markers."""
-    wanted = model.cell.design.interest
-    kept = [model.parameters[c] for c in found.columns]
-    where = f"{model.cell.path or model.cell.name}: [design] interest"
-    if not wanted:
-        own = [k for k, p in enumerate(kept) if not effect_of(p.effect).registered]
-        return np.array(own or range(len(kept)), dtype=np.int64)
-    chosen: set[int] = set()
-    for name in wanted:
-        meant = model.meant_by(name)
-        if not meant:
-            valid = model.all_names
-            raise InputError(
-                f"{where} names {quoted(name)}, which is no parameter, place or effect of the model"
-                f"{did_you_mean(name, valid)}; there are {listed(valid)}"
-            )
-        here = [k for k, c in enumerate(found.columns) if c in meant]
-        if not here:
-            raise InsufficientDataError(
-                f"{where} names {quoted(name)}; {why(model, found, meant[0])}"
-            )
-        chosen.update(here)
-    return np.array(sorted(chosen), dtype=np.int64)
-
-
-def why(model: Model, found: Estimable, index: int) -> str:
-    """Why parameter `index` is not among the kept ones, and what would help."""
-    name, r = model.names[index], found.structure
-    if index in r.kept:
-        return (
-            f"so many poses show less of {name} than their noise, and identification would hold "
-            f"it; measure more poses or repeats, or state a prior ({option('knowledge')})"
-        )
-    if index in r.invisible:
-        return (
-            f"no feasible pose shows {name}: it moves no marker in any of them; change the load's "
-            f"direction or the limits, or leave it out ({option('fixed', name)})"
-        )
-    if index in r.dropped:
-        share = np.abs(r.mixing[:, list(r.dropped).index(index)]) / found.sizes[r.kept]
-        partner = model.names[r.kept[int(share.argmax())]]
-        return (
-            f"no set of poses separates {name} from others ({partner} moves the markers in the "
-            f"same way); ask for {partner} instead, or hold one of them ({option('fixed', name)})"
-        )
-    return f"{name} is held; drop it from {option('fixed')}"
-
-
-def sample_of(model: Model, q: Array) -> IntArray:
-    """Some of the poses q (N, n), as many at each level."""
-    held = [joint_index(name) for name in model.cell.design.levels]
-    kind = np.unique(q[:, held], axis=0, return_inverse=True)[1].ravel()
-    return evenly(kind, -(-SAMPLE // (int(kind.max()) + 1)))
 
 
 def evenly(group: IntArray, each: int) -> IntArray:

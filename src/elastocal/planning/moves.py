@@ -39,22 +39,22 @@ class Roadmap:
         self.points, self.loaded, self.checker = points, loaded, checker
         self.carrying = " with the load" if loaded else ""
         self.direct = times.copy()  # inf where blocked
-        self.verdict: dict[tuple[int, int], bool] = {}
+        self.checked = np.eye(len(times), dtype=bool)
         self._ways: tuple[Array, NDArray[np.integer]] | None = None
 
     def check(self, moves: Iterable[tuple[int, int]]) -> bool:
         """Are the straight moves between these pairs of points all free?  Each is checked once,
         those not checked before together."""
-        pairs = {(min(move), max(move)) for move in moves if move[0] != move[1]}
-        new = sorted(pairs - self.verdict.keys())
+        pairs = sorted({(min(move), max(move)) for move in moves})
+        new = [pair for pair in pairs if not self.checked[pair]]
         if new:
             i, j = np.array(new).T
             free = self.checker.paths_free(self.points[i], self.points[j], self.loaded)
-            self.verdict.update(zip(new, (bool(f) for f in free), strict=True))
-            blocked = ~np.asarray(free)
-            self.direct[i[blocked], j[blocked]] = self.direct[j[blocked], i[blocked]] = np.inf
+            self.checked[i, j] = self.checked[j, i] = True
+            i, j = i[~free], j[~free]
+            self.direct[i, j] = self.direct[j, i] = np.inf
             self._ways = None
-        return all(self.verdict[pair] for pair in pairs)
+        return all(np.isfinite(self.direct[pair]) for pair in pairs)
 
     def costs(self) -> Array:
         """Times (m, m) between points: straight, or by the fastest way around; inf for none."""
@@ -114,13 +114,9 @@ class Roadmap:
 
     def _joined(self) -> IntArray:
         """A label (m,) for each part that is known to hang together."""
-        free = np.zeros(self.direct.shape, dtype=bool)
-        for (i, j), verdict in self.verdict.items():
-            free[i, j] = verdict
-        return np.asarray(csgraph.connected_components(free)[1])
+        free = self.checked & np.isfinite(self.direct)
+        return np.asarray(csgraph.connected_components(free, directed=False)[1])
 
-
-# Poses that no collision-free move reaches, told before and after the routing.
 
 MOST_NAMED = 3
 
@@ -131,9 +127,6 @@ class Unreachable(InsufficientDataError):
     def __init__(self, message: str, poses: IntArray) -> None:
         super().__init__(message)
         self.poses = poses
-
-
-# The points of a schedule, its visits, and the moves between them, checked when needed.
 
 
 @dataclass(frozen=True)
@@ -207,11 +200,11 @@ class Moves:
 
     @property
     def checked(self) -> int:
-        return sum(len(roadmap.verdict) for roadmap in self.maps)
+        return sum(int(np.triu(roadmap.checked, 1).sum()) for roadmap in self.maps)
 
     @property
     def blocked(self) -> int:
-        return sum(not free for roadmap in self.maps for free in roadmap.verdict.values())
+        return sum(int(np.isinf(np.triu(roadmap.direct)).sum()) for roadmap in self.maps)
 
     def carries(self, node: int) -> int:
         """The load state on the arm at a node of a tour, −1 for none; node 0 is without."""
@@ -290,8 +283,15 @@ class Moves:
         to all (and home)?"""
         for roadmap in self.maps:
             here = self.loaded[self.load] == roadmap.loaded
-            if self.signs is not None:
-                self._check_approaches(roadmap, here)
+            for v in np.flatnonzero(here & ~self.free.any(axis=1)):
+                pose, (below, above) = int(self.leave[v]), self.sides[v].tolist()
+                raise Unreachable(
+                    f"{self._name(pose)} cannot be approached{roadmap.carrying}, neither from below"
+                    f"{self._in_the_way(roadmap, below, pose)} nor from above"
+                    f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
+                    "[design.motion], or raise clearance_mm in [workspace]",
+                    self.pose[[v]],
+                )
             here |= not roadmap.loaded
             needed = [int(point) for point in dict.fromkeys(self.leave[here])]
             if self.home is not None and not roadmap.loaded:
@@ -304,17 +304,6 @@ class Moves:
                 # Where most hang together, all others are told at once.
                 clear = len(most) > len(every) and self.home not in every
                 raise self._unreachable(roadmap, every if clear else lost[0])
-
-    def _check_approaches(self, roadmap: Roadmap, here: BoolArray) -> None:
-        for v in np.flatnonzero(here & ~self.free.any(axis=1)):
-            pose, (below, above) = int(self.leave[v]), self.sides[v].tolist()
-            raise Unreachable(
-                f"{self._name(pose)} cannot be approached{roadmap.carrying}, neither from below"
-                f"{self._in_the_way(roadmap, below, pose)} nor from above"
-                f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
-                "[design.motion], or raise clearance_mm in [workspace]",
-                self.pose[[v]],
-            )
 
     def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
         named = ", ".join(self._name(point) for point in lost[:MOST_NAMED])

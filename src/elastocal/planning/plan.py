@@ -55,10 +55,10 @@ class Reason:
     serves: tuple[tuple[str, float], ...]
 
 
-def predicted(model: Model, found: Estimable, M: Array, n_numbers: int) -> tuple[Predicted, ...]:
+def predicted(found: Estimable, M: Array, n_numbers: int) -> tuple[Predicted, ...]:
     """Intervals of the kept parameters from M (p, p), scaled by their sizes: cov(X̂) = M⁻¹ (eq. 13
     of Klimchik et al. 2013), Student's t with `n_numbers` − p degrees of freedom."""
-    r, sizes = found.reduction, found.sizes
+    model, r, sizes = found.model, found.reduction, found.sizes
     std = np.sqrt(np.diag(inverse(M))) * sizes[r.kept]
     quantile = float(special.stdtrit(max(n_numbers - len(r.kept), 1), 0.975))
     return tuple(
@@ -74,17 +74,11 @@ def predicted(model: Model, found: Estimable, M: Array, n_numbers: int) -> tuple
     )  # fmt: skip
 
 
-def reasons(
-    model: Model, found: Estimable, blocks: Array, prior: Array, values: Array, value: float
-) -> tuple[Reason, ...]:
-    """Why each pose of a plan is in it: blocks (N, r, p), prior (p, p), both scaled.
-
-    `values` (N,): the criterion of the plan without that pose; `value`: with all.
-    """
-    V = inverse(prior + np.einsum("nri,nrj->ij", blocks, blocks))
-    names = [model.names[c] for c in found.columns]
-    told = []
-    for B, without in zip(blocks, values, strict=True):
+def reasons(names: Sequence[str], blocks: Array, M: Array, losses: Array) -> tuple[Reason, ...]:
+    """Why each pose of a plan is in it: `blocks` (N, r, p) of its M (p, p) over the parameters
+    `names`, and what the criterion loses without it, as a factor `losses` (N,)."""
+    V, told = inverse(M), []
+    for B, loss in zip(blocks, losses, strict=True):
         # V₋ = V + V Bᵀ (1 − B V Bᵀ)⁻¹ B V; a pose that carries a direction alone leaves 1 − BVBᵀ
         # singular.
         share, turn = linalg.eigh(B @ V @ B.T)
@@ -95,7 +89,7 @@ def reasons(
             growth = np.sqrt(1 + np.nan_to_num(more, nan=0.0, posinf=np.inf) / np.diag(V))
         first = np.argsort(-growth, kind="stable")[:TOLD]
         serves = tuple((names[k], float(growth[k])) for k in first if growth[k] > 1.005)
-        told.append(Reason(float(without / value), serves))
+        told.append(Reason(float(loss), serves))
     return tuple(told)
 
 
@@ -106,63 +100,8 @@ SCHEMA = "elastocal/plan/1"
 DIGITS = 9
 
 
-def plan_table(
-    execution: Execution, configurations: Sequence[str], level: IntArray, kinds: Sequence[str],
-    forces: Array | None = None, seen: Mapping[str, BoolArray] | None = None,
-    carried: Array | None = None, counts: IntArray | None = None,
-) -> tuple[Measurements, dict[str, list[str]]]:  # fmt: skip
-    """An execution as the table that is read of its plan, sorted by pose, side of approach and load
-    state, and its columns beside: level, order and notes.
-
-    With `forces` (L, 3) N one row per reading, under its force; without, one per pose and side, to
-    be measured in every load state.  `order` is the first of its stops, note_order_2 the second, …;
-    note_load, note_load_2, … what of the load states `carried` (L, 3) N hangs there.
-    A pose that is approached from both sides is two configurations, 7+ (joints moving up to it)
-    and 7-.  With `seen`, which markers are read of each pose in each load state (N, L), there is a
-    row for each; with `counts` (N, L) note_readings says how often each is read.
-    """
-    rows, marker = _rows(execution, forces is not None, seen)
-    first, n = [row[0][1] for row in rows], len(rows)
-    two = execution.motion.both_directions or any(stop.side for stop in execution.stops)
-    names = [stop.name(configurations) + ("+", "-")[stop.side] * two for stop in first]
-    labels = tuple(dict.fromkeys(names))
-    approach = [stop.approach for stop in first if stop.approach is not None]
-    times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
-    time = np.array([sum(each) / len(each) for each in times if each])
-    # As the digits of the file say it.
-    shown = np.round(in_file_units(np.array([stop.q for stop in first]), kinds), DIGITS).T
-    units = ["deg" if kind == "revolute" else "mm" for kind in kinds]
-    q = [to_si(values, unit) for values, unit in zip(shown, units, strict=True)]
-    force = np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]]
-    table = Measurements.of_poses(
-        "plan", np.column_stack(q), force, row=np.arange(n) + 2,
-        configuration=np.array([labels.index(name) for name in names]),
-        configuration_labels=labels, marker=marker,
-        marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
-        approach=np.array(approach, dtype=float) if approach else None,
-        time=np.round(time, 3) if len(time) else None, joint_kinds=tuple(kinds),
-    )  # fmt: skip
-
-    def nth(told: Callable[[int, Stop], str], i: int) -> list[str]:
-        return [told(*row[i]) if i < len(row) else "" for row in rows]
-
-    most = range(max(map(len, rows)))
-    beside = {"level": [str(level[stop.pose]) for stop in first]}
-    for i in most:
-        beside[f"note_order_{i + 1}" if i else "order"] = nth(lambda k, _: str(k), i)
-    hung = [] if carried is None else [load_name(load) for load in carried]
-    if counts is not None and hung:
-        beside["note_load"] = nth(lambda _, stop: hung[stop.load], 0)
-        beside["note_readings"] = nth(lambda _, stop: str(counts[stop.pose, stop.load]), 0)
-    elif forces is None and carried is not None and carried.any():
-        for i in most:
-            name = "note_load" + (f"_{i + 1}" if i else "")
-            beside[name] = nth(lambda _, stop: hung[stop.load], i)
-    return table, beside
-
-
 def _rows(
-    execution: Execution, by_load: bool, seen: Mapping[str, BoolArray] | None
+    execution: Execution, by_load: bool, seen: BoolArray | None
 ) -> tuple[list[list[tuple[int, Stop]]], IntArray]:
     """The stops of each row, with their places in the order, and its marker (rows,)."""
     visits: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
@@ -173,8 +112,7 @@ def _rows(
     rows = [visits[key] for key in sorted(visits)]
     if seen is None:
         return rows, np.zeros(len(rows), dtype=np.int64)
-    read = [[each[stop.pose, stop.load] for each in seen.values()] for (_, stop), *_ in rows]
-    of, marker = np.nonzero(np.array(read))
+    of, marker = np.nonzero(np.array([seen[stop.pose, stop.load] for (_, stop), *_ in rows]))
     return [rows[k] for k in of], marker
 
 
@@ -209,9 +147,6 @@ def write_plan(
     atomic_write(path, csv_text(columns, zip(*columns.values(), strict=True)))
 
 
-# The frozen result of a design: poses in order, what they promise, how far from the best.
-
-
 @dataclass(frozen=True)
 class CandidateCounts:
     tried: int
@@ -225,7 +160,7 @@ class Certificate:
 
     `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a Φ
     below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched` poses
-    and `ascents` local searches.  `starts`: Φ at which each start of the search ended.
+    and `ascents` local searches.  `starts`: where each start of it ended, in the plan's unit.
     """
 
     pool: int
@@ -539,13 +474,55 @@ class Plan(Result):
 
     @property
     def rows(self) -> tuple[Measurements, dict[str, list[str]]]:
-        names, seen = self.model.cell.tool.markers, self.seen
-        return plan_table(
-            self.execution, self.configurations, self.group + 1, self.model.chain.kinds,
-            self.stated_forces,
-            None if seen is None else dict(zip(names, np.moveaxis(seen, 2, 0), strict=True)),
-            self.forces, None if self.crossed else self.readings,
+        """The table that is read of the plan, sorted by pose, side of approach and load state, and
+        its columns beside: level, order and notes.
+
+        Where `stated_forces` are, one row per reading, under its force; else one per pose and side,
+        to be measured in every load state.  `order` is the first of its stops, note_order_2 the
+        second, …; note_load, note_load_2, … what of the load states hangs there.  A pose that is
+        approached from both sides is two configurations, 7+ (joints moving up to it) and 7-.
+        Where only some markers are seen there is a row for each, and where poses are not read
+        alike note_readings says how often each is.
+        """
+        forces, kinds = self.stated_forces, self.model.chain.kinds
+        rows, marker = _rows(self.execution, forces is not None, self.seen)
+        own = tuple(self.model.cell.tool.markers)
+        first, n = [row[0][1] for row in rows], len(rows)
+        two = self.execution.motion.both_directions or any(stop.side for stop in first)
+        names = [stop.name(self.configurations) + ("+", "-")[stop.side] * two for stop in first]
+        labels = tuple(dict.fromkeys(names))
+        approach = [stop.approach for stop in first if stop.approach is not None]
+        times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
+        time = np.array([sum(each) / len(each) for each in times if each])
+        # As the digits of the file say it.
+        shown = np.round(in_file_units(np.array([stop.q for stop in first]), kinds), DIGITS).T
+        units = ["deg" if kind == "revolute" else "mm" for kind in kinds]
+        q = [to_si(values, unit) for values, unit in zip(shown, units, strict=True)]
+        force = np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]]
+        table = Measurements.of_poses(
+            "plan", np.column_stack(q), force, row=np.arange(n) + 2,
+            configuration=np.array([labels.index(name) for name in names]),
+            configuration_labels=labels, marker=marker,
+            marker_names=own if self.seen is not None else (DEFAULT_MARKER,),
+            approach=np.array(approach, dtype=float) if approach else None,
+            time=np.round(time, 3) if len(time) else None, joint_kinds=tuple(kinds),
         )  # fmt: skip
+
+        def nth(told: Callable[[int, Stop], str], i: int) -> list[str]:
+            return [told(*row[i]) if i < len(row) else "" for row in rows]
+
+        most, hung = range(max(map(len, rows))), [load_name(load) for load in self.forces]
+        beside = {"level": [str(self.group[stop.pose] + 1) for stop in first]}
+        for i in most:
+            beside[f"note_order_{i + 1}" if i else "order"] = nth(lambda k, _: str(k), i)
+        if not self.crossed:
+            beside["note_load"] = nth(lambda _, stop: hung[stop.load], 0)
+            beside["note_readings"] = nth(lambda _, s: str(self.readings[s.pose, s.load]), 0)
+        elif forces is None and self.forces.any():
+            for i in most:
+                name = "note_load" + (f"_{i + 1}" if i else "")
+                beside[name] = nth(lambda _, stop: hung[stop.load], i)
+        return table, beside
 
     @property
     def crossed(self) -> bool:

@@ -144,9 +144,6 @@ class JointSearch:
         return total
 
 
-# All poses of a plan at once.
-
-
 def polish(
     problem: DesignProblem, searches: Searches, T: Array, plan: FeasiblePool, fine: bool = False
 ) -> Array:

@@ -51,10 +51,6 @@ class DesignProblem:
     criterion: ScenarioCriterion
     source: str = ""
 
-    @property
-    def n_poses(self) -> int:
-        return int(self.shares.sum())
-
     @cached_property
     def packed(self) -> Array:
         """B_iᵀB_i as its upper triangle, √2 off the diagonal (N, p(p+1)/2), so that ⟨G, B_iᵀB_i⟩
@@ -112,63 +108,92 @@ class DesignProblem:
         other.__dict__["packed"] = self.packed
         return other
 
+    def balancing(self) -> Array:
+        """T (p, p): parameters z, y = T z, whose information at even weights is 1.  Where base,
+        markers and geometry are identified together, an update of Φ by one pose would keep no
+        digits otherwise."""
+        M = self.information(np.arange(len(self.blocks)), self.even())
+        size = np.sqrt(np.maximum(np.diagonal(M), 0.0))
+        scale = 1 / np.where(size > 0, size, 1.0)
+        if not covariance(M)[1]:
+            n = int(np.count_nonzero(self.shares[self.group]))
+            raise InsufficientDataError(
+                f"all {n} candidates of the groups with a share together do not determine the "
+                f"{len(M)} parameters; allow other joint levels or more load, switch effects off, "
+                "or add prior knowledge"
+            )
+        L: Array = np.asarray(np.linalg.cholesky(M * scale[:, None] * scale))
+        return np.asarray(scale[:, None] * inverse(L).T)
+
+    def in_terms(self, T: Array, ridge: float = 0.0) -> DesignProblem:
+        """That of the parameters z, y = T z, T (p, k), `ridge` · 1 known before.
+
+        Where k < p, what T leaves out is taken for known: no plan has a larger Φ than before.
+        """
+        prior = T.T @ self.prior @ T
+        return replace(
+            self,
+            blocks=self.blocks @ T,
+            prior=(prior + prior.T) / 2 + ridge * np.eye(T.shape[-1]),
+            criterion=self.criterion.turned(T),
+        )
+
+    def balanced(self, T: Array | None = None) -> DesignProblem:
+        """In parameters in which the search works, with a ridge that keeps every plan regular."""
+        return self.in_terms(self.balancing() if T is None else T, RIDGE)
+
+    def check_enough(self) -> None:
+        _, r, p = self.blocks.shape
+        n = int(self.shares.sum())
+        # How many combinations of parameters the prior determines.
+        known = int(np.linalg.matrix_rank(self.prior, hermitian=True))
+        needed = -(-(p - known) // r)
+        if n < needed:
+            prior = f" and the prior {known}" if known else ""
+            raise InsufficientDataError(
+                f"{self.source}fewer equations than parameters: {n} poses of {r} readings give "
+                f"{n * r}{prior}, for {p} parameters; plan at least {needed} poses, switch effects "
+                "off or state a prior"
+            )
+
+    def check_determined(self, value: float) -> None:
+        if not np.isfinite(value):
+            raise InsufficientDataError(
+                f"no plan of {self.shares.sum()} poses that determines all "
+                f"{len(self.prior)} parameters was found; plan more poses, other shares, or "
+                "state a prior"
+            )
+
+    def random(self, rng: np.random.Generator) -> IntArray:
+        """A plan (n,), sorted, drawn uniformly from those of the shares."""
+        own = (np.flatnonzero(self.group == g) for g in range(len(self.shares)))
+        lots = [rng.choice(o, n, replace=False) for o, n in zip(own, self.shares, strict=True)]
+        return np.sort(np.concatenate(lots))
+
+    def random_information(self, seed: int) -> Array:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
+        return np.stack([self.information(self.random(rng)) for _ in range(DRAWN)])
+
+    def rounded(self, weights: Array, rng: np.random.Generator | None = None) -> IntArray:
+        """A plan (n,) of the largest relaxed weights (N,) of each group; with `rng` drawn in
+        proportion to them (the largest log w + Gumbel noise)."""
+        score = np.log(np.maximum(weights, 1e-9))
+        score = score if rng is None else score + rng.gumbel(size=len(weights))
+        return np.sort(best_of(score, self.group, self.shares))
+
+    def fitted(self, plan: IntArray) -> IntArray:
+        """A plan (n,), sorted, of the shares here from one of others: of each group those of the
+        plan first, and by price."""
+        _, price = self.worth(inverse(self.information(plan)))
+        price[plan] += price.max()
+        return np.sort(best_of(price, self.group, self.shares))
+
 
 @lru_cache
 def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
     """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
     rows, columns = np.triu_indices(p)
     return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
-
-
-def balancing(problem: DesignProblem) -> Array:
-    """T (p, p): parameters z, y = T z, whose information at even weights is 1.  Where base, markers
-    and geometry are identified together, an update of Φ by one pose would keep no digits otherwise.
-    """
-    M = problem.information(np.arange(len(problem.blocks)), problem.even())
-    size = np.sqrt(np.maximum(np.diagonal(M), 0.0))
-    scale = 1 / np.where(size > 0, size, 1.0)
-    if not covariance(M)[1]:
-        n = int(np.count_nonzero(problem.shares[problem.group]))
-        raise InsufficientDataError(
-            f"all {n} candidates of the groups with a share together do not determine the "
-            f"{len(M)} parameters; allow other joint levels or more load, switch effects off, "
-            "or add prior knowledge"
-        )
-    L: Array = np.asarray(np.linalg.cholesky(M * scale[:, None] * scale))
-    return np.asarray(scale[:, None] * inverse(L).T)
-
-
-def in_terms(problem: DesignProblem, T: Array, ridge: float = 0.0) -> DesignProblem:
-    """The problem of the parameters z, y = T z, T (p, k), `ridge` · 1 known before.
-
-    Where k < p, what T leaves out is taken for known: no plan has a larger Φ than before.
-    """
-    prior = T.T @ problem.prior @ T
-    return replace(
-        problem,
-        blocks=problem.blocks @ T,
-        prior=(prior + prior.T) / 2 + ridge * np.eye(T.shape[-1]),
-        criterion=problem.criterion.turned(T),
-    )
-
-
-def balanced(problem: DesignProblem) -> DesignProblem:
-    return in_terms(problem, balancing(problem), RIDGE)
-
-
-def check_enough(problem: DesignProblem) -> None:
-    _, r, p = problem.blocks.shape
-    n = problem.n_poses
-    # How many combinations of parameters the prior determines.
-    known = int(np.linalg.matrix_rank(problem.prior, hermitian=True))
-    needed = -(-(p - known) // r)
-    if n < needed:
-        prior = f" and the prior {known}" if known else ""
-        raise InsufficientDataError(
-            f"{problem.source}fewer equations than parameters: {n} poses of {r} readings give "
-            f"{n * r}{prior}, for {p} parameters; plan at least {needed} poses, switch effects off "
-            "or state a prior"
-        )
 
 
 def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> float:
@@ -383,8 +408,7 @@ def _inside(w: Array, E: Array, share: Array) -> Array:
     return np.asarray(w + ((missing / (E @ (w * (1 - w)))) @ E) * w * (1 - w))
 
 
-# Exact plans by exchange, plans of chance beside them, and how many poses are enough.  All searches
-# work on a `balanced` problem, whose ridge keeps every plan regular.
+# Exact plans by exchange, and how many poses are enough; all on a `balanced` problem.
 
 # Relative gain in Φ below which an exchange is not made: rounding must not decide.
 LEAST = 1e-9
@@ -445,39 +469,6 @@ def with_poses(V: Array, B: Array) -> Array:
     return np.asarray(V - BV.swapaxes(-1, -2) @ np.linalg.solve(K, BV))
 
 
-def rounded(
-    problem: DesignProblem, weights: Array, rng: np.random.Generator | None = None
-) -> IntArray:
-    """A plan (n,) of the largest relaxed weights (N,) of each group; with `rng` drawn in proportion
-    to them (the largest log w + Gumbel noise)."""
-    score = np.log(np.maximum(weights, 1e-9))
-    score = score if rng is None else score + rng.gumbel(size=len(weights))
-    return np.sort(best_of(score, problem.group, problem.shares))
-
-
-def random_plan(problem: DesignProblem, rng: np.random.Generator) -> IntArray:
-    """A plan (n,), sorted, drawn uniformly from those of the problem's shares."""
-    of_group = (np.flatnonzero(problem.group == label) for label in range(len(problem.shares)))
-    lots = zip(of_group, problem.shares.tolist(), strict=True)
-    return np.sort(np.concatenate([rng.choice(own, share, replace=False) for own, share in lots]))
-
-
-def random_information(problem: DesignProblem, seed: int) -> Array:
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
-    return np.stack([problem.information(random_plan(problem, rng)) for _ in range(DRAWN)])
-
-
-def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
-    """A plan (n,), sorted, of the problem's shares from one of others: of each group those of the
-    plan first, and by price."""
-    _, price = problem.worth(inverse(problem.information(plan)))
-    price[plan] += price.max()
-    return np.sort(best_of(price, problem.group, problem.shares))
-
-
-# The best plan of several starts.
-
-
 def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = None) -> Relaxed:
     """The relaxation, whose weights begin plans and whose tangent prices candidates; of a criterion
     that has none that of D over all parameters, which bounds nothing."""
@@ -495,8 +486,8 @@ def exact_plan(
     other shares, or the rounded relaxation, and roundings drawn at random.  Each is improved by
     exchange with the most promising candidates, the best at last with all."""
     rng, weights = np.random.default_rng(seed), relaxed.weights
-    begins = [rounded(problem, weights) if warm is None else fitted(problem, warm)]
-    begins += [rounded(problem, weights, rng) for _ in range(starts - 1)]
+    begins = [problem.rounded(weights) if warm is None else problem.fitted(warm)]
+    begins += [problem.rounded(weights, rng) for _ in range(starts - 1)]
     plan, _ = min((_descended(problem, plan) for plan in begins), key=lambda found: found[1])
     return exchange(problem, plan)
 
@@ -509,9 +500,6 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
     return exchange(problem, plan, LOOKS)
 
 
-# How many poses: a curve of sizes, and the fewest that the bound allows.
-
-
 def sized_plans(
     problem_of: Callable[[int], DesignProblem], numbers: Iterable[int], seed: int,
     progress: Progress,
@@ -522,12 +510,12 @@ def sized_plans(
     chosen, weights = None, None
     for n in sorted(numbers):
         whole = problem_of(n)
-        check_enough(whole)
-        problem = balanced(whole)
+        whole.check_enough()
+        problem = whole.balanced()
         relaxed = prospects(problem, start=weights)
         chosen, _ = exact_plan(problem, relaxed, warm=chosen, seed=seed)
         value, weights = whole.value(chosen), relaxed.weights
-        check_determined(whole, value)
+        whole.check_determined(value)
         found[n] = value, relaxed.bound if problem.criterion.certifiable else np.nan
         progress(f"{n} poses: {value:.6g}")
     return found
@@ -540,14 +528,5 @@ def first_allowed(
     high + 1 where there is none."""
     return low + bisect_left(
         range(low, high + 1), True,
-        key=lambda n: prospects(balanced(problem_of(n)), 1e-3).bound <= target,
+        key=lambda n: prospects(problem_of(n).balanced(), 1e-3).bound <= target,
     )  # fmt: skip
-
-
-def check_determined(problem: DesignProblem, value: float) -> None:
-    if not np.isfinite(value):
-        raise InsufficientDataError(
-            f"no plan of {problem.n_poses} poses that determines all "
-            f"{len(problem.prior)} parameters was found; plan more poses, other shares, or "
-            "state a prior"
-        )

@@ -18,20 +18,7 @@ from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.moves import Roadmap, Unreachable, travel_times
 from elastocal.planning.plan import Certificate
 from elastocal.planning.polish import Searches, estimate, polish
-from elastocal.planning.relaxation import (
-    RIDGE,
-    DesignProblem,
-    balancing,
-    check_determined,
-    check_enough,
-    exact_plan,
-    exchange,
-    fitted,
-    in_terms,
-    prospects,
-    random_plan,
-    rounded,
-)
+from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, prospects
 from elastocal.planning.setup import FeasiblePool
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -63,70 +50,55 @@ EFFORTS = {
 }
 
 
-@dataclass(frozen=True)
-class Selection:
-    """The plan as indices `chosen` (k,) into the `pool`, which from index `first` on holds what
-    came from polish and the continuum, at its end, once the plan is `whole`, the `pinned` poses
-    that stay; Φ `value`.  `alias`: what a shift of its readings does, once it is in order."""
+class Search:
+    """What a plan is sought with: the setup, whose parameters y = T z are balanced, and the `pool`,
+    which grows by what polish and ascents find, from index `first` on.  Then the plan, as indices
+    `chosen` (k,) into it, its Φ `value` and `certificate`."""
 
-    pool: FeasiblePool
     chosen: IntArray
     value: float
     certificate: Certificate
-    first: int
-    pinned: int = 0
-    alias: Alias | None = None
-
-    @property
-    def polished(self) -> int:
-        own = self.chosen < len(self.pool) - self.pinned
-        return int((own & (self.chosen >= self.first)).sum())
-
-    def whole(self, pinned: FeasiblePool | None) -> Selection:
-        """With the poses that stay, in the order of the levels; of a level these come first."""
-        pool, chosen, n = self.pool, np.sort(self.chosen), 0
-        if pinned is not None:
-            pool, n = FeasiblePool.join([pool, pinned]), len(pinned)
-            chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
-        chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
-        return replace(self, pool=pool, chosen=chosen, pinned=n)
-
-    def exchanged(self, pool: FeasiblePool, chosen: IntArray, value: float) -> Selection:
-        """Another plan (k,) of Φ = `value`, from a pool that may hold more poses: the bounds hold,
-        as a plan's own poses, where they are new, are those that the continuum's is about."""
-        certificate = self.certificate.of(value)
-        return replace(self, pool=pool, chosen=chosen, value=value, certificate=certificate)
-
-
-class Search:
-    """What a plan is sought with: the setup, whose parameters y = T z are balanced, and the `pool`,
-    which grows by what polish and ascents find."""
 
     def __init__(
         self, pool: FeasiblePool, searches: Searches, shares: IntArray, effort: SearchEffort,
         seed: int, checkpoint: Checkpoint, progress: Progress,
     ) -> None:  # fmt: skip
         self.setup, self.searches, self.shares = searches.setup, searches, shares
-        self.effort, self.seed, self.pool = effort, seed, pool
+        self.effort, self.seed, self.pool, self.first = effort, seed, pool, len(pool)
         self.checkpoint, self.progress = checkpoint, progress
         whole = self.setup.problem(pool, shares)
-        check_enough(whole)
-        self.T = balancing(whole)
+        whole.check_enough()
+        self.T = whole.balancing()
         self._of: tuple[FeasiblePool, DesignProblem] | None = None
 
     @property
     def problem(self) -> DesignProblem:
         if self._of is None or self._of[0] is not self.pool:
             whole = self.setup.problem(self.pool, self.shares)
-            self._of = self.pool, in_terms(whole, self.T, RIDGE)
+            self._of = self.pool, whole.balanced(self.T)
         return self._of[1]
 
-    def value(self, chosen: IntArray) -> float:
+    def value_of(self, chosen: IntArray) -> float:
         return self.setup.problem(self.pool, self.shares).value(chosen)
 
-    def select(self) -> Selection:
-        first, effort, seed = len(self.pool), self.effort, self.seed
-        self.progress(f"relaxation over {first} candidates")
+    def whole(self, chosen: IntArray) -> tuple[FeasiblePool, IntArray]:
+        """The pool with the poses that stay at its end, and the plan with them, in the order of the
+        levels; of a level these come first."""
+        pool, chosen = self.pool, np.sort(chosen)
+        if (pinned := self.setup.pinned) is not None:
+            pool = FeasiblePool.join([pool, pinned])
+            chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
+        return pool, chosen[np.argsort(pool.group[chosen], kind="stable")]
+
+    def exchange(self, chosen: IntArray) -> None:
+        """Another plan (k,): the bounds hold, as a plan's own poses, where they are new, are those
+        that the continuum's is about."""
+        self.chosen, self.value = chosen, self.value_of(chosen)
+        self.certificate = self.certificate.of(self.value)
+
+    def select(self) -> Search:
+        effort, seed = self.effort, self.seed
+        self.progress(f"relaxation over {self.first} candidates")
         self.relaxed = prospects(self.problem, CLOSE if effort.starts else FINE)
         best, ends = self._started()
         continuum = []
@@ -145,9 +117,12 @@ class Search:
             best = self._better(best, mixed)
         if effort.rounds:
             best = self.polished(best, "last", fine=True)
-        value, pool = self.value(best), self.pool
-        check_determined(self.setup.problem(pool, self.shares), value)
-        return Selection(pool, best, value, self._certificate(value, ends, continuum), first)
+        self.chosen, self.value = best, self.value_of(best)
+        self.setup.problem(self.pool, self.shares).check_determined(self.value)
+        pool = self.pool
+        self.certificate = self._certificate(self.value, ends, continuum)
+        self.pool = pool  # what the plan was chosen from: not what the bound was sought by
+        return self
 
     def _started(self) -> tuple[IntArray, list[float]]:
         """The best of plans begun from exchange, from roundings and random plans in turn, each
@@ -160,11 +135,9 @@ class Search:
         )["chosen"]
         for k in range(effort.starts):
             if k:
-                begun = (
-                    random_plan(problem, rng) if k % 2 else rounded(problem, relaxed.weights, rng)
-                )
+                begun = problem.random(rng) if k % 2 else problem.rounded(relaxed.weights, rng)
             end = self.polished(begun, f"start{k}")
-            ends.append(self.value(end))
+            ends.append(self.value_of(end))
             self.progress(f"start {k + 1} of {effort.starts}: {min(ends):.6g}")
             if ends[-1] < least * (1 - SAME):
                 best, least = end, ends[-1]
@@ -186,7 +159,7 @@ class Search:
             self.pool = FeasiblePool.join([self.pool, self.setup.pool(q, group, readings)])
 
     def _better(self, best: IntArray, other: IntArray) -> IntArray:
-        return other if self.value(other) < self.value(best) * (1 - SAME) else best
+        return other if self.value_of(other) < self.value_of(best) * (1 - SAME) else best
 
     def _relax(self, gap: float = CLOSE) -> None:
         were = self.relaxed.weights
@@ -201,7 +174,7 @@ class Search:
         return found
 
     def _certificate(self, value: float, ends: list[float], continuum: list[State]) -> Certificate:
-        own = Certificate(len(self.pool), starts=tuple(ends))
+        own = Certificate(len(self.pool), starts=tuple(map(self.setup.criterion.figure, ends)))
         if not self.problem.criterion.certifiable:
             return own
         if len(self.relaxed.weights) < len(self.pool):
@@ -231,14 +204,14 @@ VIA = 200  # candidates through which a blocked move may go
 REPLACED = 10  # times at most
 
 
-def ordered(search: Search, found: Selection) -> tuple[Selection, Execution, list[str]]:
-    """The selection in the order of its levels, its execution, and warnings.  Poses that no chain
-    of free moves reaches are replaced by the best others, unless they are pinned, and all then
-    polished again, as far as moves reach them there."""
-    order, warnings = _Ordering(search, found), []
-    plan, execution = order.reachable()
+def ordered(search: Search) -> tuple[Execution, Alias | None, list[str]]:
+    """The execution of a search's plan, what a shift of its readings does, and warnings.  Poses
+    that no chain of free moves reaches are replaced by the best others, unless they are pinned, and
+    all then polished again, as far as moves reach them there."""
+    order, warnings = _Ordering(search), []
+    execution, alias = order.reachable()
     if order.gone:
-        plan, execution = order.polished(plan, execution)
+        execution, alias = order.polished(execution, alias)
         told = "one better pose was" if order.gone == 1 else f"{order.gone} better poses were"
         warnings.append(
             f"{told} left out: no free move reaches {'it' if order.gone == 1 else 'them'}"
@@ -246,35 +219,35 @@ def ordered(search: Search, found: Selection) -> tuple[Selection, Execution, lis
     if execution.one_sided:
         told = ", ".join(str(k + 1) for k in execution.one_sided)
         warnings.append(f"approached from one side only, as the other is blocked: {told}")
-    return plan, execution, warnings
+    return execution, alias, warnings
 
 
 class _Ordering:
-    """A plan `found` put in order; `gone` poses of it were unreachable so far.  Blocked moves may
-    go through the `hub` (k, n): home, and poses of the pool, which free moves join."""
+    """The plan of a `search` put in order; `gone` poses of it were unreachable so far.  Blocked
+    moves may go through the `hub` (k, n): home, and poses of the pool, which free moves join."""
 
-    def __init__(self, search: Search, found: Selection) -> None:
-        self.search, self.found, self.gone = search, found, 0
+    def __init__(self, search: Search) -> None:
+        self.search, self.gone, pool = search, 0, search.pool
         self.rules = search.searches.checker
         self.loaded = bool(np.any(self.rules.cell.design.loads))
-        self.hub = found.pool.q[:: max(len(found.pool) // VIA, 1)]
+        self.hub = pool.q[:: max(len(pool) // VIA, 1)]
 
-    def reachable(self) -> tuple[Selection, Execution]:
+    def reachable(self) -> tuple[Execution, Alias | None]:
         for k in range(REPLACED):
             try:
-                return self.put(self.found)
+                return self.put(self.search.chosen)
             except Unreachable as error:
                 if k == 0:
-                    self.found = self._unwound()
+                    self._unwind()
                 else:
                     self._replace(error)
-        return self.put(self.found)
+        return self.put(self.search.chosen)
 
-    def put(self, found: Selection) -> tuple[Selection, Execution]:
+    def put(self, chosen: IntArray) -> tuple[Execution, Alias | None]:
         search, rules, setup = self.search, self.rules, self.search.setup
-        plan = found.whole(setup.pinned)
-        q, blocks = plan.pool.q[plan.chosen], plan.pool.blocks[plan.chosen]
-        readings, M = plan.pool.readings[plan.chosen], setup.gathered(blocks)
+        pool, chosen = search.whole(chosen)
+        q, blocks, readings = pool.q[chosen], pool.blocks[chosen], pool.readings[chosen]
+        M = setup.gathered(blocks)
         alias = Alias.of(setup.information, q, blocks, M, setup.target_rows, readings)
         execution = schedule(
             q, at_stops(rules.cell), rules,
@@ -286,25 +259,23 @@ class _Ordering:
             paired=rules.cell.model.observe == "deflection",
             seed=search.seed, progress=search.progress,
         )  # fmt: skip
-        return replace(plan, alias=alias), execution
+        return execution, alias
 
-    def polished(self, plan: Selection, execution: Execution) -> tuple[Selection, Execution]:
-        found, search = self.found, self.search
-        if not search.effort.starts:
-            return plan, execution
-        search.pool = found.pool
-        chosen = search.polished(found.chosen, "replaced")
-        value = search.value(chosen)
-        with suppress(Unreachable):
-            if value < found.value:
-                return self.put(found.exchanged(search.pool, chosen, value))
-        return plan, execution
+    def polished(self, execution: Execution, alias: Alias | None) -> tuple[Execution, Alias | None]:
+        search = self.search
+        if search.effort.starts:
+            chosen = search.polished(search.chosen, "replaced")
+            with suppress(Unreachable):
+                if search.value_of(chosen) < search.value:
+                    execution, alias = self.put(chosen)
+                    search.exchange(chosen)
+        return execution, alias
 
-    def _unwound(self) -> Selection:
+    def _unwind(self) -> None:
         """The same postures, whole turns nearer to home, or to the middle of the joint ranges: to
         the same posture a turn on there is often no way.  Poses whose information would be another
         are left as they are."""
-        rules, pool = self.rules, self.found.pool
+        rules, pool = self.rules, self.search.pool
         chain, home = rules.chain, rules.cell.design.motion.home
         lower, upper = finite_ranges(chain, *joint_limits(rules.cell, chain))
         turn = np.where([kind == "revolute" for kind in chain.kinds], 2 * np.pi, np.inf)
@@ -314,26 +285,24 @@ class _Ordering:
         q = np.where((q >= lower) & (q <= upper), q, pool.q)
         off = np.abs(self.search.setup.information.blocks(q, pool.readings) - pool.blocks)
         same = off.max(axis=(1, 2)) <= ROUNDING * np.abs(pool.blocks).max()
-        pool = replace(pool, q=np.where(same[:, None], q, pool.q))
+        self.search.pool = pool = replace(pool, q=np.where(same[:, None], q, pool.q))
         self.hub = pool.q[:: max(len(pool) // VIA, 1)]
-        return replace(self.found, pool=pool)
 
     def _replace(self, error: Unreachable) -> None:
         """In the place of the poses that cannot be reached, and by exchange in that of others, come
         those of the LIKELY candidates of a level that a free move joins to the hub."""
-        search, found, pool = self.search, self.found, self.found.pool
-        search.pool = pool
-        problem, gone = search.problem, found.whole(search.setup.pinned).chosen[error.poses]
+        search, pool, plan = self.search, self.search.pool, self.search.chosen
+        problem, gone = search.problem, search.whole(plan)[1][error.poses]
         if (gone >= len(pool)).any():
             raise error
         self.gone += len(gone)
         search.progress(f"{self.gone} poses that no free move reaches are replaced by others")
-        kept = np.setdiff1d(found.chosen, gone)
+        kept = np.setdiff1d(plan, gone)
         self.hub = self._joined(np.vstack([self.hub, pool.q[kept]]))
-        _, worth = problem.worth(inverse(problem.information(found.chosen)))
+        _, worth = problem.worth(inverse(problem.information(plan)))
         some = [kept]
         for level, share in enumerate(problem.shares):
-            own = np.setdiff1d(np.flatnonzero(problem.group == level), found.chosen)
+            own = np.setdiff1d(np.flatnonzero(problem.group == level), plan)
             ranked, n = own[np.argsort(-worth[own], kind="stable")], 0
             while len(ranked) and n < share:
                 tried, ranked = ranked[:LIKELY], ranked[LIKELY:]
@@ -343,9 +312,8 @@ class _Ordering:
         if (np.bincount(problem.group[left], minlength=len(problem.shares)) < problem.shares).any():
             raise error
         part = problem.restricted(left)
-        begun = fitted(part, np.searchsorted(left, kept))
-        chosen = left[exchange(part, begun)[0]]
-        self.found = found.exchanged(pool, chosen, search.value(chosen))
+        begun = part.fitted(np.searchsorted(left, kept))
+        search.exchange(left[exchange(part, begun)[0]])
 
     def _joined(self, q: Array) -> Array:
         motion = self.rules.cell.design.motion

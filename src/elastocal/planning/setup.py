@@ -10,9 +10,10 @@ from functools import cached_property
 import numpy as np
 from scipy import optimize
 
-from elastocal.errors import InsufficientDataError, option
+from elastocal.errors import InsufficientDataError
 from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
+from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.criteria import CriterionInputs, ScenarioCriterion, criterion_named, root
@@ -24,28 +25,18 @@ from elastocal.planning.information import (
     Sight,
     estimable,
     evenly,
-    interest_of,
     marker_sigmas,
-    sample_of,
     whitened,
-    why,
 )
 from elastocal.planning.plan import Plan, Scheduled, predicted, remaining_rms
-from elastocal.planning.relaxation import DesignProblem, balancing, in_terms, relax
-from elastocal.planning.test_poses import (
-    TargetPoses,
-    known_rows,
-    on_kept,
-    remaining_bias,
-    unpredictable,
-)
+from elastocal.planning.relaxation import DesignProblem, relax
+from elastocal.planning.test_poses import TargetPoses, known_rows
 from elastocal.simulation import expand_plan, simulate
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# Everything a design knows before it chooses: parameters, criterion, information known before.
-
 WORTH_TELLING = 1e-7  # m
+SAMPLE = 2000  # poses that show what is visible: more would not change a rank
 
 
 @dataclass(frozen=True)
@@ -143,7 +134,9 @@ def set_up(
     x = model.nominal if known.done is None else known.done.x
     free, every = fixed_and_free(model, known.fixed), np.arange(len(model.parameters))
     raw = PoseInformation(model, x, every, np.ones(len(every)), sight)
-    some = q[sample_of(model, q)]
+    held = [joint_index(name) for name in spec.levels]
+    level = np.unique(q[:, held], axis=0, return_inverse=True)[1].ravel()
+    some = q[evenly(level, -(-SAMPLE // (int(level.max()) + 1)))]
     table = raw.rows(some)
     sizes = model.sizes(model.regressor(table, x, None, observe(table, model.observe)).B)
     # Some poses, which weigh as much as those of the plan.
@@ -151,21 +144,16 @@ def set_up(
     found, prior = estimable(model, known, free, B, sizes)
     kept = found.columns
     information = replace(raw, columns=kept, sizes=sizes[kept])
-    warnings = _unseen(model, found, found.structure.invisible.tolist())
     # The unit of [design] combination: that of its parameters, "" where they differ.
     units = {p.unit for p in model.parameters if p.name in spec.combination}
     setup = Setup(
-        information,
-        found,
+        information, found,
         CriterionInputs(
-            spec.criterion, len(kept), interest_of(model, found),
-            combination=_combination(model, found), unit=units.pop() if len(units) == 1 else "",
+            spec.criterion, len(kept), found.interest,
+            combination=found.combination, unit=units.pop() if len(units) == 1 else "",
             n_poses=n_poses, names=information.names, sizes=information.sizes,
         ),
-        None,
-        prior,
-        warnings,
-        information.everything,
+        None, prior, found.unseen, information.everything,
     )  # fmt: skip
     if "test_poses" not in criterion_named(spec.criterion).needs:
         return setup
@@ -178,20 +166,20 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
     share = model.cell.design.elsewhere or 0.0
     both = targets if region is None else targets.with_others(region, share)
     x = information.x + (at_work.nominal - model.nominal)
-    rows, told = known_rows(model, at_work, both, x, found)
+    rows, told = known_rows(at_work, both, x, found)
     held = [model.names[c] for c in found.structure.kept if c not in found.columns]
-    if held and (bias := remaining_bias(rows, both.weight, found)) >= WORTH_TELLING:
+    if held and (bias := found.remaining_bias(rows, both.weight)) >= WORTH_TELLING:
         told += (
             f"so many poses show less of {listed(held)} than their noise; identification holds "
             f"what it cannot see, and typical deviations of that move the test points by "
             f"{bias * 1e6:.3g} µm rms, which the criterion does not count",
         )
-    inputs = replace(setup.inputs, A=on_kept(model, rows[:T], found), weights=targets.weight)
+    inputs = replace(setup.inputs, A=found.on_kept(rows[:T]), weights=targets.weight)
     beyond = None
     if region is not None:
         # None where no plan could make the position at all of them certain.
         with suppress(InsufficientDataError):
-            beyond = on_kept(model, rows[T:], found), region.weight
+            beyond = found.on_kept(rows[T:]), region.weight
     if share and beyond is None:
         raise InsufficientDataError(
             f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
@@ -200,32 +188,6 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
         )
     warnings = setup.warnings + told
     return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)
-
-
-def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...]:
-    if len(unseen) < 2:
-        return tuple(why(model, found, i) for i in unseen)
-    names, loads = [model.names[i] for i in unseen], model.cell.design.loads
-    loaded, remedy = loads is not None and loads.any(), "state a load ([design] loads_N)"
-    remedy = "change the load's direction or the limits" if loaded else remedy
-    return (
-        f"no feasible pose shows {listed(names)}: they move no marker in any of them; {remedy}, or "
-        f"leave them out ({option('fixed', names[0])})",
-    )
-
-
-def _combination(model: Model, found: Estimable) -> Array | None:
-    wanted = model.cell.design.combination
-    if not wanted:
-        return None
-    a = np.array([wanted.get(name, 0.0) for name in model.names])
-    lost = unpredictable(a[None, None], found)
-    if lost is not None:
-        raise InsufficientDataError(
-            f"{model.cell.path or model.cell.name}: [design] combination depends on "
-            f"{model.names[lost[1]]}; {why(model, found, lost[1])}"
-        )
-    return np.asarray((a * found.sizes)[found.columns])
 
 
 # The weight of what lies elsewhere, from the price that the test poses may pay for it.
@@ -252,14 +214,14 @@ def share_within(
     each = max(SOME // len(shares), 20 * int(shares.max()))
     pool = pool.take(evenly(pool.group, each))
     problem = replace(setup, share=0.0).problem(pool, shares)
-    own, T = problem.criterion, balancing(problem)
-    alone = relax(in_terms(problem, T), LOOSE)
+    own, T = problem.criterion, problem.balancing()
+    alone = relax(problem.in_terms(T), LOOSE)
     weights, price = alone.weights, ((1 + cap) ** 2 - 1) * alone.value
 
     def over(u: float) -> float:
         nonlocal weights
         other = replace(problem, criterion=replace(setup, share=u / (1 + u)).criterion)
-        weights = relax(in_terms(other, T), LOOSE, weights).weights
+        weights = relax(other.in_terms(T), LOOSE, weights).weights
         paid = (float(own.of_information(problem.at(weights))) - alone.value) / price
         return 0.0 if 1 - CLOSE <= paid <= 1 else paid - 1 + CLOSE / 2
 
@@ -309,11 +271,11 @@ def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, kno
     B = B[:, kept] * sizes[kept]
     M = B.T @ B + prior
     own = np.isin([model.names[c] for c in kept], without.names)
-    shown = predicted(model, found, M, len(B))
+    shown = predicted(found, M, len(B))
     names = dict.fromkeys(p.effect for p in model.parameters if p.name not in without.names)
     errors: tuple[float | None, float | None] = (None, None)
     with suppress(InsufficientDataError):
-        A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
+        A = found.on_kept(known_rows(model, targets, x, found)[0])
         R = root(A, targets.weight)
         errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
     return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))

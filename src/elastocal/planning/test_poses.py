@@ -15,7 +15,6 @@ from elastocal.cell.work_cell import Cell
 from elastocal.config import place
 from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.identification.prediction import NewPoses
-from elastocal.identification.solve import Reduction
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
@@ -26,7 +25,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import sobol, told
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import Estimable, why
+from elastocal.planning.information import Estimable
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
 from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
@@ -160,9 +159,8 @@ class TargetPoses(NewPoses):
 
     def with_others(self, others: TargetPoses, share: float) -> TargetPoses:
         """Both, of which `others` have `share` of the weight."""
-        both = TargetPoses.together([self, others], self.source)
         weight = np.concatenate([(1 - share) * self.weight, share * others.weight])
-        return replace(both, weight=weight)
+        return replace(TargetPoses.together([self, others], self.source), weight=weight)
 
 
 def test_poses(
@@ -374,9 +372,6 @@ class _Sources:
 
 # Where position must be right: A_t, how the parameters move the tool at the test poses.
 
-# Share of a test point's motion that may lie outside what the poses show: rounding, not physics.
-OUTSIDE = 1e-6
-
 
 def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool = False) -> Array:
     """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
@@ -469,7 +464,7 @@ def _with_points(model: Model, points: Array) -> Model:
 
 
 def known_rows(
-    model: Model, at_work: Model, targets: TargetPoses, x: Array, found: Estimable
+    at_work: Model, targets: TargetPoses, x: Array, found: Estimable
 ) -> tuple[Array, tuple[str, ...]]:
     """The rows of `prediction_rows` of the arm `at_work`, and what to say of them: where the
     markers' places are fitted and the readings cannot tell where the flange is, points that are
@@ -488,48 +483,10 @@ def known_rows(
             )
     rows = prediction_rows(at_work, targets, x)
     stated = rows[targets.stated]
-    if not len(stated) or not fitted_markers(model) or unpredictable(stated, found) is None:
+    if not len(stated) or not fitted_markers(found.model) or found.unpredictable(stated) is None:
         return rows, ()
     fixed = (
         "point_m of the test poses is taken to be fixed to the markers as they stand in the cell: "
         "their places are fitted, and the readings cannot tell where the flange is"
     )
     return prediction_rows(at_work, targets, x, carried=True), (fixed,)
-
-
-def on_kept(model: Model, A: Array, found: Estimable) -> Array:
-    """A (T, r, kept) on the kept parameters, scaled by their sizes.  A test point is predictable
-    where its motion by the dropped parameters is that by the kept ones they combine with,
-    A_D = A_K · mixing; where it is not, no number of poses would make that position certain."""
-    lost = unpredictable(A, found)
-    if lost is not None:
-        pose, index = lost
-        raise InsufficientDataError(
-            f"{model.cell.path or model.cell.name}: the position at test pose {pose + 1} depends "
-            f"on {model.names[index]}; {why(model, found, index)}; or ask for parameters instead "
-            'of test poses (criterion = "D")'
-        )
-    kept = found.reduction.kept
-    return np.asarray(A[..., kept] * found.sizes[kept])
-
-
-def unpredictable(A: Array, found: Estimable) -> tuple[int, int] | None:
-    """A row of A (T, r, parameters) and a parameter by which no plan can predict it, if any."""
-    r, sizes = found.structure, found.sizes
-    off = np.abs(_unexplained(A, r, sizes)).max(axis=1)
-    if off.max(initial=0.0) <= OUTSIDE * float(np.abs(A * sizes).max()):
-        return None
-    dropped = int(off.max(axis=0).argmax())
-    return int(off[:, dropped].argmax()), int(r.dropped[dropped])
-
-
-def remaining_bias(A: Array, weight: Array, found: Estimable) -> float:
-    """Rms in m of what typical deviations of held parameters, which the poses show below their
-    noise, move the test points by, A (T, r, parameters) with `weight` (T,)."""
-    off = _unexplained(A, found.reduction, found.sizes)
-    return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
-
-
-def _unexplained(A: Array, r: Reduction, sizes: Array) -> Array:
-    """(T, r, dropped): A_D − A_K · mixing, times the sizes."""
-    return np.asarray((A[..., r.dropped] - A[..., r.kept] @ r.mixing) * sizes[r.dropped])

@@ -53,7 +53,7 @@ def test_no_pair_changes_its_distance_by_more_than_the_bound(seed, tmp_path):
         load=HangingLoad(box("load", (0.2, 0.2, 0.2), (0, 0, 0)), 0.3),
     )
     rules = Feasibility(cell(workspace, Tool(np.array([0.1, 0, 0.2]))), chain)
-    bound = MotionBound(rules.kinematics, rules.bodies, rules.pairs)
+    bound = MotionBound(rules.kinematics, rules.pairs)
     tightest = 0.0
     for _ in range(15):
         middle = rng.uniform(-1, 1, chain.n_joints)

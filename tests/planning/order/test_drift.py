@@ -1,6 +1,7 @@
 """The order keeps a drift apart from what the plan is for, within time and changes of load."""
 
 from itertools import groupby
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from elastocal.identification.noise_structure import course_waves
 from elastocal.planning import execution as drift_module
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.execution import DRIFT, Alias, schedule, turns
-from elastocal.planning.plan import plan_table
+from elastocal.planning.plan import Plan
 from elastocal.planning.test_poses import prediction_rows
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
@@ -36,6 +37,20 @@ def brief_annealing(monkeypatch):
 def ordered(alias=PAIRS, **motion):
     motion = {"dwell": 30.0, "load_change": 60.0} | motion
     return schedule(Q, Motion(**motion), Discs(), loads=BOTH, alias=alias)
+
+
+NOTES = [f"{what}{nth}" for what in ("order", "load") for nth in ("", "_2", "_3")]
+
+
+def rows_of(execution, names, stated=None):
+    """As of a plan of two revolute joints without markers."""
+    cell = SimpleNamespace(tool=SimpleNamespace(markers={}))
+    model = SimpleNamespace(chain=SimpleNamespace(kinds=("revolute",) * 2), cell=cell)
+    plan = SimpleNamespace(
+        execution=execution, configurations=names, model=model, forces=BOTH, stated_forces=stated,
+        group=np.zeros(len(names), dtype=int), seen=None, crossed=True,
+    )  # fmt: skip
+    return Plan.rows.fget(plan)
 
 
 def blocks(execution):
@@ -74,8 +89,7 @@ def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
     shortest = ordered(alias=None)
     assert execution.travel <= shortest.travel + 0.05 * shortest.total
     # The file counts stops as their list does, whichever load comes first at a pose.
-    names, level = tuple(map(str, range(1, 13))), np.zeros(12, dtype=int)
-    _, more = plan_table(execution, names, level, ("revolute", "revolute"), carried=BOTH)
+    _, more = rows_of(execution, tuple(map(str, range(1, 13))))
     for pose in range(12):
         own = [k for k, stop in enumerate(execution.stops, start=1) if stop.pose == pose]
         assert [more["order"][pose], more["note_order_2"][pose]] == [str(k) for k in own]
@@ -92,17 +106,16 @@ def test_where_there_is_time_poses_are_read_before_and_after_their_load():
     assert twice.drift.bias < 0.2 * once.drift.bias
     shortest = ordered(alias=None)
     assert once.total < twice.total < 1.5 * shortest.total
-    names, level = tuple(map(str, range(1, 13))), np.zeros(12, dtype=int)
-    kinds = ("revolute", "revolute")
-    table, more = plan_table(twice, names, level, kinds)
+    names = tuple(map(str, range(1, 13)))
+    table, more = rows_of(twice, names)
     assert table.configuration_labels == names and len(table) == 12
-    assert set(more) == {"level", "order", "note_order_2", "note_order_3"}
-    places = np.array([[int(v) for v in more[k]] for k in more if k != "level"]).T
+    assert set(more) == {"level", *(f"note_{k}" for k in NOTES)} - {"note_order"} | {"order"}
+    places = np.array([[int(v) for v in more[k]] for k in more if "order" in k]).T
     assert sorted(places.ravel()) == list(range(1, 37)) and (places[:, 0] < places[:, 2]).all()
     loaded = [k + 1 for k, stop in enumerate(twice.stops) if stop.load]
     assert sorted(places[:, 1]) == loaded
     # With forces stated, the second part stands in the row of the first.
-    assert len(plan_table(twice, names, level, kinds, BOTH)[0]) == 24
+    assert len(rows_of(twice, names, BOTH)[0]) == 24
 
 
 def test_the_alias_is_what_least_squares_make_of_shifted_readings():

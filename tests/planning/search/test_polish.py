@@ -20,14 +20,7 @@ from elastocal.planning.criteria import CRITERIA, CriterionInputs, ScenarioCrite
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.polish import JointSearch, Searches, estimate, polish
-from elastocal.planning.relaxation import (
-    RIDGE,
-    DesignProblem,
-    balancing,
-    in_terms,
-    random_plan,
-    relax,
-)
+from elastocal.planning.relaxation import DesignProblem, relax
 from elastocal.planning.setup import FeasiblePool, Setup
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
@@ -141,9 +134,9 @@ def posed(name: str, criterion: str = "test_pose", n: int = 5, seed: int = 0) ->
     groups = int(pool.group.max()) + 1
     shares = np.array([n // groups + (g < n % groups) for g in range(groups)])
     whole = arm.problem(pool, shares, arm.criterion(criterion))
-    T = balancing(whole)
-    problem = in_terms(whole, T, RIDGE)
-    chosen = random_plan(problem, np.random.default_rng(seed))
+    T = whole.balancing()
+    problem = whole.balanced(T)
+    chosen = problem.random(np.random.default_rng(seed))
     return arm, pool, whole, problem, T, chosen
 
 
@@ -196,7 +189,7 @@ def test_the_bound_on_the_continuum_is_below_that_on_the_pool() -> None:
     assert (d > problem.prices(relaxed.tangent.G).max()).all()
     # Their tangent bounds plans of poses anywhere, as those of a polish.
     for seed in range(2):
-        plan = random_plan(problem, np.random.default_rng(seed))
+        plan = problem.random(np.random.default_rng(seed))
         q = pool.q[plan]
         end = polish(problem, arm.searches, T, arm.pool(q, pool.group[plan]))
         assert value_of(arm, whole, end) >= found["bound"] * (1 - 1e-3)
