@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -14,34 +13,13 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import (
-    UNSIZED_SCALES,
-    Hypothesis,
-    RegressorDirection,
-    cell_with,
-    recorded,
-)
-from elastocal.diagnosis.model_set import Item, packed_columns
+from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, project
-from elastocal.diagnosis.unknown import Generic, wrenches
-from elastocal.identification.start import as_placed
+from elastocal.diagnosis.unknown import Generic
 from elastocal.measurements import Measurements
-from elastocal.model.effects.base import (
-    DrivenEffect,
-    Effect,
-    JointMotion,
-    Stage,
-    index,
-    turning_joints,
-)
+from elastocal.model.effects.base import DrivenEffect, Effect, Stage, index, turning_joints
 from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
-from elastocal.model.effects.nameless import (
-    ApproachResponse,
-    LoadResponse,
-    ResidualStep,
-    TorqueResponse,
-)
 from elastocal.model.effects.smooth import JointCurve, ResidualField, Waves
 from elastocal.units import Array
 
@@ -126,7 +104,7 @@ def drifts(dataset: DiagnosisData) -> Iterator[Component]:
     effect, model, time = ResidualField(), dataset.base.model, dataset.table.time
     places = effect.places(model.chain, model.cell)
     if recorded(dataset.table, "time") and time is not None and np.ptp(time) > 0:
-        yield from (_field_component(dataset, effect, w, "time") for w in places if w == "base")
+        yield from (field_component(dataset, effect, w, "time") for w in places if w == "base")
 
 
 def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Component | None:
@@ -143,7 +121,7 @@ def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Componen
     if shortest / SHORTER < resolved or share < LEAST_SHARE:
         return None
     assert isinstance(c.effect, ResidualField)
-    return _field_component(dataset, c.effect, c.where, "time", share)
+    return field_component(dataset, c.effect, c.where, "time", share)
 
 
 # What is looked for beside those: families of lines of a joint's error, and smooth fields.
@@ -383,132 +361,6 @@ def beside(
     return Grams(dataset, data, project(data, noise))
 
 
-def without_a_name(dataset: DiagnosisData, found: FittedSum, most: int) -> list[Component]:
-    """What corrects the arm beside the sum and names no cause, the most conspicuous first: smooth
-    fields, steps in time, and what a joint makes of its torque or last motion."""
-    sums = beside(dataset, found, found.noise)
-    tried = (_fields, _steps, _responses, _yielding)
-    every = (one for search in tried for one in search(dataset, found, sums))
-    # A step and a smooth course of one place imitate each other: the better, then the other.
-    once = {(where, of): (e, maker) for e, where, of, maker in sorted(every, key=lambda c: c[0])}
-    best = sorted(once.values(), key=lambda pair: -pair[0])[:most]
-    return [component() for evidence, component in best if evidence > CONSPICUOUS]
-
-
-CONSPICUOUS = 3.0  # nats of evidence, its size integrated out
-# Nats, place, what it follows, and the component.
-Conspicuous = Iterator[tuple[float, str, str, Callable[[], Component]]]
-
-
-def _fields(dataset: DiagnosisData, found: FittedSum, sums: Grams) -> Conspicuous:
-    effect, model = ResidualField(), dataset.base.model
-    chain, cell = model.chain, model.cell
-    follow = [w for w in turning_joints(chain) if np.ptp(dataset.table.q[:, index(w)]) > MOVED]
-    if recorded(dataset.table, "time"):
-        follow.append("time")
-    known = {(c.where, c.follows) for c in found.components}
-    for where in effect.places(chain, cell):
-        if where.startswith("marker") and "time" not in follow:
-            continue
-        # Of one place at a time: what a large table's entries sum up to would fill the memory.
-        grams = Grams(dataset, sums.data, sums.at)
-        for name in follow:
-            own = where == name and where.startswith("joint")
-            if own or (where, name) in known or (where.startswith("marker") and name != "time"):
-                continue
-            coarse = _field(dataset, effect, where, name, FIELD_LENGTHS[0] * 2)
-            evidence = float(grams.of(coarse).evidence()[0])
-            yield evidence, where, name, partial(_field_component, dataset, effect, where, name)
-
-
-def _steps(dataset: DiagnosisData, found: FittedSum, sums: Grams) -> Conspicuous:
-    """At each place the step at the moment at which it explains most."""
-    effect, moments, time = ResidualStep(), dataset.moments, dataset.visit_table.time
-    if time is None or not len(moments):
-        return
-    later = (time[:, None] >= moments).reshape(*dataset.present.shape, -1)
-    later &= dataset.present[:, :, None]
-    for where in _free_places(dataset, found, effect):
-        entry, moved = effect.entry_at(where), np.eye(effect.entry_at(where).size) * MOTION
-        key = (entry.name, (where,))
-        entries = Grams(dataset, sums.data, sums.at).entry(key)
-        pieces = entries.pieces(len(moments), entry.size)
-        D = (later[:, :, None, some, None] * moved[:, None, :] for some in pieces)
-        evidence = np.concatenate([entries.driven(d).evidence(UNSIZED_SCALES) for d in D])
-        k, search = int(np.argmax(evidence)), math.log(len(moments))
-        settings = {effect.constants[0].key: float(moments[k])}
-        block = Generic("", "", where, "geometry", key, later[:, :, k, None, None] * moved)
-        maker = partial(_as_component, dataset, effect, block, settings, search)
-        yield float(evidence[k]) - search, where, "time", maker
-
-
-def _responses(dataset: DiagnosisData, found: FittedSum, sums: Grams) -> Conspicuous:
-    """Of each joint, by its torque and by its last motion."""
-    table, torque = dataset.table, dataset.columns.torques()
-    for effect in (TorqueResponse(), ApproachResponse()):
-        if not all(recorded(table, need) for need in effect.needed(dataset.base.model.cell)):
-            continue
-        side = table.approach if effect.needs else np.ones_like(table.q)
-        assert side is not None  # recorded
-        for where in _free_places(dataset, found, effect):
-            tau, own = torque[:, index(where)], side[:, index(where)]
-            largest = float(np.abs(tau).max(initial=0.0)) or 1.0
-            F = effect.at_rows(tau / largest, own)
-            if np.ptp(F, axis=0).max() > 0:
-                D = dataset.places.gather(F[dataset.lead])[:, :, None, :] * MOTION
-                block = Generic("", "", where, effect.stage, (JointMotion.name, (where,)), D)
-                settings = {effect.constants[1].key: largest}
-                yield _evidence(dataset, sums, effect, block, settings)
-
-
-def _yielding(dataset: DiagnosisData, found: FittedSum, sums: Grams) -> Conspicuous:
-    """Base and links by force and moment of the load, about the axes of the springs there."""
-    effect, model = LoadResponse(), dataset.base.model
-    free = _free_places(dataset, found, effect)
-    turned = as_placed(model, dataset.base.x).model.nominal.base_rotation
-    for where, key, *wrench in wrenches(dataset):
-        if where in free:
-            R = np.eye(3) if where != "base" or turned is None else turned
-            largest = [float(np.abs(part).max()) or 1.0 for part in wrench]
-            D = np.zeros((*wrench[0].shape[:2], 6, 6))
-            for own, part, most in zip((slice(3), slice(3, 6)), wrench, largest, strict=True):
-                D[:, :, own, own] = R * (part @ R)[:, :, None, :] / most * MOTION
-            settings = zip((s.key for s in effect.constants[1:]), largest, strict=True)
-            block = Generic("", "", where, effect.stage, key, D)
-            yield _evidence(dataset, sums, effect, block, dict(settings))
-
-
-def _free_places(dataset: DiagnosisData, found: FittedSum, effect: Effect) -> tuple[str, ...]:
-    """Where neither the model nor the sum has the effect."""
-    model = dataset.base.model
-    known = {(p.effect, p.where) for p in model.parameters}
-    known |= {(c.effect.name, c.where) for c in found.components}
-    places = effect.places(model.chain, model.cell)
-    return tuple(where for where in places if (effect.name, where) not in known)
-
-
-def _evidence(
-    dataset: DiagnosisData, sums: Grams, effect: Effect, block: Generic, settings: dict[str, float]
-) -> tuple[float, str, str, Callable[[], Component]]:
-    # Of one place at a time, as fields are.
-    grams = Grams(dataset, sums.data, sums.at)
-    evidence = float(grams.of(block).evidence(UNSIZED_SCALES)[0])
-    maker = partial(_as_component, dataset, effect, block, settings)
-    return evidence, block.where, effect.name, maker
-
-
-def _as_component(
-    dataset: DiagnosisData, effect: Effect, block: Generic, settings: dict[str, float],
-    search: float = 0.0,
-) -> Component:  # fmt: skip
-    model = dataset.base.model
-    return Component(
-        family_of(effect, model.cell), effect, block.where,
-        packed_columns(dataset, Item(block, np.zeros(0), 0.0)), settings=tuple(settings.items()),
-        search=search, fellows=len(effect.places(model.chain, model.cell)),
-    )  # fmt: skip
-
-
 def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[str, float]:
     x = _followed(dataset.table, name)
     keys = ("size", "length", "low", "high")
@@ -516,7 +368,7 @@ def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[st
     return {f"field_{name}_{key}": value for key, value in zip(keys, values, strict=True)}
 
 
-def _field(
+def field_block(
     dataset: DiagnosisData, effect: ResidualField, where: str, name: str, length: float
 ) -> Generic:
     """A field as a block, for a search: its direction at every visit, the same waves in each
@@ -539,7 +391,7 @@ def _followed(table: Measurements, name: str) -> Array:
     return x
 
 
-def _field_component(
+def field_component(
     dataset: DiagnosisData, effect: ResidualField, where: str, name: str,
     shortest: float = FIELD_LENGTHS[0],
 ) -> Component:  # fmt: skip

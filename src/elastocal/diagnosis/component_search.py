@@ -22,7 +22,6 @@ from elastocal.diagnosis.component_families import (
     sharpened,
     shorter,
     with_scatter,
-    without_a_name,
 )
 from elastocal.diagnosis.components import (
     SOME,
@@ -36,6 +35,7 @@ from elastocal.diagnosis.components import (
     posed,
     presence_cost,
 )
+from elastocal.diagnosis.corrections import without_a_name
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
