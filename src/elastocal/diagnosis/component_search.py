@@ -117,7 +117,11 @@ def search_components(
     found = again
     for _ in range(0 if ResidualField.name in without else FIELD_SEARCHES):
         progress("what has no name beside the components")
-        wider = _wider(found, without_a_name(full, found, MOST_FIELDS))
+        more = _without_imitators(found, without_a_name(full, found, MOST_FIELDS))
+        # Where they do not pay together, one of them may.
+        some = [more, *([c] for c in more[:TRIED] if few and len(more) > 1)]
+        fits = (_wider(found, chosen) for chosen in some)
+        wider = next((fit for fit in fits if fit is not found), found)
         if wider is found:
             break
         found = wider
@@ -350,6 +354,17 @@ def _wider(found: FittedSum, more: Sequence[Component]) -> FittedSum:
     """The sum with these as well, or what is left of them; as it is where that is no better."""
     wider = exchanged(found, [], more) if more else found
     return wider if wider.score > found.score + GAINED else found
+
+
+def _without_imitators(found: FittedSum, more: Sequence[Component]) -> list[Component]:
+    """The likeliest first; of a step and a smooth course in time at one place, which imitate each
+    other, the likelier alone."""
+    likeliest: dict[tuple[str, ...], Component] = {}
+    each = zip(evidence_beside(found, more), more, strict=True)
+    for _, c in sorted(each, key=lambda pair: -pair[0]):
+        of = (c.where, c.family, "" if c.family == "time" else c.follows)
+        likeliest.setdefault(of, c)
+    return list(likeliest.values())
 
 
 def _refitted(found: FittedSum) -> FittedSum:

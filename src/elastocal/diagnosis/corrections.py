@@ -56,7 +56,6 @@ def without_a_name(dataset: DiagnosisData, found: FittedSum, most: int) -> list[
         if where in loads:
             every += _yielding(found, grams, where, loads[where])
     shown = sorted((c for c in every if c[0] > CONSPICUOUS), key=lambda c: -c[0])
-    # A step and a smooth course of one place imitate each other: both come in, and one stays.
     chosen = list(dict.fromkeys((where, of) for _, where, of, _ in shown))[:most]
     return [component() for _, where, of, component in shown if (where, of) in chosen]
 
