@@ -55,6 +55,7 @@ from elastocal.diagnosis.noise_floor import (
     posterior,
     project,
 )
+from elastocal.diagnosis.stated_floor import most_scatter
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index, turning_joints
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
@@ -117,11 +118,7 @@ def search_components(
     found = again
     for _ in range(0 if ResidualField.name in without else FIELD_SEARCHES):
         progress("what has no name beside the components")
-        more = _without_imitators(found, without_a_name(full, found, MOST_FIELDS))
-        # Where they do not pay together, one of them may.
-        some = [more, *([c] for c in more[:TRIED] if few and len(more) > 1)]
-        fits = (_wider(found, chosen) for chosen in some)
-        wider = next((fit for fit in fits if fit is not found), found)
+        wider = _with_corrections(full, found, few)
         if wider is found:
             break
         found = wider
@@ -354,6 +351,31 @@ def _wider(found: FittedSum, more: Sequence[Component]) -> FittedSum:
     """The sum with these as well, or what is left of them; as it is where that is no better."""
     wider = exchanged(found, [], more) if more else found
     return wider if wider.score > found.score + GAINED else found
+
+
+def _with_corrections(dataset: DiagnosisData, found: FittedSum, few: bool) -> FittedSum:
+    """The sum with what has no name, all that stands out or, where it does not pay together, one of
+    the likeliest; where none does, with what stands out if joints scatter no more than usual."""
+    for begun in (found, *_quieter(found)):
+        more = _without_imitators(begun, without_a_name(dataset, begun, MOST_FIELDS))
+        some = [more, *([c] for c in more[:TRIED] if few and len(more) > 1)]
+        for chosen in filter(None, some):
+            fitted = exchanged(begun, [], chosen)
+            if fitted.score > found.score + GAINED:
+                return fitted
+    return found
+
+
+def _quieter(found: FittedSum) -> list[FittedSum]:
+    """The sum where no joint scatters far more than the others let expect, if one does: what is
+    missing there has been taken for its scatter."""
+    noise, usual = found.noise, NoiseValues.usual(len(found.noise.joint))
+    loud = noise.joint * np.hypot(1, noise.shared) > most_scatter(noise.joint)
+    joint, shared = (
+        np.where(loud, np.minimum(now, quiet), now)
+        for now, quiet in ((noise.joint, usual.joint), (noise.shared, usual.shared))
+    )
+    return [replace(found, noise=replace(noise, joint=joint, shared=shared))] if loud.any() else []
 
 
 def _without_imitators(found: FittedSum, more: Sequence[Component]) -> list[Component]:
