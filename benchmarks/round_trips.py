@@ -23,14 +23,13 @@ from scipy.spatial.transform import Rotation
 
 import elastocal as ec
 from elastocal.errors import ElastocalError
-from elastocal.export.export import export
+from elastocal.export.export import Wish, export
 from elastocal.export.mjcf_file import MujocoRest
 from elastocal.export.rigid_files import urdf_flanges
 from elastocal.measurements import Measurements
 from elastocal.model.chain import extent, finite_ranges, joint_limits
 from elastocal.model.dh import read_dh
 from elastocal.model.rigid import nominal_flanges
-from elastocal.saving import wish_of
 from elastocal.units import Array, rotation_from_rpy
 
 PACKAGES = ("example-robot-data", "rtb-data")
@@ -98,7 +97,7 @@ def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
     for form, (ending, read) in FORMATS.items():
         # A rigid file says nothing of the load, which its stated loss is without.
         acting = force if form == "mjcf" else np.zeros(3)
-        wish = wish_of(folder / f"out{ending}", form, acting, True, form == "urdf",
+        wish = Wish(folder / f"out{ending}", form, acting, True, form == "urdf",
                        None, None, 500, seed)  # fmt: skip
         done = export(fit.arm, wish)
         rows = left if form == "mjcf" else unloaded(left)
@@ -163,7 +162,7 @@ class Back:
     def parameters(self) -> tuple[dict[str, Array], Array]:
         """Markers (3,) in the flange frame and T_tracker_base (4, 4) of the exported parameters."""
         out = self.folder / "out.yaml"
-        wish = wish_of(out, "yaml", np.zeros(3), True, False, None, None, 2, 0)
+        wish = Wish(out, "yaml", np.zeros(3), True, False, None, None, 2, 0)
         geometry = yaml.safe_load(export(self.fit.arm, wish).text)["geometry"]
         base, T = geometry["tracker_to_base"], np.eye(4)
         T[:3, :3], T[:3, 3] = rotation_from_rpy(base["rpy_rad"]), base["xyz_m"]

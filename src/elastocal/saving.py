@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
-from elastocal.model.arm import given_force
-from elastocal.model.calibrated import CalibratedArm, Conditions, read_calibrated
+from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.manipulator import Model
 from elastocal.tables import PARQUET, csv_text
 from elastocal.text import json_text
@@ -29,12 +27,10 @@ if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
 
 LARGEST_SUMMARY = 200_000_000  # bytes
-MOST_POSES = 1_000_000
 
 # One verb's result should not load another verb: each function imports what it needs.
 
@@ -140,61 +136,17 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
 
 
 def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
-    """The calibrated arm for other programs; `how` as for `wish_of`.
+    """The calibrated arm for other programs; `how` as for `Wish`.
 
     Raises InputError where the format cannot be written for this robot, InsufficientDataError
     where no random pose has a static equilibrium under the load, and ElastocalError where the
     text, read back, is another arm than the model.
     """
-    from elastocal.export.export import export, write
+    from elastocal.export.export import Wish, export, write
 
     correction = how.pop("joint_correction", None)
-    wish = wish_of(path, **how, correct_joints=correction is not None)
+    wish = Wish(path, **how, correct_joints=correction is not None)
     write(export(arm, wish), path, correction)
-
-
-@checked_arguments
-def wish_of(
-    path: Path,
-    format: str | None = None,
-    load: ArrayLike | None = None,
-    frames: bool = True,
-    base_frame: bool = False,
-    temperature_c: float | None = None,
-    time_s: float | None = None,
-    poses: int = 500,
-    seed: int = 0,
-    correct_joints: bool = False,
-) -> Wish:
-    """How to export an arm to `path`, checked; the others are the options of `elastocal export`:
-    no format goes by the file's ending, costs are stated under `load` (3,) N at random `poses`.
-    """
-    from elastocal.export.export import Wish, format_of
-
-    chosen = format_of(path, format)
-    for name, value, low, high in (
-        ("temperature_c", temperature_c, -273.15, 2000.0), ("time_s", time_s, -1e9, 1e9),
-    ):  # fmt: skip
-        if value is not None and not low <= value <= high:
-            raise InputError(
-                f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
-            )
-    force = given_force(load)
-    require(
-        2 <= poses <= MOST_POSES,
-        f"{option('poses')} takes a whole number from 2 to {MOST_POSES:,}; found {poses}",
-    )
-    return Wish(
-        format=chosen,
-        frames=frames,
-        base_frame=base_frame,
-        conditions=Conditions(np.zeros(3) if force is None else force, time_s, temperature_c),
-        poses=poses,
-        seed=seed,
-        load_stated=force is not None,
-        correct_joints=correct_joints,
-        folder=path.parent,
-    )
 
 
 def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:

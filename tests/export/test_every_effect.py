@@ -109,9 +109,9 @@ def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Pat
     model = 'thermal_driver = "temperature"'
     written = write_result(tmp_path, ROBOT, ["thermal_expansion:all"], model, value=lambda p: 12e-6)
     arm = read_calibrated(*written)
-    (entry,) = export(arm, Wish("urdf", poses=20)).cost.effects
+    (entry,) = export(arm, Wish(tmp_path / "a.urdf", poses=20)).cost.effects
     assert entry.difference is None and "`temperature_c`" in entry.note
-    warm = export(arm, Wish("urdf", conditions=Conditions(temperature=30.0), poses=20))
+    warm = export(arm, Wish(tmp_path / "a.urdf", temperature_c=30.0, poses=20))
     assert not warm.cost.effects and warm.cost.total.flange_max == 0.0
     (tmp_path / "warm.urdf").write_text(warm.text)
     forearm = read_urdf(tmp_path / "warm.urdf").joints[2].placement

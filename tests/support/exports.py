@@ -80,8 +80,7 @@ def exported(
     **added: bool,
 ) -> tuple[CalibratedArm, Exported]:
     calibrated = read_calibrated(cell, result)
-    conditions = Conditions(np.zeros(3) if force is None else force)
-    wish = Wish(format, conditions=conditions, poses=poses, **added)
+    wish = Wish(cell.parent / "out", format, force, poses=poses, **added)
     return calibrated, export(calibrated, wish)
 
 

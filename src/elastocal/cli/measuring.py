@@ -455,7 +455,7 @@ def import_(
     from elastocal.files import atomic_write
     from elastocal.importing.assemble import import_files
     from elastocal.importing.exports import likely_presets
-    from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping, with_units
+    from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping
     from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
 
@@ -476,7 +476,7 @@ def import_(
         raise InputError(f"import needs --map mapping.toml, or --preset: {listed(PRESETS)}{hint}")
     run.writes((output, ".csv"))
     run.reads(*paths, mapping, cell)
-    read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
+    read = read_mapping(mapping, preset or (), length_unit, angle_unit)
     known = None if cell is None else read_cell(cell)
     run.reads(cell=known)
     found = import_files(paths, read, known, str(output or "the table"))

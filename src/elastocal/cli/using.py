@@ -474,15 +474,14 @@ def export(
         time_s: Time in s, as in the data, to export at.
         poses: Random poses to find costs at.
     """
+    from elastocal.export.export import Wish, write
     from elastocal.export.export import export as exported
-    from elastocal.export.export import write
     from elastocal.model.calibrated import read_calibrated
     from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import export_blocks
-    from elastocal.saving import wish_of
 
     run.writes((output, ""), (joint_correction, ".csv"))
-    wish = wish_of(
+    wish = Wish(
         output, format, load, frames, base_frame, temperature_c, time_s, poses, seed,
         joint_correction is not None,
     )  # fmt: skip

@@ -699,16 +699,21 @@ def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
         blocks.append((heads, result.turn * 1e6, ".4g"))
     sure = np.column_stack([result.uncertainty.std, result.uncertainty.within]) * 1e6
     blocks.append((["std_um", "within95_um"], sure, ".4g"))
-    header = ["configuration", *(h for heads, _, _ in blocks for h in heads), "status"]
+    labels = [table.configuration_labels[code] for code in table.configuration]
+    return table_csv(blocks, result.status, configuration=labels)
+
+
+def table_csv(
+    blocks: Sequence[tuple[list[str], Array, str]], status: Sequence[str], **texts: Sequence[str]
+) -> str:
+    """Columns of texts, of numbers (headers, values (n, headers), format), and the status; NaN is
+    left empty."""
+    header = [*texts, *(head for heads, _, _ in blocks for head in heads), "status"]
     rows = []
-    for i in range(len(table)):
-        cells = [
-            format(v + 0.0, form) if np.isfinite(v) else ""
-            for _, values, form in blocks
-            for v in values[i]
-        ]
-        label = table.configuration_labels[table.configuration[i]]
-        rows.append([label, *cells, result.status[i]])
+    for i, told in enumerate(status):
+        both = [(value, form) for _, values, form in blocks for value in values[i]]
+        cells = (format(v + 0.0, form) if np.isfinite(v) else "" for v, form in both)
+        rows.append([*(text[i] for text in texts.values()), *cells, told])
     return csv_text(header, rows)
 
 

@@ -18,6 +18,7 @@ from elastocal.compensation.compensate import (
     check_status,
     compensate,
     spread,
+    table_csv,
     targets_at,
 )
 from elastocal.errors import InputError, option
@@ -26,7 +27,6 @@ from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint,
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.inverse_kinematics import Reaching
 from elastocal.model.rigid import nominal_flanges
-from elastocal.tables import csv_text
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray
 
@@ -339,15 +339,11 @@ def summary_and_csv(
     what = f"{option('table')}: %d of %d grid points ({', '.join(heads)})"
     if not partial:
         check_status(what, named, plain, EXACT, _remedies())
-    heads += ["dx_mm", "dy_mm", "dz_mm"]
-    columns = [found.correction[:, :3] * 1e3]
+    order = np.lexsort(found.points.T[::-1])
+    moved, turned = found.correction[order, :3] * 1e3, np.degrees(found.correction[order, 3:])
+    blocks = [(heads, points[order], ".9g"), (["dx_mm", "dy_mm", "dz_mm"], moved, ".7f")]
     if found.oriented:
-        heads += ["drx_deg", "dry_deg", "drz_deg"]
-        columns.append(np.degrees(found.correction[:, 3:]))
-    values, rows = np.hstack(columns), []
-    for i in np.lexsort(found.points.T[::-1]):
-        cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
-        rows.append([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
+        blocks.append((["drx_deg", "dry_deg", "drz_deg"], turned, ".7f"))
     content: dict[str, Any] = {
         "points": len(found.status),
         "exact": found.status.count(EXACT),
@@ -361,4 +357,4 @@ def summary_and_csv(
     if found.oriented:
         content["rotation_without_urad"] = spread(found.before[:, 1])
         content["rotation_with_urad"] = spread(found.between[:, 1])
-    return content, csv_text([*heads, "status"], rows)
+    return content, table_csv(blocks, [found.status[i] for i in order])

@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from elastocal.above import checked_arguments
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.export import exportable, mjcf_file, rigid_files
 from elastocal.export.exportable import (
@@ -28,12 +30,13 @@ from elastocal.export.exportable import (
 from elastocal.export.mjcf_file import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
+from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
-from elastocal.model.chain import Chain
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import SmoothGroup, smooth_groups
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
+from elastocal.model.xml_file import XmlFile
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
 from elastocal.units import Array, microns, rpy_from_rotation
@@ -173,21 +176,52 @@ def format_of(path: Path, asked: str | None) -> str:
 SCHEMA = "elastocal/export/1"
 
 
+MOST_POSES = 1_000_000
+
+
+@checked_arguments
 @dataclass(frozen=True)
 class Wish:
-    """How to export: `poses` random poses for the cost, drawn with `seed`; `load_stated`: under the
-    force of `conditions` though it is zero; `correct_joints`: with a joint correction; `folder`
-    that the file is for (None: that of the robot's own file)."""
+    """How to export an arm to `path`, checked; the others are the options of `elastocal export`.
 
-    format: str
+    No format goes by the file's ending; costs are stated under `load` (3,) N at random `poses`;
+    `correct_joints`: with a joint correction.
+    """
+
+    path: Path
+    format: str | None = None
+    load: ArrayLike | None = None
     frames: bool = True
     base_frame: bool = False
-    conditions: Conditions = field(default_factory=Conditions)
-    load_stated: bool = False
-    correct_joints: bool = False
+    temperature_c: float | None = None
+    time_s: float | None = None
     poses: int = 500
     seed: int = 0
-    folder: Path | None = None
+    correct_joints: bool = False
+
+    def __post_init__(self) -> None:
+        format_of(self.path, self.format)
+        for name, low, high in (("temperature_c", -273.15, 2000.0), ("time_s", -1e9, 1e9)):
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(
+                    f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
+                )
+        given_force(self.load)
+        require(
+            2 <= self.poses <= MOST_POSES,
+            f"{option('poses')} takes a whole number from 2 to {MOST_POSES:,}; found {self.poses}",
+        )
+
+    @property
+    def kind(self) -> str:
+        return format_of(self.path, self.format)
+
+    @property
+    def conditions(self) -> Conditions:
+        force = given_force(self.load)
+        force = np.zeros(3) if force is None else force
+        return Conditions(force, self.time_s, self.temperature_c)
 
 
 @dataclass(frozen=True)
@@ -245,8 +279,8 @@ def export(
         (option("base_frame"), wish.base_frame, FRAMED),
         (option("joint_correction"), wish.correct_joints, FITTED),
     ):
-        if given and wish.format not in formats:
-            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.format}")
+        if given and wish.kind not in formats:
+            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.kind}")
     # The visits measured, where they are known, count under the load that was asked for.
     visits, conditions = calibrated.visits, wish.conditions
     require(
@@ -254,29 +288,29 @@ def export(
         f"{calibrated.source} does not say where the arm was measured, which "
         f"{option('joint_correction')} needs; identify anew",
     )
-    if visits is not None and (wish.load_stated or conditions.force.any()):
+    if visits is not None and wish.load is not None:
         visits = replace(visits, force=np.broadcast_to(conditions.force, visits.force.shape))
     conditions = replace(conditions, visits=visits)
-    kept = exportable.keep(calibrated, elastic=wish.format == "mjcf", conditions=conditions)
+    kept = exportable.keep(calibrated, elastic=wish.kind == "mjcf", conditions=conditions)
     refit, correction = None, JointCorrection()
-    if wish.format in FITTED:
+    if wish.kind in FITTED:
         progress("fitting what the format holds")
         kept, refit, correction = refitted(kept, wish.poses, wish.seed, wish.correct_joints)
     pieces = exportable.evaluate_pieces(kept.exported, conditions)
     progress("what the format cannot hold")
     cost = exportable.cost_of(kept, wish.poses, wish.seed)
     progress("writing and reading back")
-    if wish.format in WRITERS:
-        found = WRITERS[wish.format](calibrated, wish, kept, pieces)
+    if wish.kind in WRITERS:
+        found = WRITERS[wish.kind](calibrated, wish, kept, pieces)
     else:
-        found = Written(_parameters(calibrated, pieces, cost, wish.format))
+        found = Written(_parameters(calibrated, pieces, cost, wish.kind))
     # Smooth functions are zero where nothing shows them: no values that are held.
     model, entries = calibrated.model, calibrated.entries
     each = zip(model.names, entries, model.shrunk, strict=True)
     told = (*_warnings(calibrated, kept, cost), *found.warnings)
     return Exported(
         **vars(found) | {"warnings": told},
-        format=wish.format,
+        format=wish.kind,
         cost=cost,
         held={n: plain(e.get("held")) for n, e, shrunk in each
               if not shrunk and e.get("identifiable") is not True},
@@ -338,13 +372,6 @@ def _accepted(distance: float, largest: float) -> float:
     return distance
 
 
-def _read_back(text: str, ending: str, read: Callable[[Path], Chain]) -> Chain:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"written{ending}"
-        atomic_write(path, text)
-        return read(path)
-
-
 def _check_rest(
     at_rest: Callable[[Array, Array], Array], pieces: ExportNumbers, kept: Kept,
     T_world_base: Array, seed: int,
@@ -384,14 +411,14 @@ def _note(calibrated: CalibratedArm, kept: Kept) -> str:
 
 
 def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    from elastocal.model.urdf import check_urdf, read_urdf
+    from elastocal.model.urdf import check_urdf, tree_of
 
     robot = calibrated.model.cell.robot
     note = _note(calibrated, kept)
     added = wish.frames, wish.base_frame
     if robot.urdf is not None:
         text = rigid_files.calibrated_urdf(robot, pieces, *added, note)
-        text, told = rigid_files.moved(robot.urdf, text, wish.folder)
+        text, told = rigid_files.moved(robot.urdf, text, wish.path.parent)
         base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
     else:
         text = rigid_files.new_urdf(pieces, *added, note)
@@ -404,7 +431,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
             if pieces.nominal_masses
             else "the links have no <inertial> in this file, as their masses are not known"
         ]
-    back = _read_back(text, ".urdf", partial(read_urdf, base=base, flange=flange))
+    back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF")).chain(base, flange)
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
     chain = pieces.calibrated_chain()
     expected = nominal_flanges(chain, q)
@@ -488,7 +515,7 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
             "the springs stand in series with the joints: hold those by stiff actuators, whose "
             "own error would come on top"
         )
-    text, told = rigid_files.moved(robot.mjcf, text, wish.folder)
+    text, told = rigid_files.moved(robot.mjcf, text, wish.path.parent)
     return Written(text, distance, "MuJoCo, at rest under the load", (*warnings, *told))
 
 
@@ -511,14 +538,15 @@ def _compensator(part: Valued) -> dict[str, float] | None:
 def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
     from elastocal.model.dh import read_dh
 
-    convention = rigid_files.CONVENTIONS[wish.format]
+    convention = rigid_files.CONVENTIONS[wish.kind]
     lines = rigid_files.dh_lines(calibrated.model.cell.robot, pieces, convention)
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
     expected = nominal_flanges(pieces.calibrated_chain(), q)
 
     def checked(text: str, largest: float = LARGEST) -> float:
-        back = _read_back(text, ".csv", partial(read_dh, convention=convention))
-        return _apart(nominal_flanges(back, q), expected, largest)
+        with tempfile.TemporaryDirectory() as folder:
+            (path := Path(folder) / "written.csv").write_text(text, encoding="utf-8")
+            return _apart(nominal_flanges(read_dh(path, convention), q), expected, largest)
 
     apart, beta = checked(rigid_files.dh_csv(lines)), None
     comments = [

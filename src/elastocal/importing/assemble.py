@@ -408,7 +408,7 @@ def import_files(
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
     spherical = False
-    for path, source in _assigned(where, files, mapping.sources):
+    for path, source in _assigned(where, files, table.source or ()):
         found = joining.with_labels(
             where, read_records(where, path, source, table.units), source.names
         )

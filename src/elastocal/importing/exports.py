@@ -653,9 +653,7 @@ def likely_presets(path: Path) -> list[str]:
     rows = dict[str, int]()
     for name in mapping_file.PRESETS:
         mapping = mapping_file.read_mapping(None, [name])
-        try:
-            read = read_records(mapping.path, path, mapping.sources[0], UnitsTable())
-        except ElastocalError:
-            continue
-        rows[name] = len(read)
+        (source,) = mapping.table.source or ()
+        with suppress(ElastocalError):
+            rows[name] = len(read_records(mapping.path, path, source, UnitsTable()))
     return [name for name, n in rows.items() if n == max(rows.values())]

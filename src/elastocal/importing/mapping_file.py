@@ -157,11 +157,10 @@ _UNIT = re.compile(r"_[A-Za-z]+$")
 
 @dataclass(frozen=True)
 class ImportMapping:
-    """`path` says in messages where it was stated; `sources` have their presets merged in."""
+    """`path` says in messages where it was stated; each source has its preset merged in."""
 
     path: str
     table: MappingTable
-    sources: tuple[SourceTable, ...]
 
 
 def preset_text(name: str) -> str:
@@ -173,11 +172,18 @@ def preset_text(name: str) -> str:
     return (folder / f"{name}.toml").read_text(encoding="utf-8")
 
 
-def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> ImportMapping:
-    """The mapping of a file, of presets (one source each), or of both.
+def read_mapping(
+    path: str | Path | None, presets: Sequence[str] = (), length_unit: str | None = None,
+    angle_unit: str | None = None,
+) -> ImportMapping:  # fmt: skip
+    """The mapping of a file, of presets (one source each), or of both; units given count instead of
+    its own.
 
     A mapping file without [[source]] tables says how to join and convert what `presets` read.
     """
+    given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
+    options = f"{option('length_unit')}, {option('angle_unit')}"
+    checked(MappingTable, {"units": given}, options)
     where = option("presets") if path is None else str(path)
     data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file", MAX_BYTES)
     if presets and data.get("source"):
@@ -194,27 +200,15 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Import
             f'{where}: no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or '
             f"give {option('presets')}"
         )
-    merged = {**data, "source": [_with_preset(where, s) for s in data["source"]]}
-    table = checked(MappingTable, merged, where)
-    sources = table.source or []
-    for k, source in enumerate(sources):
+    merged = {"source": [_with_preset(where, s) for s in data["source"]]}
+    table = checked(MappingTable, data | merged | {"units": data.get("units", {}) | given}, where)
+    for k, source in enumerate(table.source or ()):
         require(
             bool(source.columns),
             f"{where}: {place('source', k)} has neither preset nor columns; say where the "
             'numbers stand, as in x_mm = "X"',
         )
-    return ImportMapping(where, table, tuple(sources))
-
-
-def with_units(
-    mapping: ImportMapping, length_unit: str | None, angle_unit: str | None
-) -> ImportMapping:
-    """The mapping with these units, where given, instead of its own."""
-    given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
-    where = f"{option('length_unit')}, {option('angle_unit')}"
-    checked(MappingTable, {"units": given}, where)
-    units = mapping.table.units.model_copy(update=given)
-    return replace(mapping, table=mapping.table.model_copy(update={"units": units}))
+    return ImportMapping(where, table)
 
 
 def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
