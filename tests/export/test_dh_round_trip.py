@@ -48,3 +48,9 @@ def test_numbers_that_calibration_leaves_alone_are_the_users(format: str, tmp_pa
     assert len(rows) == 6
     for i in (0, 1, 2):  # links beyond the error move, those before it do not
         assert all(float(rows[i][k]) == float(nominal[i][k]) for k in ("theta0_rad", "d_m", "a_m"))
+
+
+def test_a_robot_of_any_name_becomes_a_urdf(tmp_path: Path) -> None:
+    (tmp_path / "my|arm.csv").write_text(DH)
+    written = write_result(tmp_path, 'dh = "my|arm.csv"', ["joint_offset"])
+    assert '<robot name="my|arm">' in exported(*written, "urdf")[1].text

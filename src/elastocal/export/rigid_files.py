@@ -174,8 +174,8 @@ def _joint(joint: Joint, parent: str, child: str) -> list[str]:
 
 
 def _nested(tag: str, stated: dict[str, str], lines: Sequence[str]) -> list[str]:
-    head, end = element(tag, stated, "|").split("|")
-    return [head, *(f"  {line}" for line in lines), end]
+    head = element(tag, stated).removesuffix("/>")
+    return [f"{head}>", *(f"  {line}" for line in lines), f"</{tag}>"]
 
 
 # The user's own file, of either kind, written into another folder: its meshes are found from there.
