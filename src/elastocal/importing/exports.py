@@ -653,7 +653,7 @@ def likely_presets(path: Path) -> list[str]:
     rows = dict[str, int]()
     for name in mapping_file.PRESETS:
         mapping = mapping_file.read_mapping(None, [name])
-        (source,) = mapping.table.source or ()
-        with suppress(ElastocalError):
-            rows[name] = len(read_records(mapping.path, path, source, UnitsTable()))
+        for source in mapping.table.source or ():
+            with suppress(ElastocalError):
+                rows[name] = len(read_records(mapping.path, path, source, UnitsTable()))
     return [name for name, n in rows.items() if n == max(rows.values())]
