@@ -215,6 +215,26 @@ def test_a_ripple_that_the_catalogue_lacks_is_an_unknown_effect_of_its_joint(tmp
     why = ec.diagnose(seen / "cell.toml", seen / "data.csv", without=("gear_ripple",))
     assert why.verdict == "unknown_effect" and not why.effects
     assert why.location.where == drawn.effects[0].where and why.location.stage == "transmission"
+    assert [(f.effect, f.where) for f in why.fields] == [("gear_spectrum", why.location.where)]
+
+
+@pytest.mark.long
+def test_friction_that_the_catalogue_lacks_is_corrected_without_a_name(tmp_path):
+    """At new poses as well as friction with its name is; and what is left out is not found."""
+    seen, sealed = tmp_path / "seen", tmp_path / "sealed"
+    write_world(named("left_out", 20281601, "hysteresis-60-x2-000").recipe.draw(), seen, sealed)
+
+    def error(*without):
+        why = ec.diagnose(seen / "cell.toml", seen / "data.csv", without=without)
+        found = (*why.effects, *why.fields)
+        write_extended_cell(seen / "cell.toml", seen / "found.toml", found, why.model_keys)
+        fit = ec.identify(seen / "found.toml", seen / "data.csv", test=sealed / "fresh.csv")
+        return {f.effect for f in why.fields}, fit.test.rms
+
+    (_, whole), (fields, without) = error(), error("hysteresis")
+    assert fields == {"approach_response"} and without < 1.1 * whole
+    fields, neither = error("hysteresis", "approach_response")
+    assert "approach_response" not in fields and neither > 2 * whole
 
 
 def test_the_world_shares_no_code_with_elastocal():

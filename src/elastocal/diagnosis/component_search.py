@@ -39,7 +39,7 @@ from elastocal.diagnosis.corrections import without_a_name
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
-from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
+from elastocal.diagnosis.hypotheses import Hypothesis, judged_together, possible
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
 from elastocal.diagnosis.model_set import (
     Item,
@@ -57,7 +57,8 @@ from elastocal.diagnosis.noise_floor import (
 )
 from elastocal.diagnosis.stated_floor import most_scatter
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
-from elastocal.model.effects.base import index, turning_joints
+from elastocal.model.effects.base import index
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.loads import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve, ResidualField
@@ -116,9 +117,9 @@ def search_components(
     if again is not found and few:
         again = with_returned(_with_lines(full, again), every)
     found = again
-    for _ in range(0 if ResidualField.name in without else FIELD_SEARCHES):
+    for _ in range(FIELD_SEARCHES):
         progress("what has no name beside the components")
-        wider = _with_corrections(full, found, few)
+        wider = _with_corrections(full, found, few, without)
         if wider is found:
             break
         found = wider
@@ -353,11 +354,13 @@ def _wider(found: FittedSum, more: Sequence[Component]) -> FittedSum:
     return wider if wider.score > found.score + GAINED else found
 
 
-def _with_corrections(dataset: DiagnosisData, found: FittedSum, few: bool) -> FittedSum:
+def _with_corrections(
+    dataset: DiagnosisData, found: FittedSum, few: bool, without: Container[str]
+) -> FittedSum:
     """The sum with what has no name, all that stands out or, where it does not pay together, one of
     the likeliest; where none does, with what stands out if joints scatter no more than usual."""
     for begun in (found, *_quieter(found)):
-        more = _without_imitators(begun, without_a_name(dataset, begun, MOST_FIELDS))
+        more = _without_imitators(begun, without_a_name(dataset, begun, MOST_FIELDS, without))
         some = [more, *([c] for c in more[:TRIED] if few and len(more) > 1)]
         for chosen in filter(None, some):
             fitted = exchanged(begun, [], chosen)
@@ -632,14 +635,7 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
     if GearSpectrum.name in without:
         kept = [h for h in kept if not isinstance(h.effect, GearRipple)]
     elif GearRipple.name in without:
-        chain, cell, ripple = base.model.chain, base.model.cell, GearRipple()
-        kept += [
-            Hypothesis(
-                ripple, where, ripple.parameters(where, chain, cell),
-                ripple.settings(where, chain, cell),
-            )
-            for where in turning_joints(chain)
-        ]  # fmt: skip
+        kept += possible(base.model, base.observed.table, CATALOGUE.keys() - {GearRipple.name})[0]
     more = judged_together(base.model, base.observed.table, without)
     return dataset.changed(hypotheses=(*kept, *more))
 

@@ -45,7 +45,6 @@ from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,
     candidates,
-    judge,
     structure_tests,
     too_small,
     warnings,
@@ -259,12 +258,13 @@ def _diagnosed(
     base = dataset.base
     dataset, search, found, screened = _searched(dataset, options, progress)
     rng = np.random.default_rng(options.seed)
-    whole, nats, fields = _sum_of_all(dataset, found, options, rng, progress)
+    few = FewAnswer.of(dataset, found, rng)
+    whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
     tests = structure_tests(found.first)
-    found = found if whole else search.settled(found)
-    judged = judge(found)
-    answer = whole or FewAnswer.of(dataset, found, judged, fields, rng)
+    if not whole and (settled := search.settled(found)) is not found:
+        found, few = settled, FewAnswer.of(dataset, settled, rng)
+    answer = whole or replace(few, corrections=fields)
     answers = _pieces(answer, dataset, found.nothing.noise, tests)
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
@@ -275,7 +275,7 @@ def _diagnosed(
         nothing = min(nothing, FALSE_SMOOTH)
     return Diagnosis(
         **answers,
-        candidates=candidates(dataset, found, judged),
+        candidates=candidates(dataset, found, few.judged),
         structure=tests,
         probability_nothing=nothing,
         p_value=p,
@@ -308,18 +308,17 @@ def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
 
 
 def _sum_of_all(
-    dataset: DiagnosisData, found: SelectedEffects, options: DiagnosisOptions,
-    rng: np.random.Generator, progress: Progress,
-) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:  # fmt: skip
+    few: FewAnswer, options: DiagnosisOptions, progress: Progress
+) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:
     """The sum of all that may act at once, None where a few causes are the better answer, by how
     many nats it is more probable than nothing, and what has no name in it."""
     progress("judging all that may act at once")
-    few = FewAnswer.of(dataset, found, judge(found), (), rng)
-    open_, without = few.verdict == "unknown_effect" or few.supported.open, options.without
+    dataset, found, without = few.before, few.selected, options.without
+    open_ = few.verdict == "unknown_effect" or few.supported.open
     if (searched := search_components(dataset, found.chosen, open_, without, progress)) is None:
         return None, 0.0, ()
     full, total, hidden = searched
-    answer, nothing = SumAnswer(dataset, full, total, hidden, rng).decided, found.nothing.score
+    answer, nothing = SumAnswer(dataset, full, total, hidden, few.rng).decided, found.nothing.score
     over = compared_score(full, total) - nothing
     if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
         return None, 0.0, answer.without_names

@@ -205,16 +205,14 @@ class FewAnswer(SumAnswer):
 
     selected: SelectedEffects
     judged: Answer
-    corrections: tuple[FoundEffect, ...]
+    corrections: tuple[FoundEffect, ...] = ()
 
     @classmethod
     def of(
-        cls, before: DiagnosisData, selected: SelectedEffects, judged: Answer,
-        corrections: tuple[FoundEffect, ...], rng: np.random.Generator,
-    ) -> FewAnswer:  # fmt: skip
-        data = selected.dataset
-        found = sum_of(data, selected.chosen)
-        return cls(before, data, found, (), rng, selected, judged, corrections)
+        cls, before: DiagnosisData, selected: SelectedEffects, rng: np.random.Generator
+    ) -> FewAnswer:
+        found, judged = sum_of(selected.dataset, selected.chosen), judge(selected)
+        return cls(before, selected.dataset, found, (), rng, selected, judged)
 
     @property
     def verdict(self) -> Verdict:

@@ -16,16 +16,16 @@ import numpy as np
 from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Entry, JointMotion, Symbols, index, links
+from elastocal.model.effects.base import LinkFrame, Symbols, index, links
 from elastocal.model.effects.compliances import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.model.effects.gears import BY_ORDER, came_from
-from elastocal.model.effects.placements import JUMP_TIME, Jump
-from elastocal.model.effects.smooth import every_place, motion_of
+from elastocal.model.effects.placements import JUMP_TIME, KEYS, Jump
+from elastocal.model.effects.smooth import AnyMotion
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
 
 
-class ResidualStep(Jump):
+class ResidualStep(AnyMotion, Jump):
     """A place moves by u for t ≥ T, and nobody knows why: a knock, a clamp that slipped.
 
     Of "jointN" its angle, of "linkN" its end frame along and about its axes, of "base" the base, of
@@ -33,21 +33,13 @@ class ResidualStep(Jump):
     """
 
     name = "residual_step"
-    nameless = together = True
-    stage = "geometry"
+    together = True
     family = "time"
-    entry = JointMotion()  # at a joint; see `entry_at`
     sized_by = "step_size"
     constants = (
         replace(JUMP_TIME, key="step_time_s"),
         Setting("step_size", "range", 1e-4, 0.0, 1.0),
     )
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return every_place(chain, cell)
-
-    def entry_at(self, place: str) -> Entry:
-        return motion_of(place)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         size = self.stated(place, chain, cell)[self.sized_by]
@@ -69,6 +61,12 @@ class JointResponse(TorqueEffect):
     at = "turning joints"
     count: ClassVar[int]
 
+    def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
+        return (
+            Setting(self.sized_by, "range", 1e-4, 0.0, 1.0),
+            Setting(f"{self.name}_Nm", "range", 100.0, 1e-9, 1e9),
+        )
+
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
         """φ (count,) at u and a."""
         raise NotImplementedError
@@ -79,7 +77,7 @@ class JointResponse(TorqueEffect):
         return tuple(ParameterSpec(key, "rad", 0.0, size, shrunk=True) for key in keys)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        i, largest = index(place), p[self.constants[1].key]
+        i, largest = index(place), p[f"{self.name}_Nm"]
         c = ca.vertcat(*(p[f"{self.name}_{k}"] for k in range(1, self.count + 1)))
         side = came_from(arm)[i] if "approach" in self.needs else ca.SX(1)
         add_deflection(
@@ -108,10 +106,6 @@ class TorqueResponse(JointResponse):
     family = "torque"
     count = 5
     sized_by = "torque_response_rad"
-    constants = (
-        Setting(sized_by, "range", 1e-4, 0.0, 1.0),
-        Setting("torque_response_Nm", "range", 100.0, 1e-9, 1e9),
-    )
 
     def laws(self, u: ca.SX, side: ca.SX) -> ca.SX:
         return ca.vertcat(u, u**3, ca.tanh(u / SHARP), _magnitude(u), u**2)
@@ -130,10 +124,6 @@ class ApproachResponse(JointResponse):
     needs = ("approach",)
     count = 2
     sized_by = "approach_response_rad"
-    constants = (
-        Setting(sized_by, "range", 1e-4, 0.0, 1.0),
-        Setting("approach_response_Nm", "range", 100.0, 1e-9, 1e9),
-    )
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.approach == BY_ORDER else self.needs
@@ -172,15 +162,12 @@ class LoadResponse(LoadedEffect):
         size = self.stated(place, chain, cell)[self.sized_by]
         return tuple(
             ParameterSpec(f"load_response_{key}", unit, 0.0, size, shrunk=True)
-            for key, unit in zip(AXES, motion_of(place).units, strict=True)
+            for key, unit in zip(KEYS, LinkFrame.units, strict=True)
         )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        for k, key in enumerate(AXES):
+        for k, key in enumerate(KEYS):
             kind, largest = ("prismatic", "N") if k < 3 else ("revolute", "Nm")
             compliance = p[f"load_response_{key}"] / p[f"load_response_{largest}"]
             name, axis = f"{place}.{self.name}_{key}", np.eye(3)[k % 3]
             arm.add_spring(Spring.linear(name, place, kind, axis, compliance))
-
-
-AXES = ("x", "y", "z", "rx", "ry", "rz")

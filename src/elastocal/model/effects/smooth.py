@@ -191,22 +191,27 @@ class JointCurve(SmoothEffect):
         return (smooth_function(place, {"curve": "rad"}, *stated),)
 
 
-def every_place(chain: Chain, cell: Cell) -> tuple[str, ...]:
-    """Places that may move without a known cause."""
-    markers = tuple(f"marker:{name}" for name in cell.tool.markers)
-    return (*joints(chain), *links(chain), "base", *markers)
+class AnyMotion(DrivenEffect):
+    """Without a known cause a place moves: of "jointN" its angle, of "linkN" its end frame along
+    and about its axes, of "base" the base, of "marker:NAME" the marker."""
+
+    nameless = True
+    stage = "geometry"
+    entry = JointMotion()  # at a joint; see `entry_at`
+
+    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
+        markers = tuple(f"marker:{name}" for name in cell.tool.markers)
+        return (*joints(chain), *links(chain), "base", *markers)
+
+    def entry_at(self, place: str) -> Entry:
+        if place.startswith("joint"):
+            return JointMotion()
+        if place.startswith("link"):
+            return LinkFrame()
+        return BaseMotion() if place == "base" else MarkerMotion()
 
 
-def motion_of(place: str) -> Entry:
-    """How such a place moves."""
-    if place.startswith("joint"):
-        return JointMotion()
-    if place.startswith("link"):
-        return LinkFrame()
-    return BaseMotion() if place == "base" else MarkerMotion()
-
-
-class ResidualField(SmoothEffect):
+class ResidualField(AnyMotion, SmoothEffect):
     """A place moves smoothly with joint angles or time, and nobody knows why.
 
     u = Σ_c f_c(x_c) in every component of the motion at the place: of "jointN" its angle, of
@@ -218,16 +223,7 @@ class ResidualField(SmoothEffect):
     """
 
     name = "residual_field"
-    nameless = True
-    stage = "geometry"
     family = "pose"
-    entry = JointMotion()  # at a joint; see `entry_at`
-
-    def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return every_place(chain, cell)
-
-    def entry_at(self, place: str) -> Entry:
-        return motion_of(place)
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         found: list[Setting] = []
