@@ -15,9 +15,10 @@ Beyond its range a function that is not periodic ends, and the arm is that of th
 
     w f(x) + (1 − w) g,   w = (1 − t)² (1 + 2t),
 
-t the distance from the range over that in which f fades, 1 at most, so that value and slope have no
-step.  g ~ N(0, s²) is what the function may be there: no reading within the range tells of it, so
-that it stays at zero and the uncertainty is the function's whole size.
+t the distance from the range over ℓ, 1 at most, so that value and slope have no step: beyond a
+length the readings at the end say next to nothing.  g ~ N(0, s²) is what the function may be there:
+no reading within the range tells of it, so that it stays at zero and the uncertainty is the
+function's whole size.
 
 A smooth function corrects the arm and explains nothing.
 """
@@ -56,9 +57,6 @@ from elastocal.units import Array
 HIGHEST = 6.0
 MOST_WAVES = 160
 MARGIN, LENGTHS = 0.25, 3.0  # of the range, or in lengths, that the ends are apart
-# Of the range, and at most one length: within it the function fades.  Beyond a length the readings
-# at the end say next to nothing, and a long one would reach as far again as was measured.
-FADE = 0.125
 
 
 @dataclass(frozen=True)
@@ -79,8 +77,7 @@ class Waves:
         """Those of functions over [low, high] that vary over `length`; `turns` says whether x is
         an angle, and the function periodic where it goes all the way round."""
         span = max(high - low, 1e-9)
-        period = span + max(MARGIN * span, LENGTHS * length)
-        fade = min(length, FADE * span)
+        period, fade = span + max(MARGIN * span, LENGTHS * length), length
         if turns and span >= FULL_TURN * 2 * math.pi:
             period, fade = 2 * math.pi, math.inf
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
