@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,17 @@ def append_side(folder: Path) -> None:
     _, *lines = (folder / "side_data.csv").read_text(encoding="utf-8").splitlines()
     with open(folder / "data.csv", "a", encoding="utf-8") as handle:
         handle.writelines("10," + line.removeprefix("9,") + "\n" for line in lines)
+
+
+def first(n: int) -> Callable[[Path], None]:
+    """Prepares data.csv of its first n configurations."""
+
+    def shortened(folder: Path) -> None:
+        header, *lines = (folder / "data.csv").read_text(encoding="utf-8").splitlines()
+        kept = [line for line in lines if int(line.partition(",")[0]) < n]
+        (folder / "data.csv").write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
+
+    return shortened
 
 
 def spoil_three(folder: Path) -> None:
@@ -83,13 +95,13 @@ def equal_noise(folder: Path) -> None:
 
 
 def thinned_ur5(folder: Path) -> None:
-    """Every tenth pose of the UR5's grid, with the 20 random poses to test on."""
+    """Every fourteenth pose of the UR5's grid, with the 20 random poses to test on."""
     source = Path(os.environ["ELASTOCAL_DATASETS"]) / "ur5_wam_tsinghua"
     (folder / "data").mkdir()
     table = (source / "nominal_dh_ur5.csv").read_text(encoding="utf-8")
     (folder / "data" / "ur5_dh.csv").write_text(table, encoding="utf-8")
     columns = [*(f"q{i}_rad" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"]
-    for name, step in (("grid", 10), ("random", 1)):
+    for name, step in (("grid", 14), ("random", 1)):
         with open(source / f"ur5_{name}.csv", newline="", encoding="utf-8") as handle:
             rows = [[row[c] for c in columns] for row in csv.DictReader(handle)]
         lines = [",".join(row) for row in (columns, *rows[::step])]

@@ -50,6 +50,7 @@ GOLDENS: dict[str, Golden] = {
     ), engine=True),
     # Identification
     "identify_geometry": Golden(BLIND, (
+        door.first(25),
         "identify cell.toml data.csv -o result.json -q --details --certificate done.html",
     ), engine=True),
     "identify_convention": Golden(case("fanuc_convention"), (
@@ -110,9 +111,11 @@ GOLDENS: dict[str, Golden] = {
     ), engine=True),
     # Diagnosis
     "diagnose_one": Golden(BLIND, (
+        door.first(30),
         "diagnose cell.toml data.csv -o diagnosis.json --cell-out found.toml --report page.html -q",
     ), engine=True),
     "diagnose_many": Golden(WHOLE, (
+        door.first(18),
         "diagnose cell.toml data.csv -o diagnosis.json --cell-out found.toml -q",
     ), engine=True),
     "diagnose_nothing": Golden(case("joint_zero_5deg"), (
@@ -152,7 +155,7 @@ GOLDENS: dict[str, Golden] = {
         "compensate placed.toml placed.json --target 1500,200,1200,0,90,0 --point M1 "
         "--near 0,-90,90,0,20,0 -o one.csv --json -q",
         "compensate deflecting.toml result.json --table table.csv --grid 2,2,2,1,1,1 -q",
-        "compensate deflecting.toml result.json --table box.csv --grid 2 -q "
+        "compensate deflecting.toml result.json --table box.csv --grid 2,1,1 -q "
         "--box 700,-100,600,800,100,700 --rotation 0,90,0",
     )),
     "export_urdf": Golden(ARM, (

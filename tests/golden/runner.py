@@ -56,8 +56,12 @@ class Golden:
 
 
 def run(golden: Golden) -> list[dict[str, Any]]:
-    """What each step does, as it is kept."""
-    with tempfile.TemporaryDirectory() as name, contextlib.chdir(name):
+    """What each step does, as it is kept; few steps in search of an order, which tests of that
+    search let run to its end."""
+    from elastocal.planning import execution
+
+    few = mock.patch.multiple(execution, STEPS=1000, FEW=1000)
+    with tempfile.TemporaryDirectory() as name, contextlib.chdir(name), few:
         folder = Path(name)
         for source in golden.inputs:
             whole = ROOT / source
