@@ -77,7 +77,7 @@ def stages_in(begun):
      *(pytest.param("normal", stage, number, marks=pytest.mark.long)
        for stage in ("start0", "warm0") for number in (signal.SIGINT, signal.SIGKILL))],
 )  # fmt: skip
-def test_a_process_that_is_stopped(tmp_path, effort, stage, number):
+def test_a_process_that_is_stopped(tmp_path, whole, effort, stage, number):
     cell, begun = write_cell(tmp_path), tmp_path / "plan.csv.resume"
     words = ["design", str(cell), "--effort", effort, "-o"]
     command = [sys.executable, "-c", PROGRAM, *words, str(tmp_path / "plan.csv")]
@@ -94,6 +94,8 @@ def test_a_process_that_is_stopped(tmp_path, effort, stage, number):
         assert process.returncode == -signal.SIGKILL
     assert everything_in(tmp_path) == ["cell.toml", "plan.csv.resume"]
     assert GOING_ON in elastocal(*words, tmp_path / "plan.csv").stderr
-    assert elastocal(*words, tmp_path / "whole.csv").exit_code == 0
-    assert (tmp_path / "plan.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+    if effort != "quick":
+        assert elastocal(*words, tmp_path / "whole.csv").exit_code == 0
+        whole = (tmp_path / "whole.csv").read_bytes()
+    assert (tmp_path / "plan.csv").read_bytes() == whole
     assert not begun.exists()

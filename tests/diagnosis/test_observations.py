@@ -32,7 +32,7 @@ def test_a_gears_error_shows_in(observe: str) -> None:
 
 
 def test_deflections_show_what_gives_way() -> None:
-    d = ec.diagnose(*campaign(TILTED, observe="deflection", n=30))
+    d = ec.diagnose(*campaign(TILTED, observe="deflection", n=20))
     assert d.verdict == "ambiguous"
     shown = {(e.effect, e.where) for e in d.indistinguishable[0]}
     assert shown == {("off_axis_compliance", "joint3"), ("link_bending", "link2")}
@@ -47,7 +47,7 @@ def test_positions_without_load_time_approach_and_further_markers() -> None:
     plain = cell(("base_frame", "joint_offset", "marker_position:marker:M1"), link_gravity=False)
     plain = replace(plain, tracker=replace(plain.tracker, position=np.zeros(3)))
     d = ec.diagnose(Model.assembled(kr270_chain(), plain), bare)
-    assert d.n_readings == d.n_configurations == 40
+    assert d.n_readings == d.n_configurations == 24
     advice = {u.effect: u.advice for u in reversed(d.untested)}
     assert {"joint_drift", "payload_error"} <= advice.keys()
     assert "approach" in advice["hysteresis"] and "position_m" in advice["tracker_distortion"]
@@ -62,7 +62,7 @@ def test_arms_of_other_numbers_of_joints(n_joints: int = 4) -> None:
     fault = Fault(
         "gear_eccentricity", "joint3", {"eccentricity_sin": 2e-4, "eccentricity_cos": -1.5e-4}
     )
-    table = measured(chain, plain, [fault], plan(chain, 30, n_joints, PULL), n_joints)
+    table = measured(chain, plain, [fault], plan(chain, 20, n_joints, PULL), n_joints)
     d = ec.diagnose(Model.assembled(chain, plain), table)
     assert key(d) == fault.key and d.verdict in ("explained", "ambiguous")
     assert len(d.noise.repeatability) == n_joints

@@ -31,8 +31,8 @@ def lines(why: ec.Diagnosis) -> list[int]:
 
 def test_one_reading_in_sixty_that_is_a_millimetre_off_is_found_and_no_other() -> None:
     """A visit whose markers moved together has none: the flange was elsewhere."""
-    model, table = campaign()
-    rows = np.array([31, 88, 147, 200])
+    model, table = campaign(n=30)
+    rows = np.array([31, 88, 147])
     read = with_faults(table, rows)
     together = (table.configuration == 7) & (table.force[:, 2] == 0)
     assert together.sum() == 3 and not together[rows].any()
@@ -68,7 +68,7 @@ def test_distances_of_the_markers_tell_the_faulty_readings_of_an_arm_unlike_its_
 ) -> None:
     """Every move leaves it short of its target by a different part of it, or all its joints have
     curves of errors."""
-    chain, plain, n = kr270_chain(), cell(RIGID, link_gravity=False, nominal=Nominal()), 40
+    chain, plain, n = kr270_chain(), cell(RIGID, link_gravity=False, nominal=Nominal()), 30
     q = random_poses(chain, n, 1)
     table = table_of(q, np.zeros(3), both=False)
     off = table.q.copy()
@@ -80,7 +80,7 @@ def test_distances_of_the_markers_tell_the_faulty_readings_of_an_arm_unlike_its_
     else:
         off += 2e-4 * np.sin(7.3 * table.q + np.arange(6))
     read = replace(measured(chain, plain, [], replace(table, q=off), 1), q=table.q)
-    rows = np.array([17, 80, 101])
+    rows = np.array([17, 62, 80])
     why = ec.diagnose(Model.assembled(chain, plain), with_faults(read, rows))
     assert lines(why) == sorted(read.row[rows])
 

@@ -26,7 +26,7 @@ def notebook(name):
     """The names that a notebook's code leaves behind, its cells run with few candidates."""
     names = {}
     for number, source in enumerate(cells(name, "code")):
-        source = source.replace("candidates=500", "candidates=100")
+        source = source.replace("candidates=500", "candidates=60")
         exec(compile(source, f"{name}.ipynb, cell {number}", "exec"), names)
     return names
 

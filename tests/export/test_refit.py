@@ -68,7 +68,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     # Poses, every second one under a load, with the sides that the joints came from.
     heads = [*(f"q{k}_rad" for k in range(1, 7)), *(f"force_{a}_N" for a in "xyz"),
              *(f"approach_{k}" for k in range(1, 7))]  # fmt: skip
-    for name, n, seed in (("train", 50, 1), ("test", 40, 2)):
+    for name, n, seed in (("train", 32, 1), ("test", 24, 2)):
         draw = np.random.default_rng(seed)
         rows = [
             [*draw.uniform(LOW, HIGH).tolist(), 0, 0, -1500 * (k % 2), *draw.choice([-1, 1], 6)]

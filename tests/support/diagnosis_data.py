@@ -140,7 +140,7 @@ def plan(chain: Chain, n: int, seed: int, force: Array = DOWN) -> Measurements:
 
 @lru_cache
 def campaign(
-    *names: str, n: int = 40, seed: int = 1, observe: str = "position", sigma: float = SIGMA
+    *names: str, n: int = 24, seed: int = 1, observe: str = "position", sigma: float = SIGMA
 ) -> tuple[Model, Measurements]:
     """Model without, and readings with, the faults of these names."""
     chain, plain = kr270_chain(), cell(observe=observe, sigma=sigma)
@@ -149,5 +149,5 @@ def campaign(
 
 
 @lru_cache
-def diagnosed(*names: str, without: tuple[str, ...] = (), n: int = 40, seed: int = 1) -> Diagnosis:
+def diagnosed(*names: str, without: tuple[str, ...] = (), n: int = 24, seed: int = 1) -> Diagnosis:
     return ec.diagnose(*campaign(*names, n=n, seed=seed), without=without)
