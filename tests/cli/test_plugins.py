@@ -136,7 +136,7 @@ def test_the_noise_model_is_chosen_and_named(tmp_path: Path) -> None:
     cell.write_text(text, encoding="utf-8")
     write_example(tmp_path, "noise_by_day.py")
     model = Model(cell, plugins=True)
-    table = table_of(random_poses(model.chain, 60, 1), np.zeros(3))
+    table = table_of(random_poses(model.chain, 30, 1), np.zeros(3))
     day, exact = table.configuration % 3, model.predict(table).reshape(-1, 3)
     scatter = np.array([1e-5, 8e-5, 1e-5])[day][:, None]
     read = exact + scatter * np.random.default_rng(5).normal(size=exact.shape)

@@ -109,7 +109,7 @@ def test_rivals_that_stay_alike_are_planned_for_as_one() -> None:
         ("link_mass_error", "link2"): 0.3,
         ("encoder_scale", "joint2"): 0.3,
     }
-    model, table = campaign(2.0, eccentric("joint2", 1e-4, 1e-4), link_gravity=True)
+    model, table = campaign(2.0, eccentric("joint2", 1e-4, 1e-4), n=16, link_gravity=True)
     extra = plan_extra(model, table, diagnosis_of(trio), most=3)
     alike = [t for t in extra.advice if "no pose separates" in t]
     assert len(alike) == 1 and "encoder_scale" not in alike[0]

@@ -30,9 +30,9 @@ def fuzzed(*words: str) -> str:
 
 
 def test_spoilt_input_ends_with_a_message_and_a_kill_leaves_whole_files() -> None:
-    quick = (w for verb in ("identify", "simulate", "study", "export") for w in ("--verb", verb))
-    told = fuzzed("--cases", "12", "--seed", "17", "--kills", "1", *quick)
-    assert "killed 4; 0 with a finding" in told and "exit 2" in told
+    quick = (w for verb in ("identify", "study") for w in ("--verb", verb))
+    told = fuzzed("--cases", "8", "--seed", "17", "--kills", "1", *quick)
+    assert "killed 2; 0 with a finding" in told and "exit 2" in told
 
 
 @pytest.mark.long

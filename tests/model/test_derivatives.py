@@ -184,13 +184,9 @@ def test_of_every_effect(effect: str) -> None:
     assert largest_excess(c, spread(c.columns(effect), 6)) <= 1
 
 
-@pytest.mark.parametrize(
-    "observed, deflection_model",
-    [("position", "linear"), ("deflection", "equilibrium"), ("pose", "linear"),
-     ("distance", "linear")],
-)  # fmt: skip
-def test_of_what_is_observed(observed: str, deflection_model: str) -> None:
-    c = everything(observed, deflection_model)
+@pytest.mark.parametrize("observed", OBSERVED)
+def test_of_what_is_observed(observed: str) -> None:
+    c = everything(observed, "linear")
     effects = with_parameters(observed)
     assert {effect: largest_excess(c, spread(c.columns(effect), 2)) for effect in effects} == {
         effect: pytest.approx(0.5, abs=0.5) for effect in effects
@@ -201,7 +197,7 @@ def test_every_parameter_moves_some_observation() -> None:
     """Else the comparisons above would compare zeros."""
     moves: dict[str, float] = {}
     for observed in OBSERVED:
-        c = everything(observed, "linear" if observed in ("pose", "distance") else "equilibrium")
+        c = everything(observed, "equilibrium" if observed == "position" else "linear")
         for name, far in zip(c.model.names, np.abs(c.B).max(axis=0) * c.sizes, strict=True):
             moves[name] = max(far, moves.get(name, 0.0))
     assert [name for name, far in moves.items() if far <= 1e-9] == []

@@ -209,7 +209,8 @@ def test_the_reduction_told_is_that_at_new_poses(tmp_path):
 def test_a_ripple_that_the_catalogue_lacks_is_an_unknown_effect_of_its_joint(tmp_path):
     """Of so high an order that no smooth function of the angle follows it, and the same whenever
     the arm comes back: it fits as if the joint scattered, twenty times as much as the others."""
-    drawn = named("left_out", 20281401, "gear_ripple-60-x2-000").recipe.draw()
+    task = named("left_out", 20281401, "gear_ripple-60-x2-000")
+    drawn = replace(task.recipe, poses=40).draw()
     seen = tmp_path / "seen"
     write_world(drawn, seen, tmp_path / "sealed")
     why = ec.diagnose(seen / "cell.toml", seen / "data.csv", without=("gear_ripple",))
