@@ -63,9 +63,8 @@ BINARY: dict[int, Any] = {
 # pose, and the same runs on complex arrays, which complex-step checks use.
 
 CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
-# Finding common subexpressions takes 7 µs per instruction.  It saves 2 to 14 % of the instructions
-# of B and 1 % of a Jacobian of 170 000, where it would take longer than all the rest.
-LARGEST_REDUCED = 60_000
+# Common subexpressions are not looked for: that takes 7 µs per instruction, as long as all the rest
+# before the first row, and would save 2 to 14 % of the instructions of B.
 LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
 
 
@@ -112,10 +111,6 @@ def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
     Not a tuple for every step: thousands of these would have Python look for garbage in all that
     is loaded, 0.07 s each time.
     """
-    if function.n_instructions() <= LARGEST_REDUCED:
-        # The derivative code repeats the chain's products many times over.
-        symbols = function.sx_in()
-        function = ca.Function("rows", symbols, function.call(symbols), {"cse": True})
     columns = tuple([*column] for column in zip(*_steps(function), strict=True))
     return columns, int(function.sz_w())
 
