@@ -306,13 +306,12 @@ def test_progress_is_told(model):
     assert "finding the start" in told
 
 
-def test_what_a_user_guesses(tmp_path):
+def test_what_a_user_guesses(folder):
     """A data frame for a table, pickles, and the words that other libraries have for a fit."""
     import pandas as pd
 
-    run_demo(tmp_path)
-    model = ec.Model(tmp_path / "cell.toml")
-    frame = pd.read_csv(tmp_path / "data.csv", comment="#")
+    model = ec.Model(folder / "cell.toml")
+    frame = pd.read_csv(folder / "data.csv", comment="#")
     fit = ec.identify(model, frame)
     again = pickle.loads(pickle.dumps(fit))
     assert again.params == fit.params == dict(zip(model.names, fit.x, strict=True))
@@ -322,7 +321,7 @@ def test_what_a_user_guesses(tmp_path):
         fit.residuals.shape == (270, 3) and fit.to_dict()["schema"] == "elastocal/identification/1"
     )
     assert fit.summary() == str(fit)
-    q = model.read_plan(tmp_path / "plan.csv").q
+    q = model.read_plan(folder / "plan.csv").q
     assert fit.predict(q, [0, 0, -2600]).shape == (len(q), 3)
     table = fit.observations.table
     assert np.allclose(fit.predict(table), fit.observations.value.reshape(-1, 3) - fit.residuals)

@@ -10,6 +10,7 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -491,15 +492,22 @@ def _named(part: str, target: ColumnKey) -> list[str]:
     return [name.strip() for name in part.split("|")]
 
 
+@lru_cache(4096)  # of one header many names are sought
 def _plain(name: str) -> str:
     return " ".join(name.split()).casefold()
+
+
+@lru_cache(4096)
+def _unitless(name: str) -> str:
+    return _plain(split_unit(name)[0])
 
 
 def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
     """Columns with the first of the names that any has; by the whole header, else less its unit."""
     for name in names:
-        for view in (_plain, lambda cell: _plain(split_unit(cell)[0])):
-            hits = [i for i, cell in enumerate(header) if view(cell) == _plain(name)]
+        sought = _plain(name)
+        for view in (_plain, _unitless):
+            hits = [i for i, cell in enumerate(map(view, header)) if cell == sought]
             if hits:
                 return hits
     return []
