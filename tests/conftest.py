@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gc
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib import import_module
+from functools import cache
+from importlib import import_module, metadata
 from typing import Any
 
 import pytest
+from typer import testing
 
 gc.disable()  # what is collected stays: to look for garbage in it is a third of the time
 
@@ -53,6 +56,22 @@ def plain_layout(request: pytest.FixtureRequest) -> Iterator[None]:
         patch.setattr(figures, "LAYOUT", None)
         if "report" not in request.path.parts:
             patch.setattr(figures, "rendered", lambda figure: '<svg viewBox="0 0 1 1"></svg>')
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def once() -> Iterator[None]:
+    """What is the same all through: the command line that typer builds of its functions, and the
+    plug-ins of installed packages while the same folders are searched for them."""
+    ask = metadata.entry_points
+
+    @cache
+    def remembered(path: tuple[str, ...], **sought: str) -> Any:
+        return ask(**sought)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(testing, "_get_command", cache(testing._get_command))
+        patch.setattr(metadata, "entry_points", lambda **s: remembered(tuple(sys.path), **s))
         yield
 
 
