@@ -283,9 +283,7 @@ WORSE = 2  # numbers of repeats in a row that are worse than fewer: more are not
 TRIES = 3  # plans whose moves took longer than was thought
 
 
-def within(
-    choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes: float
-) -> Plan:  # fmt: skip
+def within(choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes: float) -> Plan:
     asked = minutes
     for left in reversed(range(TRIES)):
         sizes, best = _sizes(choice, cell, asked)

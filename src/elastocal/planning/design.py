@@ -346,7 +346,14 @@ class _Design:
         bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
         wanted, figure = self.cell.design.target, setup.criterion.figure
         assert wanted is not None
-        target, tried = self._target(setup, wanted), dict[int, PlanSize]()
+        metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
+        require(
+            setup.criterion.unit == "µm",
+            f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
+            f"{', '.join(metric[:-1])} and {metric[-1]}, not with {setup.criterion.name}; drop it, "
+            f"or compare by {option('curve')}",
+        )
+        target, tried = (wanted * 1e6 / figure(1.0)) ** 2, dict[int, PlanSize]()
         available = np.bincount(pool.group)
         most, low = len(available), max(len(available), int(self.pinned.sum()) + 1)
         while most < MOST_POSES and (shares_of(self.cell, most + 1) <= available).all():
@@ -383,16 +390,6 @@ class _Design:
                 "ask for less, measure more repeats, or take a better tracker"
             )
         return best, tuple(tried.values())
-
-    def _target(self, setup: Setup, target: float) -> float:
-        metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
-        require(
-            setup.criterion.unit == "µm",
-            f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
-            f"{', '.join(metric[:-1])} and {metric[-1]}, not with {setup.criterion.name}; drop it, "
-            f"or compare by {option('curve')}",
-        )
-        return (target * 1e6 / setup.criterion.figure(1.0)) ** 2
 
     def _plan(
         self, setup: Setup, found: Search, counts: CandidateCounts, targets: str,

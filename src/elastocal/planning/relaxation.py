@@ -245,7 +245,12 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
     full = (size == problem.shares)[problem.group]
     if full.any():
         return _around(problem, full, gap, start)
-    weights, best = _first_weights(problem, start), None
+    # Even weights, or `start` with a part of them, times √d_i: where the support lies (Silvey,
+    # Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379).
+    weights, best = problem.even(), None
+    weights = weights if start is None else EVEN * weights + (1 - EVEN) * start
+    soft = problem.judged_by(problem.criterion.softened(1.0))  # of a kink all sides count
+    weights = weights * np.sqrt(np.maximum(soft.worth(inverse(problem.at(weights)))[1], 0.0))
     least = problem.shares + 2  # of a group: as its share takes, and a choice
     sizes = np.where(
         problem.shares > 0,
@@ -293,16 +298,6 @@ def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | 
     found = relax(rest, gap, None if start is None else start[free])
     weights[free] = found.weights
     return replace(found, weights=weights)
-
-
-def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
-    """Even weights, or `start` with a part of them, times √d_i: where the support lies (Silvey,
-    Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379)."""
-    even = problem.even()
-    w = even if start is None else EVEN * even + (1 - EVEN) * start
-    soft = problem.judged_by(problem.criterion.softened(1.0))  # of a kink all sides count
-    d = soft.worth(inverse(problem.at(w)))[1]
-    return np.asarray(w * np.sqrt(np.maximum(d, 0.0)))
 
 
 def best_of(score: Array, group: IntArray, counts: IntArray) -> IntArray:

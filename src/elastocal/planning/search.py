@@ -211,7 +211,12 @@ def ordered(search: Search) -> tuple[Execution, Alias | None, list[str]]:
     order, warnings = _Ordering(search), []
     execution, alias = order.reachable()
     if order.gone:
-        execution, alias = order.polished(execution, alias)
+        if search.effort.starts:
+            chosen = search.polished(search.chosen, "replaced")
+            with suppress(Unreachable):
+                if search.value_of(chosen) < search.value:
+                    execution, alias = order.put(chosen)
+                    search.exchange(chosen)
         told = "one better pose was" if order.gone == 1 else f"{order.gone} better poses were"
         warnings.append(
             f"{told} left out: no free move reaches {'it' if order.gone == 1 else 'them'}"
@@ -259,16 +264,6 @@ class _Ordering:
             paired=rules.cell.model.observe == "deflection",
             seed=search.seed, progress=search.progress,
         )  # fmt: skip
-        return execution, alias
-
-    def polished(self, execution: Execution, alias: Alias | None) -> tuple[Execution, Alias | None]:
-        search = self.search
-        if search.effort.starts:
-            chosen = search.polished(search.chosen, "replaced")
-            with suppress(Unreachable):
-                if search.value_of(chosen) < search.value:
-                    execution, alias = self.put(chosen)
-                    search.exchange(chosen)
         return execution, alias
 
     def _unwind(self) -> None:
