@@ -35,6 +35,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.hypotheses import corrects
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
@@ -46,6 +47,7 @@ from elastocal.diagnosis.stated_floor import (
 )
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.effects.base import Stage, index
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
@@ -460,8 +462,7 @@ class SumAnswer:
     def without_names(self) -> tuple[FoundEffect, ...]:
         """Curves, lines and what has no name, which correct the arm though the verdict knows no
         cause of them."""
-        gears = (f for f in self.effects if f.effect in (JointCurve.name, GearSpectrum.name))
-        return (*gears, *self.fields)
+        return (*(f for f in self.effects if corrects(effect_of(f.effect))), *self.fields)
 
     @property
     def unnamed_probability(self) -> float:

@@ -31,6 +31,8 @@ from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import (
     BY_LAST_MOVE,
     OUT_OF_ORDER,
+    Hypothesis,
+    corrects,
     model_keys,
     possible,
     with_recorded_drivers,
@@ -321,8 +323,27 @@ def _sum_of_all(
     answer, nothing = SumAnswer(dataset, full, total, hidden, few.rng).decided, found.nothing.score
     over = compared_score(full, total) - nothing
     if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
-        return None, 0.0, answer.without_names
+        return None, 0.0, _beside(few, answer, without, progress)
     return answer, over, ()
+
+
+def _beside(
+    few: FewAnswer, answer: SumAnswer, without: Sequence[str], progress: Progress
+) -> tuple[FoundEffect, ...]:
+    """What corrects the arm beside the few causes: what has no name in the sum, searched again
+    without the names that the verdict does not know where they stand for what is unknown."""
+    chosen = few.selected.chosen
+    causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
+    known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
+    keys = {h.key for h in known}
+    named = {(c.effect.name, c.where) for c in answer.found.components if c.effect.name in causes}
+    if few.verdict != "unknown_effect" or named <= keys:
+        return answer.without_names
+    bare = few.before.changed(hypotheses=tuple(known))
+    searched = search_components(bare, chosen, True, {*without, *causes}, progress)
+    assert searched is not None  # as the verdict is open
+    full, total, hidden = searched
+    return SumAnswer(bare, full, total, hidden, few.rng).decided.without_names
 
 
 def _pieces(

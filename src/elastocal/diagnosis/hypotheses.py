@@ -169,6 +169,11 @@ def possible(
     return hypotheses, untested
 
 
+def corrects(effect: Effect) -> bool:
+    """Whether it may stand for any cause: what has no name, and curves and lines of a gear."""
+    return effect.nameless or isinstance(effect, JointCurve | GearSpectrum)
+
+
 def judged_together(
     model: Model, table: Measurements, without: Container[str] = ()
 ) -> list[Hypothesis]:
@@ -181,7 +186,7 @@ def judged_together(
         for effect in CATALOGUE.values()
         if effect.together
         and effect.name not in without
-        and not (effect.nameless or isinstance(effect, JointCurve | GearSpectrum))
+        and not corrects(effect)
         and all(recorded(table, need) for need in effect.needed(cell))
         and not (effect.unless and recorded(table, effect.unless))
         for where in effect.places(chain, cell)
@@ -213,7 +218,10 @@ def among(points: Array) -> bool:
 # What the table records decides how some effects are driven.
 
 # Effects of the last move that take it from the order of the visits.
-BY_LAST_MOVE = tuple(name for name, effect in CATALOGUE.items() if effect.family == "move")
+BY_LAST_MOVE = tuple(
+    name for name, effect in CATALOGUE.items()
+    if effect.family == "move" and "approach" not in effect.needs
+)  # fmt: skip
 OUT_OF_ORDER = (
     ". What goes with the last move was left out; give the joints of the pose before each as "
     "before_1_deg …, or the table as it was measured"
