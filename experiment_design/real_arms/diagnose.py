@@ -27,9 +27,7 @@ class Run:
     """`table` is diagnosed, and the cell identified before and after; where there is a `test`
     table, both predict its poses.  `clean` leaves out the readings that `identify` does.
 
-    `earlier` is the error in mm (of the test poses, else held out) with what the diagnosis named
-    before all causes were judged together, commit c5a4ec1; `published` the mean error in mm that
-    others reached on the same test poses.
+    `published`: the mean error in mm that others reached on the same test poses.
     """
 
     key: str
@@ -37,7 +35,6 @@ class Run:
     cell: str
     table: str
     test: str | None = None
-    earlier: float | None = None
     published: float | None = None
     clean: bool = False
 
@@ -47,38 +44,35 @@ class Run:
 
 
 RUNS = (
-    Run("ur10_100", "UR10, 100 poses", "ur10.toml", "ur10_100.csv", "ur10_test.csv", 0.349),
-    Run("ur10_600", "UR10, 600 poses", "ur10.toml", "ur10_600.csv", "ur10_test.csv", 0.340),
+    Run("ur10_100", "UR10, 100 poses", "ur10.toml", "ur10_100.csv", "ur10_test.csv"),
+    Run("ur10_600", "UR10, 600 poses", "ur10.toml", "ur10_600.csv", "ur10_test.csv"),
     Run("ur10_3000", "UR10, 3000 poses", "ur10.toml", "ur10_3000.csv", "ur10_test.csv"),
     Run(
         "ur10_blocks", "UR10, 6 blocks of 100 poses", "ur10.toml", "ur10_blocks_600.csv",
-        "ur10_blocks_test.csv", 0.488,
+        "ur10_blocks_test.csv",
     ),
     Run(
         "ur10_first", "UR10, the first 600 poses", "ur10.toml", "ur10_first_600.csv",
-        "ur10_first_test.csv", 3.610,
+        "ur10_first_test.csv",
     ),
-    Run("ur5", "UR5, 1000 poses", "ur5.toml", "ur5_grid.csv", "ur5_random.csv", 0.092, 0.155),
-    Run("wam", "WAM, 216 poses", "wam.toml", "wam_grid.csv", "wam_random.csv", 3.282, 2.918),
-    Run("iiwa7", "iiwa 7, rigid", "iiwa7_rigid.toml", "iiwa7.csv", None, 0.469),
-    Run(
-        "iiwa7_scale", "iiwa 7, rigid, encoder scales", "iiwa7_rigid_scale.toml", "iiwa7.csv",
-        None, 0.402,
-    ),
+    Run("ur5", "UR5, 1000 poses", "ur5.toml", "ur5_grid.csv", "ur5_random.csv", 0.155),
+    Run("wam", "WAM, 216 poses", "wam.toml", "wam_grid.csv", "wam_random.csv", 2.918),
+    Run("iiwa7", "iiwa 7, rigid", "iiwa7_rigid.toml", "iiwa7.csv"),
+    Run("iiwa7_scale", "iiwa 7, rigid, encoder scales", "iiwa7_rigid_scale.toml", "iiwa7.csv"),
     Run(
         "iiwa7_part", "iiwa 7, rigid, four fifths", "iiwa7_rigid.toml", "iiwa7_train.csv",
-        "iiwa7_test.csv", 0.427,
+        "iiwa7_test.csv",
     ),
-    Run("irb120", "IRB 120 by cable, as is", "irb120.toml", "irb120.csv", None, 1.737),
+    Run("irb120", "IRB 120 by cable, as is", "irb120.toml", "irb120.csv"),
     Run(
-        "irb120_clean", "IRB 120 by cable, faulty left out", "irb120.toml", "irb120.csv", None,
-        0.424, clean=True,
+        "irb120_clean", "IRB 120 by cable, faulty left out", "irb120.toml", "irb120.csv",
+        clean=True,
     ),
 )  # fmt: skip
 SUMMARY = (
-    "| run | verdict | error, mm | nominal | geometry | earlier version | as diagnosed "
+    "| run | verdict | error, mm | nominal | geometry | as diagnosed "
     "| mean of it (published) | noise floor | s | CPU s | MB |\n"
-    "|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "|---|---|---|---|---|---|---|---|---|---|---|"
 )
 
 
@@ -187,13 +181,12 @@ def diagnose(run: Run, data: Path) -> None:
 
 
 def row(run: Run, found: dict[str, Any], measured: dict[str, Any]) -> str:
-    earlier = "–" if run.earlier is None else f"{run.earlier:.3f}"
     fitted = read(OUT / f"{run.stem}_after.json")["test"]
     mean = mm((fitted or {}).get("mean_um"))
     mean += f" ({run.published:.3f})" if run.published else ""
     values = (
         run.label, found["verdict"], "test" if run.test else "held out", mm(measured["nominal"]),
-        mm(measured["before"]), earlier, mm(measured["after"]), mean,
+        mm(measured["before"]), mm(measured["after"]), mean,
         mm(found["gap"]["noise_floor_um"]),
         f"{measured['seconds']:.0f}", f"{measured['cpu']:.0f}", f"{measured['peak']:.0f}",
     )  # fmt: skip
