@@ -25,9 +25,11 @@ def key(d: Diagnosis) -> tuple[str, str]:
     return d.effects[0].effect, d.effects[0].where
 
 
-@pytest.mark.parametrize("observe", ["pose", pytest.param("distance", marks=pytest.mark.long)])
-def test_a_gears_error_shows_in(observe: str) -> None:
-    d = ec.diagnose(*campaign(ECCENTRIC, observe=observe, n=20))
+@pytest.mark.parametrize(
+    ("observe", "n"), [("pose", 20), pytest.param("distance", 40, marks=pytest.mark.long)]
+)
+def test_a_gears_error_shows_in(observe: str, n: int) -> None:
+    d = ec.diagnose(*campaign(ECCENTRIC, observe=observe, n=n))
     assert d.verdict == "explained" and key(d) == ("gear_eccentricity", "joint4")
 
 
