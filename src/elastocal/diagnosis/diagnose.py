@@ -323,12 +323,12 @@ def _sum_of_all(
     answer, nothing = SumAnswer(dataset, full, total, hidden, few.rng).decided, found.nothing.score
     over = compared_score(full, total) - nothing
     if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
-        return None, 0.0, _beside(few, answer, without, progress)
+        return None, 0.0, _beside(few, answer, open_, without, progress)
     return answer, over, ()
 
 
 def _beside(
-    few: FewAnswer, answer: SumAnswer, without: Sequence[str], progress: Progress
+    few: FewAnswer, answer: SumAnswer, open_: bool, without: Sequence[str], progress: Progress
 ) -> tuple[FoundEffect, ...]:
     """What corrects the arm beside the few causes: what has no name in the sum, searched again
     without the names that the verdict does not know where they stand for what is unknown."""
@@ -337,7 +337,7 @@ def _beside(
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
     keys = {h.key for h in known}
     named = {(c.effect.name, c.where) for c in answer.found.components if c.effect.name in causes}
-    if few.verdict != "unknown_effect" or named <= keys:
+    if not open_ or named <= keys:
         return answer.without_names
     bare = few.before.changed(hypotheses=tuple(known))
     searched = search_components(bare, chosen, True, {*without, *causes}, progress)
