@@ -356,7 +356,7 @@ def _pieces(
     floor = answer.supported.noise
     gap = Gap(
         steps[0].heldout_rms, first[-1].heldout_rms, named[-1].heldout_rms, floor,
-        answer.unexplained,
+        answer.unexplained, answer.supported.stands_out,
     )  # fmt: skip
     location = answer.location(tests)
     if location is None and gap.open:

@@ -194,6 +194,7 @@ class Gap:
 
     `unexplained` is scatter that fits as if it were noise, and is none: repeats do not show it,
     neighbours in pose or time share it, or joints would have to be worse than joints are.
+    `joint_stands_out`: one scatters more than the others let expect.
     """
 
     nominal: float
@@ -201,6 +202,7 @@ class Gap:
     explained: float
     noise_floor: float
     unexplained: float = 0.0
+    joint_stands_out: bool = False
 
     @property
     def unexplained_share(self) -> float:
@@ -216,8 +218,9 @@ class Gap:
     @property
     def open(self) -> bool:
         """Whether no verdict may call the gap explained, or nothing: what is unexplained is more
-        than the noise, and more than LARGE of the gap."""
-        return self.unexplained > self.noise_floor and self.unexplained_share > LARGE
+        than LARGE of the gap, and more than the noise or of a joint that stands out."""
+        beyond = self.joint_stands_out or self.unexplained > self.noise_floor
+        return beyond and self.unexplained_share > LARGE
 
 
 @dataclass(frozen=True)
@@ -536,7 +539,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "p_value": d.p_value,
         "probability_nothing": d.probability_nothing,
         "probability_unknown": d.probability_unknown,
-        "gap": _in_um(d.gap, *vars(d.gap)),
+        "gap": _in_um(d.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"),
         "budget": [
             {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
             for s in d.budget

@@ -258,17 +258,19 @@ def most_scatter(joint: Array) -> Array:
 @dataclass(frozen=True)
 class SupportedFloor:
     """3-D rms (m) that is `noise`, and the rest of the fitted noise, which is `unexplained`; the
-    mean squares (m²) of it that each of the `joints` and the `instrument` has."""
+    mean squares (m²) of it that each of the `joints` and the `instrument` has.  `stands_out`:
+    whether a joint scatters more than the others let expect."""
 
     noise: float
     unexplained: float
     joints: Array
     instrument: float
+    stands_out: bool
 
     @property
     def open(self) -> bool:
-        """Whether more is unexplained than is noise."""
-        return self.unexplained > self.noise
+        """Whether more is unexplained than is noise, or a joint stands out and repeats do not."""
+        return self.unexplained > (0.0 if self.stands_out else self.noise)
 
     def location(self, tests: Sequence[StructureTest]) -> Location | None:
         """Where what is unexplained lies, each joint by its share; None where not in joints."""
@@ -311,9 +313,10 @@ def supported_floor(
     size = min(data.blocks.size, 3)
     scatter = noise.joint**2 * (1 + noise.shared**2)
     smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
-    above = 0.0
+    above, excess = 0.0, np.zeros_like(scatter)
     if data.stated:  # else what joints do and what the instrument does are not to be told apart
-        smooth = np.maximum(smooth, scatter - most_scatter(noise.joint) ** 2)
+        excess = np.maximum(scatter - most_scatter(noise.joint) ** 2, 0.0)
+        smooth = np.maximum(smooth, excess)
         above = max(noise.factor**2 - MOST_STATED**2, 0.0)
     stated = np.diagonal(data.covariance, axis1=1, axis2=2)
     joints = np.array([_per_reading(data, g) for g in np.moveaxis(data.G**2 * smooth, 2, 0)])
@@ -332,7 +335,7 @@ def supported_floor(
             variance = shown
     floor = min(float(np.sqrt(variance)), fitted)
     unexplained = float(np.sqrt(max(fitted**2 - floor**2, 0.0)))
-    return SupportedFloor(floor, unexplained, joints, instrument)
+    return SupportedFloor(floor, unexplained, joints, instrument, bool(excess.any()))
 
 
 # Errors on configurations, or blocks of time, left out of the fit, in closed form.
