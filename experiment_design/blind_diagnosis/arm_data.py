@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -95,7 +95,9 @@ def draw_specimen(spec: ArmSpec, rng: np.random.Generator) -> Specimen:
     k = np.array(spec.compliance)
     k = k * rng.uniform(1 - COMPLIANCE_SPREAD, 1 + COMPLIANCE_SPREAD, J)
     true = TrueArm(
-        skeleton=_bent(spec.skeleton, rng),
+        skeleton=spec.skeleton.bent(
+            rng.normal(0.0, LENGTH, (J, 3)), rng.normal(0.0, ANGLE, (J, 3))
+        ),
         compliance=k,
         offset=rng.normal(0.0, OFFSET, J),
         base_position=believed + rng.normal(0.0, BASE_POSITION, 3),
@@ -105,13 +107,3 @@ def draw_specimen(spec: ArmSpec, rng: np.random.Generator) -> Specimen:
         hook=np.array(spec.hook),
     )
     return Specimen(true, believed, yaw, np.array(spec.compliance))
-
-
-def _bent(skeleton: Skeleton, rng: np.random.Generator) -> Skeleton:
-    """Every link's distal frame moved and turned a little along its own axes."""
-    J = skeleton.n_joints
-    position, rotation = skeleton.position.copy(), skeleton.rotation.copy()
-    shift = rng.normal(0.0, LENGTH, (J, 3))
-    position[1:] += np.einsum("jab,jb->ja", skeleton.rotation[1:], shift)
-    rotation[1:] = rotation[1:] @ Rotation.from_rotvec(rng.normal(0.0, ANGLE, (J, 3))).as_matrix()
-    return replace(skeleton, position=position, rotation=rotation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,7 @@ from skeleton import Array
 Variant = Literal[
     "as_modelled", "sigma_wrong", "heavy_tails", "outliers", "joint_pattern", "shared_scatter"
 ]
-VARIANTS: tuple[Variant, ...] = (
-    "as_modelled", "sigma_wrong", "heavy_tails", "outliers", "joint_pattern", "shared_scatter",
-)  # fmt: skip
+VARIANTS: tuple[Variant, ...] = get_args(Variant)
 
 LEVELS = (10e-6, 100e-6)  # m, rms of one coordinate over the campaign
 REPEATABILITY = 6e-6  # rad per joint and visit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,13 @@ class Skeleton:
     def link_vector(self, j: int) -> Array:
         """From joint j's frame (0-based) to the next one, (3,) m, in joint j's frame."""
         return self.position[j + 1]
+
+    def bent(self, shift: Array, turn: Array) -> Skeleton:
+        """Every link's distal frame moved and turned along its own axes, by (J, 3) m and rad."""
+        position, rotation = self.position.copy(), self.rotation.copy()
+        position[1:] += np.einsum("jab,jb->ja", rotation[1:], shift)
+        rotation[1:] = rotation[1:] @ Rotation.from_rotvec(turn).as_matrix()
+        return replace(self, position=position, rotation=rotation)
 
     def forward(self, q: Array) -> tuple[Array, Array]:
         """Rotations (n, J+1, 3, 3) and origins (n, J+1, 3) of all frames at q (n, J), base frame.

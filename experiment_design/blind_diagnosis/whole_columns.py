@@ -52,18 +52,21 @@ def scene_of(world: World, visits: Visits) -> Scene:
         R, o = _placed(arm, q + angles, motion.base)
         return np.concatenate([o[:, :-1, 2:], R[:, :-1, 2]], axis=2)
 
-    def seen(angles: Array = 0, base: Array = 0, link: tuple[int, Array] | None = None) -> Array:
-        bent = arm if link is None else _bent(arm, *link)
+    def seen(angles: Array = 0, base: Array = 0, link: Array | None = None) -> Array:
+        bent = arm
+        if link is not None:
+            shift, turn = np.split(link.reshape(J, 6), 2, axis=1)
+            bent = replace(arm, skeleton=arm.skeleton.bent(shift, turn))
         R, o = _placed(bent, q + angles, motion.base + base)
         points = o[:, -1, None] + np.einsum("nab,mb->nma", R[:, -1], arm.markers)
         return points.reshape(len(q), -1)
 
-    along, small = np.eye(J), np.eye(6)
+    along = np.eye(J)
     flange = _placed(arm, q, motion.base)[0][:, -1]
     return Scene(
         joint=_slopes([lambda h, a=a: seen(angles=h * a) for a in along]),
-        base=_slopes([lambda h, a=a: seen(base=h * a) for a in small]),
-        links=_slopes([lambda h, j=j, a=a: seen(link=(j, h * a)) for j in range(J) for a in small]),
+        base=_slopes([lambda h, a=a: seen(base=h * a) for a in np.eye(6)]),
+        links=_slopes([lambda h, a=a: seen(link=h * a) for a in np.eye(6 * J)]),
         markers=np.einsum("nab,lm->nlamb", flange, np.eye(M)).reshape(len(q), 3 * M, 3 * M),
         load=rest.load, carried=bare.load,
         weighing=-GRAVITY * _slopes(
@@ -83,15 +86,6 @@ def _placed(arm: TrueArm, q: Array, base: Array) -> tuple[Array, Array]:
     R, o = arm.skeleton.forward(q)
     foot = arm.base_position + base[:, :3]
     return turn[:, None] @ R, foot[:, None] + np.einsum("nab,njb->nja", turn, o)
-
-
-def _bent(arm: TrueArm, j: int, change: Array) -> TrueArm:
-    """The end of link j shifted and turned along its own axes, by (6,)."""
-    s = arm.skeleton
-    position, rotation = s.position.copy(), s.rotation.copy()
-    position[j + 1] += s.rotation[j + 1] @ change[:3]
-    rotation[j + 1] = rotation[j + 1] @ Rotation.from_rotvec(change[3:]).as_matrix()
-    return replace(arm, skeleton=replace(s, position=position, rotation=rotation))
 
 
 def components(world: World, visits: Visits, scene: Scene) -> dict[tuple[str, str], Array]:

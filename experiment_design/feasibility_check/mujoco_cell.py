@@ -57,11 +57,6 @@ class MujocoCell:
                 found.append((a, b, float(contact.dist)))
         return found
 
-    def slanted(self, axis: np.ndarray, least_cosine: float) -> bool:
-        """The rope's direction (flange frame) is too far from the vertical in the pose placed."""
-        down = -self.data.body("flange").xmat.reshape(3, 3)[2] @ axis
-        return bool(down / np.linalg.norm(axis) < least_cosine)
-
     def hidden(self, q: np.ndarray, end: float, loaded: bool) -> list[str]:
         """Markers that a ray from the tracker does not reach up to `end` m before them."""
         self.place(q, loaded)

@@ -3,7 +3,7 @@ that measure, identify, and compensate at the test poses."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, delayed
 
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell.work_cell import read_cell
 from elastocal.demo.example import published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
@@ -23,8 +23,8 @@ from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, plan_forces, rows_of
 from elastocal.planning.plan import Plan
-from elastocal.planning.setup import FeasiblePool, Setup, set_up
-from elastocal.planning.test_poses import TargetPoses, test_poses
+from elastocal.planning.setup import set_up
+from elastocal.planning.test_poses import test_poses
 from elastocal.simulation import simulate, values_from
 
 HERE = Path(__file__).parent
@@ -36,32 +36,20 @@ ROUNDS = 6
 CLOSE = 1e-9  # m: how near the calibrated model is brought to the target
 
 
-@dataclass(frozen=True)
 class Study:
     """A cell, its model, and what evaluates any plan in it."""
 
-    name: str
-    cell: Cell
-    model: Model
-    forces: np.ndarray
-    feasibility: Feasibility
-    targets: TargetPoses
-    setup: Setup
-    pool: FeasiblePool
-
-    @classmethod
-    def of(cls, name: str, candidates: int) -> Study:
-        model = Model(read_cell(HERE / f"{name}.toml"))
-        cell, chain = model.cell, model.chain
-        cell = replace(cell, design=replace(cell.design, candidates=candidates))
-        model = Model.assembled(chain, cell)
-        forces, feasibility = plan_forces(cell), Feasibility(cell, chain)
-        targets = test_poses(cell, chain)
-        drawn = draw(feasibility, forces, 2000, SEED)
+    def __init__(self, name: str, candidates: int) -> None:
+        self.name, cell = name, read_cell(HERE / f"{name}.toml")
+        cell = self.cell = replace(cell, design=replace(cell.design, candidates=candidates))
+        self.model = Model(cell)
+        self.forces = plan_forces(cell)
+        self.feasibility = Feasibility(cell, self.model.chain)
+        self.targets = test_poses(cell, self.model.chain)
+        drawn = draw(self.feasibility, self.forces, 2000, SEED)
         n = int(shares_of(cell).sum())
-        setup = set_up(model, drawn.q, n, targets, Known())
-        pool = setup.pool(drawn.q, drawn.group)
-        return cls(name, cell, model, forces, feasibility, targets, setup, pool)
+        self.setup = set_up(self.model, drawn.q, n, self.targets, Known())
+        self.pool = self.setup.pool(drawn.q, drawn.group)
 
     def rho(self, q: np.ndarray) -> float:
         """Predicted ρ₀ in µm of the poses q (N, n)."""
@@ -110,7 +98,7 @@ def realised(study: Study, q: np.ndarray, campaigns: int, jobs: int) -> np.ndarr
 @cache
 def _instruments(name: str) -> tuple[Study, Tool]:
     """Each process has its own: symbolic models do not pickle."""
-    study = Study.of(name, 1)
+    study = Study(name, 1)
     return study, Tool(study)
 
 

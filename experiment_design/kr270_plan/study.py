@@ -29,7 +29,7 @@ def main() -> None:
     asked = parser.parse_args()
     text = ["# Result", "", f"`study.py`, {asked.campaigns} campaigns per plan.", ""]
     for name in ("joint_limits", "work_cell"):
-        text += _of_cell(Study.of(name, asked.candidates), asked)
+        text += _of_cell(Study(name, asked.candidates), asked)
     (HERE / "result.md").write_text("\n".join(text) + "\n", encoding="utf-8")
     print("\n".join(text))
 
