@@ -224,6 +224,7 @@ def test_a_ripple_that_the_catalogue_lacks_is_an_unknown_effect_of_its_joint(tmp
     (20281601, "hysteresis", "approach_response"),
     (20281603, "hysteresis", "approach_response"),  # the rows are not in the order of the visits
     (20281603, "encoder_scale", "joint_curve"),  # harmonics imitate it, which the verdict rejects
+    (20281604, "gear_ripple", "gear_spectrum"),  # its joint scatters, by less than the instrument
 ])  # fmt: skip
 def test_what_the_catalogue_lacks_is_corrected_without_a_name(tmp_path, seed, effect, corrected_by):
     """At new poses as well as with its name; and what is left out is not found."""
