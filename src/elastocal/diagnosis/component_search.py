@@ -55,7 +55,7 @@ from elastocal.diagnosis.noise_floor import (
     posterior,
     project,
 )
-from elastocal.diagnosis.stated_floor import most_scatter
+from elastocal.diagnosis.stated_floor import scatter_beyond
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -373,7 +373,7 @@ def _quieter(found: FittedSum) -> list[FittedSum]:
     """The sum where no joint scatters far more than the others let expect, if one does: what is
     missing there has been taken for its scatter."""
     noise, usual = found.noise, NoiseValues.usual(len(found.noise.joint))
-    loud = noise.joint * np.hypot(1, noise.shared) > most_scatter(noise.joint)
+    loud = scatter_beyond(noise) > 0
     joint, shared = (
         np.where(loud, np.minimum(now, quiet), now)
         for now, quiet in ((noise.joint, usual.joint), (noise.shared, usual.shared))

@@ -255,6 +255,12 @@ def most_scatter(joint: Array) -> Array:
     return np.minimum(limit, MOST_SCATTER)
 
 
+def scatter_beyond(noise: NoiseValues) -> Array:
+    """Variance (joints,) of each joint's scatter beyond what the others let expect."""
+    scatter = noise.joint**2 * (1 + noise.shared**2)
+    return np.maximum(scatter - most_scatter(noise.joint) ** 2, 0.0)
+
+
 @dataclass(frozen=True)
 class SupportedFloor:
     """3-D rms (m) that is `noise`, and the rest of the fitted noise, which is `unexplained`; the
@@ -315,7 +321,7 @@ def supported_floor(
     smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
     above, excess = 0.0, np.zeros_like(scatter)
     if data.stated:  # else what joints do and what the instrument does are not to be told apart
-        excess = np.maximum(scatter - most_scatter(noise.joint) ** 2, 0.0)
+        excess = scatter_beyond(noise)
         smooth = np.maximum(smooth, excess)
         above = max(noise.factor**2 - MOST_STATED**2, 0.0)
     stated = np.diagonal(data.covariance, axis1=1, axis2=2)
