@@ -303,20 +303,22 @@ class Moves:
                 every = [point for part in lost for point in part]
                 # Where most hang together, all others are told at once.
                 clear = len(most) > len(every) and self.home not in every
-                gone = every if clear else lost[0]
-                named = ", ".join(self._name(point) for point in gone[:MOST_NAMED])
-                more = f" and {len(gone) - MOST_NAMED} more" if len(gone) > MOST_NAMED else ""
-                others = np.setdiff1d(np.arange(len(self.points)), gone)
-                between = self.times[gone][:, others]
-                i, j = np.unravel_index(int(np.argmin(between)), between.shape)
-                by = self._in_the_way(roadmap, int(others[j]), gone[int(i)])
-                raise Unreachable(
-                    f"{named}{more} cannot be reached{roadmap.carrying} by collision-free joint "
-                    f"moves, neither directly nor through home and other poses{by}; give another "
-                    "home in [design.motion], free the way, or narrow [limits] to exclude such "
-                    "poses",
-                    np.unique(self.pose[np.isin(self.leave, gone)]),
-                )
+                raise self._unreachable(roadmap, every if clear else lost[0])
+
+    def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
+        named = ", ".join(self._name(point) for point in lost[:MOST_NAMED])
+        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        others = np.setdiff1d(np.arange(len(self.points)), lost)
+        between = self.times[lost][:, others]
+        i, j = np.unravel_index(int(np.argmin(between)), between.shape)
+        by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
+        return Unreachable(
+            f"{named}{more} cannot be reached{roadmap.carrying} by collision-free joint moves, "
+            f"neither directly nor through home and other poses{by}; give "
+            "another home in [design.motion], free the way, or narrow [limits] to exclude such "
+            "poses",
+            np.unique(self.pose[np.isin(self.leave, lost)]),
+        )
 
     def _name(self, point: int) -> str:
         joints = ", ".join(f"{value:.3f}" for value in self.points[point])
