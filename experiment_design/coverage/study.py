@@ -17,7 +17,7 @@ import pandas as pd
 from scenarios import SCENARIOS, Setting, setting
 from scipy import stats
 
-from elastocal.identification.least_squares import cluster_robust
+from elastocal.identification.least_squares import clustered, orthogonal
 from elastocal.identification.outliers import majority, settle
 from elastocal.identification.published import eq14, ols
 
@@ -74,8 +74,9 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
     put("default", noise.x, noise.covariance.std, noise.covariance.dof)
     put("oracle", *s.oracle(e, clean), np.inf)
     plain = ols(B, e)
-    clustered = cluster_robust(B, plain.residual, np.repeat(s.configuration, 3))
-    put("OLS, CR2", plain.x, clustered.std, clustered.dof)
+    Q, V = orthogonal(B)
+    cr2 = clustered([(Q, plain.residual, np.repeat(s.configuration, 3))], V, "CR2")
+    put("OLS, CR2", plain.x, cr2.std, cr2.dof)
     if replicate % PUBLISHED_EVERY == 0:
         group, last = eq14(B, e, s.group), eq14(B, e)[-1]
         put("OLS, eq. (8)", group[0].x, group[0].std, np.inf)

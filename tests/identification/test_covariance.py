@@ -13,7 +13,12 @@ import statsmodels.api as sm
 from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.least_squares import Covariance, cluster_robust, clustered, orthogonal
+from elastocal.identification.least_squares import Covariance, clustered, orthogonal
+
+
+def cluster_robust(B, e, cluster, kind="CR2"):
+    Q, V = orthogonal(B)
+    return clustered([(Q, e, cluster)], V, kind)
 
 
 def hc(B, e, kind):
@@ -61,10 +66,10 @@ def test_clusters_are_those_of_statsmodels():
 
 def test_rows_may_come_in_parts(kind="CR2"):
     B, e, cluster = problem(6)
-    whole, factors = cluster_robust(B, e, cluster, kind), orthogonal(B)
+    whole, (Q, V) = cluster_robust(B, e, cluster, kind), orthogonal(B)
     some = np.isin(cluster, np.unique(cluster)[:3])
-    parts = [(factors.Q[own], e[own], cluster[own]) for own in (some, ~some)]
-    found = clustered(parts, factors.V, kind)
+    parts = [(Q[own], e[own], cluster[own]) for own in (some, ~some)]
+    found = clustered(parts, V, kind)
     np.testing.assert_allclose(found.matrix, whole.matrix, rtol=1e-9)
     np.testing.assert_allclose(found.dof, whole.dof, rtol=1e-9)
 

@@ -255,9 +255,8 @@ def summarise(
     estimates, combinations = _estimates(found, left_out)
     determined = tuple(model.names[c] for c in kept)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
-    leverage = found.leverage  # None of a large table
-    if leverage is None and not problem.large:
-        leverage = solution.leverage
+    heldout, leverage = solution.crossed
+    plainly_large = problem.large and solution.held is None
     report = None
     if not every.exact:
         fitted = found.solution if set_apart or found.smooth else sound
@@ -267,18 +266,18 @@ def summarise(
         noise_parts=parts, estimates=estimates, combinations=combinations, x=final.x,
         determined=determined, spread=found.spread,
         correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
-        observations=observed, residual=final.residual, held_out=solution.heldout, sigma=sigma,
+        observations=observed, residual=final.residual, held_out=heldout, sigma=sigma,
         dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
-        heldout_rms=rms_3d(solution.heldout, observed.size), nominal_rms=solution.nominal_rms,
+        heldout_rms=rms_3d(heldout, observed.size), nominal_rms=solution.nominal_rms,
         converged=final.converged, reason=final.reason, outliers=() if set_apart else faulty,
         excluded=faulty if set_apart else (), warnings=(),
         residual_summary=summarise_residuals(
-            observed, final.whitened, leverage, weights.apply(solution.heldout),
-            absolute=weights.absolute,
+            observed, final.whitened, None if plainly_large else leverage,
+            weights.apply(heldout), absolute=weights.absolute,
         ),
         faulty_report=report, active=found.active, prior_share=found.prior_share,
         smooth=found.smooth, left=left_open(solution, found.limits), copies=copies,
-        shown=_shown(solution, covariance, leverage),
+        shown=_shown(solution, covariance),
     )  # fmt: skip
     predicted = predicted_error(
         result.arm, observed, result.excess, found.spread,
@@ -326,10 +325,10 @@ def uncertainty_of(
 SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
 
 
-def _shown(solution: Solution, covariance: Array, leverage: Array | None) -> ShownPoses | None:
-    if solution.problem.large or leverage is None or not np.isfinite(covariance).all():
+def _shown(solution: Solution, covariance: Array) -> ShownPoses | None:
+    if solution.problem.large or not np.isfinite(covariance).all():
         return None
-    left = np.maximum(1 - leverage, SEEN_BY_OTHERS)
+    left = np.maximum(1 - solution.crossed[1], SEEN_BY_OTHERS)
     std = uncertainty_of(solution.problem.observations, solution.fit.B, covariance, left)
     return ShownPoses(float(std.max()), len(std))
 
@@ -563,21 +562,20 @@ def run_method(
     they know nothing of smooth functions among the parameters `free`.  Constraints and prior come
     last, on the weights and the readings that the method ends with.
     """
-    if every.problem.model.shrunk[free].any():
+    alone, smooth = options, every.problem.model.shrunk[free].any()
+    if options.knows:
+        alone = replace(options, constraints=None, prior=None, intervals="auto")
+    if smooth:
         from elastocal.identification.smooth_fit import fit_smooth  # few models have any
 
         found = fit_smooth(every, sound, faulty, free, options, progress)
-    elif options.knows:
-        alone = replace(options, constraints=None, prior=None, intervals="auto")
-        found = _by_method(every, sound, faulty, refit, alone, progress)
     else:
-        found = _by_method(every, sound, faulty, refit, options, progress)
-        return with_limits(every, found, options)
-    if not options.knows:
-        return found
-    from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
+        found = _by_method(every, sound, faulty, refit, alone, progress)
+    if options.knows:
+        from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
 
-    return fit_with_knowledge(found, options, progress)
+        return fit_with_knowledge(found, options, progress)
+    return found if smooth else with_limits(every, found, options)
 
 
 def _by_method(
@@ -734,7 +732,7 @@ def _held_out_rms(solution: Solution, judge: Solution) -> float:
     """Root mean square length in m of what poses left out are off by: those which the noise of
     `judge` takes for one, configurations or blocks in time."""
     judged, together = judge.problem.observations, judge.problem.weights.together
-    held = solution.heldout
+    held = solution.crossed[0]
     if together is not None:
         block = dict(zip(judged.configuration.tolist(), together.tolist(), strict=True))
         observed, weights = solution.problem.observations, solution.problem.weights

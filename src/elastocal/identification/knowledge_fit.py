@@ -301,17 +301,15 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     } if len(P) else {}  # fmt: skip
     # Linearised, with the active constraints kept active: directions of the face are orthonormal by
     # the rows of readings and prior together.
-    heldout, leverage = held_out_by_parts(
-        problem.model, problem.parts, found.fit.x, columns, found.face
-    )
+    crossed = held_out_by_parts(problem.model, problem.parts, found.fit.x, columns, found.face)
     final = replace(
-        solution, fit=_as_fit(found), reduction=_reduction(solution, found), held=heldout
+        solution, fit=_as_fit(found), reduction=_reduction(solution, found), held=crossed
     )
     doubts = _contradiction(before, found, stated)
     return replace(
         before, method="constrained", solution=final, spread=spread,
         active=found.best.active, prior_share=shares, effective=round(found.effective),
-        leverage=leverage, warnings=(*before.warnings, *doubts),
+        warnings=(*before.warnings, *doubts),
         smooth=tuple(part.refitted(final.fit.x, columns, spread.matrix) for part in before.smooth),
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.identification.constrained import minimise
 from elastocal.identification.knowledge import System
 from elastocal.identification.weighted_problem import (
     Evaluation,
@@ -195,7 +196,7 @@ class Objective:
             cond = max(at.r_factor.rows, p) * np.finfo(float).eps
             step = least_norm(damped, target, cond=cond)
         else:
-            step = _least(damped, target, self.limits.moved(u, np.ones(p)))
+            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
@@ -243,13 +244,6 @@ class Objective:
         return damping
 
 
-def _least(J: Array, t: Array, limits: System) -> Array:
-    """x (p,) with the least |t − J x|² within the limits."""
-    from elastocal.identification.constrained import minimise  # it brings a cone solver
-
-    return minimise(J, t, limits).x
-
-
 def _steepest(at: Evaluation) -> float:
     return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
@@ -281,7 +275,7 @@ def fit(
     known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
     objective = Objective(problem, columns, x, size, known)
     if objective.limits is not None:  # the nearest that is allowed
-        u = _least(np.eye(len(u)), u, objective.limits)
+        u = minimise(np.eye(len(u)), u, objective.limits).x
     u, at, reason = objective.descend(u, tolerance, max_steps)
     return Fit(
         objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
@@ -369,20 +363,12 @@ def t_quantile(level: float, dof: Array) -> Array:
 EPS = float(np.finfo(np.float64).eps)
 
 
-@dataclass(frozen=True)
-class Orthogonal:
-    """Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and V Vᵀ = (BᵀB)⁻¹.
+def orthogonal(B: Array) -> tuple[Array, Array]:
+    """Of the whitened B (rows, p) Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and
+    V Vᵀ = (BᵀB)⁻¹.
 
     Any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ: BᵀB, whose condition is that of B squared,
     is never formed.  Row j of V is the coefficient of parameter j on the columns of Q.
-    """
-
-    Q: Array
-    V: Array
-
-
-def orthogonal(B: Array) -> Orthogonal:
-    """Factors of the whitened B (rows, p).
 
     Raises InputError where the columns depend on each other, InsufficientDataError where there are
     no more rows than parameters.
@@ -403,7 +389,7 @@ def orthogonal(B: Array) -> Orthogonal:
         raise InputError(f"columns {names} of B depend on the others; drop them first")
     V = np.empty((p, p))
     V[order] = linalg.solve_triangular(R, np.eye(p)) / lengths[order, None]
-    return Orthogonal(Q, V)
+    return Q, V
 
 
 # Satterthwaite degrees of freedom of variance estimates that are sums of squares.
@@ -459,11 +445,10 @@ DESCRIPTION = {
 Rows = tuple[Array, Array, IntArray]  # Q_c and e_c of whole clusters, and the cluster of each
 
 
-def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> Covariance:
-    """Covariance of x̂ that allows any correlation within a cluster (equations above).
-
-    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual; `cluster` (n,) labels in
-    any order.
+def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
+    """Covariance of x̂ that allows any correlation within a cluster (equations above), of rows in
+    parts, Q = B V with V Vᵀ = (BᵀB)⁻¹ and e = y − B x̂ the least-squares residual, whitened; HC0
+    to HC3 are the CR where every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
 
     Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the
     generalised inverse square root, which leaves parameters outside that direction unbiased
@@ -472,14 +457,6 @@ def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> 
     single cluster.
 
     Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
-    """
-    factors = orthogonal(B)
-    return clustered([(factors.Q, e, cluster)], factors.V, kind)
-
-
-def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
-    """The same of rows that come in parts, Q = B V with V Vᵀ = (BᵀB)⁻¹; HC0 to HC3 are the CR where
-    every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
 
     Degrees of freedom by Satterthwaite for every kind, each for its own A_c (Pustejovsky & Tipton
     2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero over the clusters, and far

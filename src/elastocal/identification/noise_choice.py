@@ -608,8 +608,8 @@ def _orthonormal(readings: Readings) -> tuple[Readings, Array]:
     Neither the units of the parameters nor their correlation then cost digits, and columns that
     depend on each other are found out.
     """
-    factors = orthogonal(readings.B.reshape(-1, readings.n_parameters))
-    return replace(readings, B=factors.Q.reshape(readings.B.shape)), factors.V
+    Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
+    return replace(readings, B=Q.reshape(readings.B.shape)), T
 
 
 def _result(

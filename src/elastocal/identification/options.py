@@ -153,11 +153,11 @@ class MethodResult:
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
     fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
-    many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
-    the readings contradict them; in a fit to readings alone effective and leverage follow from
-    the solution.  `smooth` are the smooth functions, whose prior is `functions`, with which
-    `standard` (N, size) are the residuals of all readings free of the fit's part in them.  `limits`
-    are the 95 % intervals of the parameters that the readings `hardly_shown`, by their index.
+    many parameters the readings paid for (`effective`; in a fit to readings alone all fitted), and
+    `warnings` where the readings contradict them.  `smooth` are the smooth functions, whose prior
+    is `functions`, with which `standard` (N, size) are the residuals of all readings free of the
+    fit's part in them.  `limits` are the 95 % intervals of the parameters that the readings
+    `hardly_shown`, by their index.
     """
 
     method: str
@@ -168,7 +168,6 @@ class MethodResult:
     active: tuple[ActiveConstraint, ...] = ()
     prior_share: dict[str, float] = field(default_factory=dict)
     effective: int | None = None
-    leverage: Array | None = None
     warnings: tuple[str, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
     functions: FunctionPrior | None = None

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.least_squares import Covariance, Problem, cluster_robust, orthogonal
+from elastocal.identification.least_squares import Covariance, Problem, clustered, orthogonal
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import MethodResult
@@ -565,7 +565,6 @@ class RobustEstimate:
     c: float
     z: Array
     scale: float
-    converged: bool
 
     @property
     def x(self) -> Array:
@@ -574,12 +573,7 @@ class RobustEstimate:
     @property
     def distance(self) -> Array:
         """|e_i|/σ (n,)."""
-        return lengths(self.residual, self.size) / self.scale
-
-    @property
-    def weights(self) -> Array:
-        """ψ(d)/d (n,)."""
-        return loss_weights(self.distance, self.c)
+        return np.linalg.norm(self.residual.reshape(-1, self.size), axis=1) / self.scale
 
     @property
     def smooth_c(self) -> float:
@@ -593,14 +587,9 @@ class RobustEstimate:
         h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3) * (1.5 / (2 * np.pi)) ** (1 / 3)
         return max(self.c, float(np.quantile(kept, min(2 * h, 0.98)))) if self.c == L1 else self.c
 
-
-def lengths(residual: Array, size: int) -> Array:
-    """|e_i| (n,) of each observation."""
-    return np.linalg.norm(residual.reshape(-1, size), axis=1)
-
-
-def loss_weights(d: Array, c: float) -> Array:
-    return c / np.maximum(d, c)
+    def weights(self, c: float) -> Array:
+        """ψ(d)/d (n,)."""
+        return c / np.maximum(self.distance, c)
 
 
 def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstimate:
@@ -610,23 +599,25 @@ def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstima
 
     It has one solution, and resists errors in y but not at leverage points.
     """
-    factors, c = orthogonal(B), HUBER[size - 1] if c is None else c
-    Q, z, converged = factors.Q, factors.Q.T @ y, False
-    floor = float(np.finfo(float).eps * np.sqrt(np.mean(y**2)) + np.finfo(float).tiny)
-    r = y - Q @ z
-    scale = max(median_scale(lengths(r, size), size), floor)
-    for _ in range(MAX_ITER):
-        weighted = Q.T * np.repeat(loss_weights(lengths(r, size) / scale, c), size)
-        step = linalg.solve(weighted @ Q, weighted @ r, assume_a="pos")
-        z, before = z + step, scale
+    (Q, V), c = orthogonal(B), HUBER[size - 1] if c is None else c
+    eps = np.finfo(float).eps
+    floor = float(eps * np.sqrt(np.mean(y**2)) + TINY)
+
+    def at(z: Array) -> RobustEstimate:
         r = y - Q @ z
-        scale = max(median_scale(lengths(r, size), size), floor)
-        moved = float(np.linalg.norm(step))
-        still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
-        same = abs(scale - before) <= TOLERANCE * scale
-        if converged := bool((moved <= TOLERANCE * scale or still) and same):
+        scale = median_scale(np.linalg.norm(r.reshape(-1, size), axis=1), size)
+        return RobustEstimate(Q, V, r, size, c, z, max(scale, floor))
+
+    found = at(Q.T @ y)
+    for _ in range(MAX_ITER):
+        weighted, before = Q.T * np.repeat(found.weights(c), size), found.scale
+        step = linalg.solve(weighted @ Q, weighted @ found.residual, assume_a="pos")
+        found, moved = at(found.z + step), float(np.linalg.norm(step))
+        still = moved <= 4 * eps * np.linalg.norm(found.z)  # no more digits in z
+        same = abs(found.scale - before) <= TOLERANCE * found.scale
+        if (moved <= TOLERANCE * found.scale or still) and same:
             break
-    return RobustEstimate(Q, factors.V, r, size, c, z, scale, converged)
+    return found
 
 
 # Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
@@ -645,7 +636,7 @@ def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstima
 # residual came out large, not because its variance was known to be.
 
 
-def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = None) -> Covariance:
+def covariance_of(found: RobustEstimate, cluster: IntArray | None = None) -> Covariance:
     """Covariance (p, p) of x̂ of y ≈ B x.
 
     Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
@@ -657,7 +648,7 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
     """
     rows, p, size, d = len(found.residual), len(found.z), found.size, found.distance
     c = found.smooth_c
-    along, across, psi = (d <= c).astype(float), loss_weights(d, c), np.minimum(d, c)
+    along, across, psi = (d <= c).astype(float), found.weights(c), np.minimum(d, c)
     a = float(np.mean(along + (size - 1) * across)) / size
     if not a > 0:
         raise InsufficientDataError(
@@ -666,7 +657,7 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
         )
     if cluster is not None:
         pseudo = np.repeat(across, size) * found.residual / a
-        return cluster_robust(B, pseudo, np.repeat(cluster, size), "CR3")
+        return clustered([(found.Q, pseudo, np.repeat(cluster, size))], found.V, "CR3")
     square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
     k = 1 + p / rows * (square - a**2) / a**2
     variance = (k * found.scale / a) ** 2 * float(psi @ psi) / (rows - p)
@@ -709,8 +700,8 @@ def robust_result(
     observed, weights = problem.observations, problem.weights
     while True:
         at = problem.model.regressor(observed.table, x, kept, observed)
-        B, e = weights.apply(at.B), weights.apply(at.residual)
-        found = huber(B, e, observed.size, None if method == "huber" else L1)
+        c = None if method == "huber" else L1
+        found = huber(weights.apply(at.B), weights.apply(at.residual), observed.size, c)
         converged = bool(np.linalg.norm(found.z) <= STILL * found.scale * np.sqrt(len(kept)))
         if converged or steps == MOST_MOVES:
             break
@@ -722,13 +713,14 @@ def robust_result(
         reason=sound.fit.reason if converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
-    root = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
+    root = np.sqrt(np.repeat(np.minimum(found.weights(found.c), 1e6), observed.size))
     whiten = sparse.csr_array(sparse.diags_array(root))
     if weights.whiten is not None:
         whiten = sparse.csr_array(whiten @ weights.whiten)
     heldout = held_out_residual(
         fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
     )
-    solution = replace(sound, fit=fit, held=heldout)
+    solution = replace(sound, fit=fit)
+    solution = replace(solution, held=(heldout, solution.crossed[1]))
     cluster = None if intervals == "auto" else observed.configuration
-    return MethodResult(method, solution, covariance_of(found, B, cluster), None, good)
+    return MethodResult(method, solution, covariance_of(found, cluster), None, good)

@@ -64,10 +64,10 @@ def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> Publ
     if len(dp) != len(B):
         raise InputError(f"dp must have shape ({len(B)},), as B has {len(B)} rows; got {dp.shape}")
     w = _positive("weights", weights, len(dp))
-    factors, x = orthogonal(w[:, None] * B), np.zeros(B.shape[1])
+    (Q, V), x = orthogonal(w[:, None] * B), np.zeros(B.shape[1])
     for _ in range(3):  # refined twice
-        x = x + factors.V @ (factors.Q.T @ (w * (dp - B @ x)))
-    covariance = factors.V @ factors.V.T
+        x = x + V @ (Q.T @ (w * (dp - B @ x)))
+    covariance = V @ V.T
     if sigma is not None:
         middle = B * (w**2 * _positive("sigma", sigma, len(dp)))[:, None]
         covariance = covariance @ (middle.T @ middle) @ covariance

@@ -345,7 +345,7 @@ def fit_smooth(
         held = rms_3d(cross[0], size)
         tried.append((not fit.found.converged, held, search, (fit, cross, noise, good)))
         # A prior that leads astray predicts worse than the ordinary parameters alone.
-        if not len(sized) or (fit.found.converged and held <= rms_3d(sound.heldout, size)):
+        if not len(sized) or (fit.found.converged and held <= rms_3d(sound.crossed[0], size)):
             break
     _, _, search, parts = min(tried, key=lambda course: course[:2])
     return search.result(*parts)
@@ -533,7 +533,7 @@ class _Course:
         problem = replace(found.problem, free=self.sound.problem.free)
         mixing = np.vstack([r.mixing, np.zeros((len(posterior.own), len(r.dropped)))])
         solution = replace(
-            self.sound, held=cross[0], nominal_rms=self.every.nominal_rms,
+            self.sound, held=cross, nominal_rms=self.every.nominal_rms,
             fit=replace(found, problem=problem, r_factor=posterior.marginal),
             reduction=replace(r, kept=columns, mixing=mixing, with_prior=f.columns),
         )  # fmt: skip
@@ -554,7 +554,7 @@ class _Course:
         own, shares = columns[k:], zip(columns[k:], share[k:].tolist(), strict=True)
         sigma, std = fit.scales.sigma, fit.scales.sigma / np.diag(posterior.P[:, k:])
         return MethodResult(
-            method, solution, covariance, noise, good, leverage=cross[1], standard=self.standard,
+            method, solution, covariance, noise, good, standard=self.standard,
             prior_share={model.names[c]: part for c, part in shares if not model.shrunk[c]},
             effective=round(effective), warnings=self._warnings(fit),
             smooth=self._parts(fit, covariance.matrix),

@@ -311,14 +311,14 @@ class Solution:
     """The fit of the kept set, which parameters those are, and how well it predicts.
 
     `reduction` holds indices into the model's parameters; `nominal_rms` is the 3-D rms in m of the
-    nominal arm with only base, markers and cable placed; `held` is `heldout` where that is not what
+    nominal arm with only base, markers and cable placed; `held` is `crossed` where that is not what
     B and weights say.
     """
 
     fit: Fit
     reduction: Reduction
     nominal_rms: float
-    held: Array | None = None
+    held: tuple[Array, Array] | None = None
 
     @property
     def problem(self) -> Problem:
@@ -334,18 +334,10 @@ class Solution:
         return rms_3d(self.fit.residual, self.problem.observations.size) < EXACT
 
     @cached_property
-    def _looked(self) -> tuple[Array, Array]:
-        return looked_at(self.fit)
-
-    @property
-    def heldout(self) -> Array:
-        """Residual (rows,) of each configuration under a fit to the others."""
-        return self._looked[0] if self.held is None else self.held
-
-    @property
-    def leverage(self) -> Array:
-        """How much each row (rows,) draws the fit to itself, 0 to 1."""
-        return self._looked[1]
+    def crossed(self) -> tuple[Array, Array]:
+        """Residual (rows,) of each configuration under a fit to the others, and leverage (rows,),
+        how much each row draws the fit to itself, 0 to 1."""
+        return looked_at(self.fit) if self.held is None else self.held
 
 
 def solve(
