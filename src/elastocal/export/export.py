@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,9 @@ from elastocal.export.exportable import (
 from elastocal.export.mjcf_file import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
+from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
-from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import SmoothGroup, smooth_groups
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
@@ -40,112 +39,6 @@ from elastocal.model.xml_file import XmlFile
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
 from elastocal.units import Array, microns, rpy_from_rotation
-
-# The parameters as YAML or JSON, to be read by people and by programs of their own.
-
-PARAMETERS = "elastocal/parameters/1"
-KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
-
-
-def _parameters(calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost, format: str) -> str:
-    """Everything to be written: estimates, the geometry they make, and that geometry's cost.
-
-    Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
-    rad (roll, pitch, yaw), offsets included, so that joint values stay commanded ones.
-    """
-    chain = pieces.calibrated_chain()
-    cell = calibrated.model.cell
-
-    def placed(T: Array) -> dict[str, list[float]]:
-        rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
-        return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
-
-    document = {
-        "schema": PARAMETERS,
-        "robot": chain.name,
-        "cell": None if cell.path is None else Path(cell.path).name,
-        "result": Path(calibrated.source).name,
-        "units": "SI: m, rad, N, kg",
-        "parameters": [  # what an older result does not have is null
-            {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
-            for name, entry in zip(calibrated.model.names, calibrated.entries, strict=True)
-        ],
-        "geometry": {
-            "tracker_to_base": placed(pieces.T_tracker_base),
-            "joints": [
-                {"name": joint.name, "kind": joint.kind, **placed(joint.placement),
-                 "axis": [float(v) for v in joint.axis]}
-                for joint in chain.joints
-            ],
-            "flange": placed(chain.flange_placement),
-            "markers": {name: placed(T) for name, T in pieces.markers.items()},
-            "load_point_m": [float(v) for v in pieces.load_point],
-        },
-        "geometry_alone": cost.to_json(),
-    }  # fmt: skip
-    if format == "json":
-        return json_text(document) + "\n"
-    import yaml
-
-    return str(yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf))
-
-
-# Smooth functions as a table: what no format of geometry holds, for controllers of one's own.
-
-CORRECTIONS_HEADER = (
-    "effect", "where", "follows", "position_deg", "time_s", "component", "unit", "value", "half95",
-)  # fmt: skip
-LEVEL = 0.95
-PER_LENGTH = 10  # rows for each correlation length
-FEWEST, MOST = 21, 5001
-MICRO = {"rad": "urad", "m": "um"}
-
-
-def _corrections(calibrated: CalibratedArm, wish: Wish, kept: Kept, _: ExportNumbers) -> Written:
-    """Every smooth function over its range, with the half width of its 95 % band.
-
-    A row says by how much (urad or um) the place has moved beyond its commanded or identified
-    position: of a joint its angle, of a link its end frame along and about its axes (components 1
-    to 6), of the base along and about the data's axes, of a marker its position in the flange
-    frame.  `position_deg` or `time_s` is what it follows.  A line that begins with # says where
-    the numbers come from.
-    """
-    groups = smooth_groups(calibrated.model)
-    rows = [row for group in groups for row in _correction_rows(calibrated, group)]
-    if not rows:
-        raise InputError(
-            f"{calibrated.source}: this arm has no smooth function to be written as corrections; "
-            "elastocal diagnose finds those that the readings show"
-        )
-    return Written(csv_text(CORRECTIONS_HEADER, rows, [_note(calibrated, kept)]))
-
-
-def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:
-    names, place = calibrated.model.names, {n: k for k, n in enumerate(calibrated.determined)}
-    if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
-        return
-    steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
-    x = group.grid(min(max(steps + 1, FEWEST), MOST))
-    waves = group.basis(x)
-    quantile = float(t_quantile(LEVEL, np.array(np.inf)))
-    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True), 1):
-        known = np.array([names[c] in place for c in columns])
-        at = [place[names[c]] for c in columns[known]]
-        own = waves[:, known]
-        variance = np.einsum("nk,kl,nl->n", own, calibrated.covariance[np.ix_(at, at)], own)
-        half = quantile * np.sqrt(np.maximum(variance, 0.0))
-        value = waves @ calibrated.x[columns]
-        for position, *sizes in zip(x, value, half, strict=True):
-            angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
-            micro = (f"{size * 1e6 + 0.0:.3f}" for size in sizes)
-            yield (
-                group.effect, group.where, group.follows,
-                *((angle, "") if group.lasting else ("", time)),
-                str(component), MICRO.get(unit, unit), *micro,
-            )  # fmt: skip
-
-
-# Which format a file is written in: by its ending, or as asked for.
 
 ENDINGS = {
     ".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh", ".yaml": "yaml",
@@ -156,26 +49,7 @@ FRAMED = ("urdf", "mjcf")
 FITTED = (*FRAMED, "dh", "mdh")
 
 
-def format_of(path: Path, asked: str | None) -> str:
-    if asked is not None:
-        if asked.lower() not in FORMATS:
-            raise InputError(
-                f"{option('format')} takes one of {', '.join(FORMATS)}; found '{asked}'"
-                f"{did_you_mean(asked.lower(), FORMATS)}"
-            )
-        return asked.lower()
-    found = ENDINGS.get(path.suffix.lower())
-    if found is None:
-        raise InputError(
-            f"{path}: the ending '{path.suffix}' names no known format; use one of "
-            f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}"
-        )
-    return found
-
-
 SCHEMA = "elastocal/export/1"
-
-
 MOST_POSES = 1_000_000
 
 
@@ -200,7 +74,7 @@ class Wish:
     correct_joints: bool = False
 
     def __post_init__(self) -> None:
-        format_of(self.path, self.format)
+        _ = self.kind
         for name, low, high in (("temperature_c", -273.15, 2000.0), ("time_s", -1e9, 1e9)):
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
@@ -215,43 +89,50 @@ class Wish:
 
     @property
     def kind(self) -> str:
-        return format_of(self.path, self.format)
-
-    @property
-    def conditions(self) -> Conditions:
-        force = given_force(self.load)
-        force = np.zeros(3) if force is None else force
-        return Conditions(force, self.time_s, self.temperature_c)
+        """The format: as asked for, or by the file's ending."""
+        ending = ENDINGS.get(self.path.suffix.lower(), "")
+        found = ending if self.format is None else self.format.lower()
+        require(
+            self.format is not None or bool(ending),
+            f"{self.path}: the ending '{self.path.suffix}' names no known format; use one of "
+            f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}",
+        )
+        require(
+            found in FORMATS,
+            f"{option('format')} takes one of {', '.join(FORMATS)}; found '{self.format}'"
+            f"{did_you_mean(found, FORMATS)}",
+        )
+        return found
 
 
 @dataclass(frozen=True)
-class Written:
-    """A text, its largest distance in m when read back and with what (None where it was not), what
-    to know of it, and of a DH table with a column beta_rad the largest distance in m for who reads
-    four columns only."""
-
-    text: str
-    checked: float | None = None
-    checked_with: str = ""
-    warnings: tuple[str, ...] = ()
-    without_beta: float | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Exported(Written):
+class Exported:
     """What was written, and at which cost.
 
     `held`: parameters that the data did not determine, with the values used; `refit`: how far the
     file is from the arm before and after what it holds was fitted to it; `correction`: where its
-    joints are to be commanded besides, empty where nothing was asked for.
+    joints are to be commanded besides, empty where nothing was asked for; `checked`: the largest
+    distance in m when it was read back with `checked_with`, None where it was not; `without_beta`:
+    of a DH table with a column beta_rad that in m for who reads four columns only.
     """
 
     format: str
     cost: Cost
     held: dict[str, float]
     of_the_measurement: tuple[str, ...]
-    refit: Refit | None = None
-    correction: JointCorrection = field(default_factory=JointCorrection)
+    refit: Refit | None
+    correction: JointCorrection
+    warnings: tuple[str, ...]
+    text: str = ""
+    checked: float | None = None
+    checked_with: str = ""
+    without_beta: float | None = None
+
+    def written(
+        self, text: str, *told: str, read: tuple[float | None, str] = (None, "")
+    ) -> Exported:
+        warnings, (checked, how) = (*self.warnings, *told), read
+        return replace(self, text=text, warnings=warnings, checked=checked, checked_with=how)
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -282,15 +163,16 @@ def export(
         if given and wish.kind not in formats:
             raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.kind}")
     # The visits measured, where they are known, count under the load that was asked for.
-    visits, conditions = calibrated.visits, wish.conditions
+    visits, force = calibrated.visits, given_force(wish.load)
     require(
         visits is not None or not wish.correct_joints,
         f"{calibrated.source} does not say where the arm was measured, which "
         f"{option('joint_correction')} needs; identify anew",
     )
-    if visits is not None and wish.load is not None:
-        visits = replace(visits, force=np.broadcast_to(conditions.force, visits.force.shape))
-    conditions = replace(conditions, visits=visits)
+    if visits is not None and force is not None:
+        visits = replace(visits, force=np.broadcast_to(force, visits.force.shape))
+    force = np.zeros(3) if force is None else force
+    conditions = Conditions(force, wish.time_s, wish.temperature_c, visits)
     kept = exportable.keep(calibrated, elastic=wish.kind == "mjcf", conditions=conditions)
     refit, correction = None, JointCorrection()
     if wish.kind in FITTED:
@@ -300,34 +182,24 @@ def export(
     progress("what the format cannot hold")
     cost = exportable.cost_of(kept, wish.poses, wish.seed)
     progress("writing and reading back")
-    if wish.kind in WRITERS:
-        found = WRITERS[wish.kind](calibrated, wish, kept, pieces)
-    else:
-        found = Written(_parameters(calibrated, pieces, cost, wish.kind))
     # Smooth functions are zero where nothing shows them: no values that are held.
-    model, entries = calibrated.model, calibrated.entries
-    each = zip(model.names, entries, model.shrunk, strict=True)
-    told = (*_warnings(calibrated, kept, cost), *found.warnings)
-    return Exported(
-        **vars(found) | {"warnings": told},
-        format=wish.kind,
-        cost=cost,
-        held={n: plain(e.get("held")) for n, e, shrunk in each
-              if not shrunk and e.get("identifiable") is not True},
-        of_the_measurement=kept.of_the_measurement,
-        refit=refit,
-        correction=correction,
-    )  # fmt: skip
+    each = zip(calibrated.model.parameters, calibrated.entries, strict=True)
+    held = {p.name: plain(e.get("held")) for p, e in each
+            if not p.shrunk and e.get("identifiable") is not True}  # fmt: skip
+    told = tuple(_warnings(calibrated, kept, cost))
+    done = Exported(wish.kind, cost, held, kept.of_the_measurement, refit, correction, told)
+    format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
+    written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
+    return written
 
 
 def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
     spec, loads = calibrated.model.cell.model, len(cost.forces)
-    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
     doubts = (
         (kept.fitted and loads > 1 and not kept.exported.elastic,
          f"the arm sags under its load and this file cannot: it is fitted to all {loads} loads "
          f"measured; state {option('load')} for the one that it is for"),
-        (elastic and not cost.forces.any() and not spec.link_gravity,
+        (calibrated.elastic and not cost.forces.any() and not spec.link_gravity,
          f"no load is given, so compliances cost nothing here: state one with {option('load')} "
          "(N, in the tracker's axes)"),
         (spec.torque == "measured",
@@ -347,13 +219,285 @@ def write(done: Exported, path: Path, correction: str | Path | None) -> None:
             atomic_write(correction, done.correction.csv([told]))
 
 
-# Each format written, and read back by the library that users read it with before it is kept.
-
+PARAMETERS = "elastocal/parameters/1"
+KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
+CORRECTIONS_HEADER = (
+    "effect", "where", "follows", "position_deg", "time_s", "component", "unit", "value", "half95",
+)  # fmt: skip
+LEVEL = 0.95
+PER_LENGTH = 10  # rows for each correlation length
+FEWEST, MOST = 21, 5001
+MICRO = {"rad": "urad", "m": "um"}
 LARGEST = 1e-8  # m; a hundred times the rounding of a chain of a few metres
 LARGEST_AT_REST = 1e-6  # m
 POSES_AT_REST = 20
 # Origin and points 0.1 m along the flange's axes, homogeneous (4, 4).
 CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
+
+
+@dataclass(frozen=True)
+class _Writing:
+    """One arm in the formats there are, each read back by the library that users read it with
+    before it is kept."""
+
+    calibrated: CalibratedArm
+    wish: Wish
+    kept: Kept
+    pieces: ExportNumbers
+    done: Exported
+
+    def parameters(self) -> Exported:
+        """Everything to be written: estimates, the geometry they make, and that geometry's cost.
+
+        Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
+        rad (roll, pitch, yaw), offsets included, so that joint values stay commanded ones.
+        """
+        pieces, model = self.pieces, self.calibrated.model
+        chain, cell = pieces.calibrated_chain(), model.cell
+
+        def placed(T: Array) -> dict[str, list[float]]:
+            rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
+            return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
+
+        document = {
+            "schema": PARAMETERS,
+            "robot": chain.name,
+            "cell": None if cell.path is None else Path(cell.path).name,
+            "result": Path(self.calibrated.source).name,
+            "units": "SI: m, rad, N, kg",
+            "parameters": [  # what an older result does not have is null
+                {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
+                for name, entry in zip(model.names, self.calibrated.entries, strict=True)
+            ],
+            "geometry": {
+                "tracker_to_base": placed(pieces.T_tracker_base),
+                "joints": [
+                    {"name": joint.name, "kind": joint.kind, **placed(joint.placement),
+                     "axis": [float(v) for v in joint.axis]}
+                    for joint in chain.joints
+                ],
+                "flange": placed(chain.flange_placement),
+                "markers": {name: placed(T) for name, T in pieces.markers.items()},
+                "load_point_m": [float(v) for v in pieces.load_point],
+            },
+            "geometry_alone": self.done.cost.to_json(),
+        }  # fmt: skip
+        if self.wish.kind == "json":
+            return self.done.written(json_text(document) + "\n")
+        import yaml
+
+        text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
+        return self.done.written(text)
+
+    def corrections(self) -> Exported:
+        """Every smooth function over its range, with the half width of its 95 % band.
+
+        A row says by how much (urad or um) the place has moved beyond its commanded or identified
+        position: of a joint its angle, of a link its end frame along and about its axes
+        (components 1 to 6), of the base along and about the data's axes, of a marker its position
+        in the flange frame.  `position_deg` or `time_s` is what it follows.  A line that begins
+        with # says where the numbers come from.
+        """
+        groups = smooth_groups(self.calibrated.model)
+        rows = [row for group in groups for row in _correction_rows(self.calibrated, group)]
+        if not rows:
+            raise InputError(
+                f"{self.calibrated.source}: this arm has no smooth function to be written as "
+                "corrections; elastocal diagnose finds those that the readings show"
+            )
+        return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
+
+    @property
+    def note(self) -> str:
+        conditions, cell = self.kept.conditions, self.calibrated.model.cell
+        source = Path(self.calibrated.source).name
+        of = Path(cell.path).name if cell.path else "cell"
+        told = f"calibrated by elastocal: {source} of {of}"
+        if conditions.temperature is not None:
+            told += f", at {conditions.temperature:g} °C"
+        if conditions.time is not None:
+            told += f", at {conditions.time:g} s"
+        if self.kept.fitted and conditions.visits is not None:
+            sizes = np.linalg.norm(conditions.visits.force, axis=1)
+            low, high = f"{sizes.min():.4g}", f"{sizes.max():.4g}"
+            span = high if low == high else f"{low} to {high}"
+            told += f", fitted where it was measured, under {span} N"
+        return told
+
+    def random(self, poses: int) -> Measurements:
+        return random_table(self.kept.full.model, self.kept.conditions, poses, self.wish.seed)
+
+    def urdf(self) -> Exported:
+        from elastocal.model.urdf import check_urdf, tree_of
+
+        robot, chain = self.calibrated.model.cell.robot, self.pieces.calibrated_chain()
+        how = self.pieces, self.wish.frames, self.wish.base_frame, self.note
+        if robot.urdf is not None:
+            text = rigid_files.calibrated_urdf(robot, *how)
+            text, told = rigid_files.moved(robot.urdf, text, self.wish.path.parent)
+            base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
+        else:
+            text, base, flange = rigid_files.new_urdf(*how), rigid_files.BASE, rigid_files.FLANGE
+            told = [
+                "inertia tensors are zero in this file: of the links masses and their centres "
+                "alone are known. Its kinematics and weights are right; before simulating motion "
+                "put in tensors"
+                + (", or export as .xml, which keeps those of the model" * (robot.mjcf is not None))
+                if self.pieces.nominal_masses
+                else "the links have no <inertial> in this file, as their masses are not known"
+            ]
+        back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF")).chain(base, flange)
+        q = self.random(100).q
+        expected = nominal_flanges(chain, q)
+        apart, names = _apart(nominal_flanges(back, q), expected), [j.name for j in chain.joints]
+        try:
+            found = rigid_files.urdf_flanges(text, names, base, flange, q)
+        except (ValueError, RuntimeError) as error:  # pinocchio's own
+            refused = (
+                "pinocchio's own reader refuses this file, as it does without the corrections "
+                f"({str(error).strip().splitlines()[0]}); only elastocal's has read it back"
+            )
+            return self.done.written(
+                text, *told, refused, read=(apart, "elastocal's reader of URDF")
+            )
+        return self.done.written(
+            text, *told, read=(max(apart, _apart(found, expected)), "pinocchio")
+        )
+
+    def mjcf(self) -> Exported:
+        robot, pieces, warnings = self.calibrated.model.cell.robot, self.pieces, []
+        if robot.mjcf is not None:
+            try:
+                return self.corrected(robot.mjcf)
+            except NotInPlace as reason:
+                warnings.append(
+                    f"{robot.mjcf.name} itself cannot take the corrections: {reason}; this file is "
+                    "a new one with the arm alone"
+                )
+        inertias: tuple[Array, ...] = ()
+        if pieces.masses and robot.urdf is not None:
+            inertias = exportable.link_inertias(robot.urdf, pieces.chain)
+        text = mjcf_file.calibrated_mjcf(
+            pieces, self.note, inertias, _compensator(self.kept.exported), self.wish.base_frame
+        )
+        if not pieces.masses:
+            warnings.append(
+                "the links weigh nothing in this file, as in the model it was identified with: "
+                "weights would deflect the arm a second time; set [model] link_gravity = true and "
+                "identify anew for an arm with weights"
+            )
+        warnings += self.rigid_joints(f" (gain {mjcf_file.RIGID:g})")
+        try:
+            import mujoco  # noqa: F401
+        except ImportError:
+            lack = "not read back: MuJoCo is not installed (pip install elastocal[mujoco])"
+            return self.done.written(text, *warnings, lack)
+        placed = pieces.T_tracker_base if self.wish.base_frame else np.eye(4)
+        return self.done.written(text, *warnings, read=self.at_rest(MujocoRest(text), placed))
+
+    def corrected(self, path: Path) -> Exported:
+        cell, pieces, robot = (
+            self.calibrated.model.cell,
+            self.pieces,
+            self.calibrated.model.cell.robot,
+        )
+        if self.wish.base_frame:
+            raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
+        if _compensator(self.kept.exported) is not None:
+            raise NotInPlace("it has no gravity compensator")
+        if pieces.masses and not cell.model.link_gravity:
+            how = "without those of the file (link_gravity = false)"
+            raise NotInPlace(f"weights were identified {how}")
+        text, warnings = mjcf_file.corrected_mjcf(robot, pieces, self.wish.frames, self.note)
+        added = f'name="{mjcf_file.FLANGE}"' in text
+        arm = MjcfArm.read(path, robot.base, mjcf_file.FLANGE if added else robot.flange, text)
+        if not pieces.masses:
+            arm.model.opt.gravity[:] = 0.0
+        read = self.at_rest(MujocoRest(text, arm), arm.tree.placed(arm.base))
+        if pieces.springs and not pieces.masses:
+            warnings.append(
+                "the links weigh in this file and did not in the model that was identified: their "
+                "weights deflect the springs a second time; set [model] link_gravity = true and "
+                "identify anew, or switch gravity off in the file"
+            )
+        if pieces.springs:
+            warnings += self.rigid_joints("")
+            warnings.append(
+                "the springs stand in series with the joints: hold those by stiff actuators, whose "
+                "own error would come on top"
+            )
+        text, told = rigid_files.moved(path, text, self.wish.path.parent)
+        return self.done.written(text, *warnings, *told, read=read)
+
+    def rigid_joints(self, how: str) -> list[str]:
+        springs, n = {s.site for s in self.pieces.springs}, self.pieces.chain.n_joints
+        rigid = ", ".join(j for i in range(n) if (j := f"joint{i + 1}") not in springs)
+        told = f"no compliance was identified for {rigid}: rigid in this file{how}"
+        return [told] if rigid else []
+
+    def at_rest(self, rest: MujocoRest, T_world_base: Array) -> tuple[float, str]:
+        """Largest distance in m of flange and markers between MuJoCo at rest and the exported
+        model, whose base is at `T_world_base` (4, 4) in the MJCF's world."""
+        part, pieces, table = self.kept.exported, self.pieces, self.random(POSES_AT_REST)
+        placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
+        expected = placed @ part.model.flange_poses(table, part.x)
+        worst = 0.0
+        for q, force, T in zip(table.q, table.force, expected, strict=True):
+            if np.isfinite(T).all():
+                away = rest.points(q, force, pieces) - (pieces.points @ T[:3, :3].T + T[:3, 3])
+                worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
+        return _accepted(worst, LARGEST_AT_REST), "MuJoCo, at rest under the load"
+
+    def dh(self) -> Exported:
+        from elastocal.model.dh import read_dh
+
+        convention, q = rigid_files.CONVENTIONS[self.wish.kind], self.random(100).q
+        lines = rigid_files.dh_lines(self.calibrated.model.cell.robot, self.pieces, convention)
+        expected = nominal_flanges(self.pieces.calibrated_chain(), q)
+
+        def checked(text: str, largest: float = LARGEST) -> float:
+            with tempfile.TemporaryDirectory() as folder:
+                (path := Path(folder) / "written.csv").write_text(text, encoding="utf-8")
+                return _apart(nominal_flanges(read_dh(path, convention), q), expected, largest)
+
+        apart, beta = checked(rigid_files.dh_csv(lines)), None
+        comments = [
+            f"{self.note}; {convention} convention: {rigid_files.FORMULA[convention]}",
+            f"rounding of this table: {apart * 1e6:.2g} um at the flange",
+        ]
+        if any(row[4] for _, _, row in lines):
+            four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
+            beta = checked(rigid_files.dh_csv(four), largest=np.inf)
+            comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
+        text = rigid_files.dh_csv(lines, comments)
+        checked(text)
+        done = replace(self.done, without_beta=beta)
+        return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
+
+
+def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:
+    names, place = calibrated.model.names, {n: k for k, n in enumerate(calibrated.determined)}
+    if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+        return
+    steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
+    x = group.grid(min(max(steps + 1, FEWEST), MOST))
+    waves = group.basis(x)
+    quantile = float(t_quantile(LEVEL, np.array(np.inf)))
+    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True), 1):
+        known = np.array([names[c] in place for c in columns])
+        at = [place[names[c]] for c in columns[known]]
+        own = waves[:, known]
+        variance = np.einsum("nk,kl,nl->n", own, calibrated.covariance[np.ix_(at, at)], own)
+        half = quantile * np.sqrt(np.maximum(variance, 0.0))
+        value = waves @ calibrated.x[columns]
+        for position, *sizes in zip(x, value, half, strict=True):
+            angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
+            micro = (f"{size * 1e6 + 0.0:.3f}" for size in sizes)
+            yield (
+                group.effect, group.where, group.follows,
+                *((angle, "") if group.lasting else ("", time)),
+                str(component), MICRO.get(unit, unit), *micro,
+            )  # fmt: skip
 
 
 def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
@@ -372,160 +516,6 @@ def _accepted(distance: float, largest: float) -> float:
     return distance
 
 
-def _check_rest(
-    at_rest: Callable[[Array, Array], Array], pieces: ExportNumbers, kept: Kept,
-    T_world_base: Array, seed: int,
-) -> float:  # fmt: skip
-    """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
-
-    `at_rest`: `pieces.points` (k, 3) in the MJCF's world by commanded joints and force;
-    `T_world_base` (4, 4) there.  Raises ElastocalError where they differ.
-    """
-    part = kept.exported
-    table = random_table(kept.full.model, kept.conditions, POSES_AT_REST, seed)
-    placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
-    expected = placed @ part.model.flange_poses(table, part.x)
-    worst = 0.0
-    for q, force, T in zip(table.q, table.force, expected, strict=True):
-        if np.isfinite(T).all():
-            away = at_rest(q, force) - (pieces.points @ T[:3, :3].T + T[:3, 3])
-            worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
-    return _accepted(worst, LARGEST_AT_REST)
-
-
-def _note(calibrated: CalibratedArm, kept: Kept) -> str:
-    conditions = kept.conditions
-    cell = calibrated.model.cell
-    source = Path(calibrated.source).name
-    told = f"calibrated by elastocal: {source} of {Path(cell.path).name if cell.path else 'cell'}"
-    if conditions.temperature is not None:
-        told += f", at {conditions.temperature:g} °C"
-    if conditions.time is not None:
-        told += f", at {conditions.time:g} s"
-    if kept.fitted and conditions.visits is not None:
-        sizes = np.linalg.norm(conditions.visits.force, axis=1)
-        low, high = f"{sizes.min():.4g}", f"{sizes.max():.4g}"
-        span = high if low == high else f"{low} to {high}"
-        told += f", fitted where it was measured, under {span} N"
-    return told
-
-
-def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    from elastocal.model.urdf import check_urdf, tree_of
-
-    robot = calibrated.model.cell.robot
-    note = _note(calibrated, kept)
-    added = wish.frames, wish.base_frame
-    if robot.urdf is not None:
-        text = rigid_files.calibrated_urdf(robot, pieces, *added, note)
-        text, told = rigid_files.moved(robot.urdf, text, wish.path.parent)
-        base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
-    else:
-        text = rigid_files.new_urdf(pieces, *added, note)
-        base, flange = rigid_files.BASE, rigid_files.FLANGE
-        told = [
-            "inertia tensors are zero in this file: of the links masses and their centres alone "
-            "are known. Its kinematics and weights are right; before simulating motion put in "
-            "tensors"
-            + ("" if robot.mjcf is None else ", or export as .xml, which keeps those of the model")
-            if pieces.nominal_masses
-            else "the links have no <inertial> in this file, as their masses are not known"
-        ]
-    back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF")).chain(base, flange)
-    q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
-    chain = pieces.calibrated_chain()
-    expected = nominal_flanges(chain, q)
-    apart = _apart(nominal_flanges(back, q), expected)
-    try:
-        found = rigid_files.urdf_flanges(
-            text, [joint.name for joint in chain.joints], base, flange, q
-        )
-    except (ValueError, RuntimeError) as error:  # pinocchio's own
-        refused = (
-            "pinocchio's own reader refuses this file, as it does without the corrections "
-            f"({str(error).strip().splitlines()[0]}); only elastocal's has read it back"
-        )
-        return Written(text, apart, "elastocal's reader of URDF", (*told, refused))
-    return Written(text, max(apart, _apart(found, expected)), "pinocchio", tuple(told))
-
-
-def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    robot, warnings = calibrated.model.cell.robot, []
-    if robot.mjcf is not None:
-        try:
-            return _corrected(calibrated, wish, kept, pieces)
-        except NotInPlace as reason:
-            warnings.append(
-                f"{robot.mjcf.name} itself cannot take the corrections: {reason}; this file is a "
-                "new one with the arm alone"
-            )
-    inertias: tuple[Array, ...] = ()
-    if pieces.masses and robot.urdf is not None:
-        inertias = exportable.link_inertias(robot.urdf, pieces.chain)
-    text = mjcf_file.calibrated_mjcf(
-        pieces, _note(calibrated, kept), inertias, _compensator(kept.exported), wish.base_frame
-    )
-    if not pieces.masses:
-        warnings.append(
-            "the links weigh nothing in this file, as in the model it was identified with: "
-            "weights would deflect the arm a second time; set [model] link_gravity = true and "
-            "identify anew for an arm with weights"
-        )
-    warnings += _rigid_joints(pieces, f" (gain {mjcf_file.RIGID:g})")
-    try:
-        import mujoco  # noqa: F401
-    except ImportError:
-        warnings.append("not read back: MuJoCo is not installed (pip install elastocal[mujoco])")
-        return Written(text, warnings=tuple(warnings))
-    names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
-    placed = pieces.T_tracker_base if wish.base_frame else np.eye(4)
-    at_rest = partial(MujocoRest(text).sites, names=names)
-    distance = _check_rest(at_rest, pieces, kept, placed, wish.seed)
-    return Written(text, distance, "MuJoCo, at rest under the load", tuple(warnings))
-
-
-def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    cell = calibrated.model.cell
-    if wish.base_frame:
-        raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
-    if _compensator(kept.exported) is not None:
-        raise NotInPlace("it has no gravity compensator")
-    if pieces.masses and not cell.model.link_gravity:
-        raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
-    text, warnings = mjcf_file.corrected_mjcf(
-        cell.robot, pieces, wish.frames, _note(calibrated, kept)
-    )
-    robot, added = cell.robot, mjcf_file.FLANGE
-    assert robot.mjcf is not None
-    flange = added if f'name="{added}"' in text else robot.flange
-    arm = MjcfArm.read(robot.mjcf, robot.base, flange, text)
-    if not pieces.masses:
-        arm.model.opt.gravity[:] = 0.0
-    at_rest = partial(MujocoRest(text, arm).points, pieces=pieces)
-    distance = _check_rest(at_rest, pieces, kept, arm.tree.placed(arm.base), wish.seed)
-    if pieces.springs and not pieces.masses:
-        warnings.append(
-            "the links weigh in this file and did not in the model that was identified: their "
-            "weights deflect the springs a second time; set [model] link_gravity = true and "
-            "identify anew, or switch gravity off in the file"
-        )
-    if pieces.springs:
-        warnings += _rigid_joints(pieces, "")
-        warnings.append(
-            "the springs stand in series with the joints: hold those by stiff actuators, whose "
-            "own error would come on top"
-        )
-    text, told = rigid_files.moved(robot.mjcf, text, wish.path.parent)
-    return Written(text, distance, "MuJoCo, at rest under the load", (*warnings, *told))
-
-
-def _rigid_joints(pieces: ExportNumbers, how: str) -> list[str]:
-    springs = {s.site for s in pieces.springs}
-    joints = [f"joint{i + 1}" for i in range(pieces.chain.n_joints)]
-    rigid = ", ".join(joint for joint in joints if joint not in springs)
-    return [f"no compliance was identified for {rigid}: rigid in this file{how}"] if rigid else []
-
-
 def _compensator(part: Valued) -> dict[str, float] | None:
     """Values of the gravity compensator by key with its 0-based joint, None where there is none."""
     values = {name: v for name, v in part.values.items() if ".compensator_" in name}
@@ -533,33 +523,3 @@ def _compensator(part: Valued) -> dict[str, float] | None:
         return None
     joint = int(next(iter(values)).partition(".")[0].removeprefix("joint")) - 1
     return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
-
-
-def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    from elastocal.model.dh import read_dh
-
-    convention = rigid_files.CONVENTIONS[wish.kind]
-    lines = rigid_files.dh_lines(calibrated.model.cell.robot, pieces, convention)
-    q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
-    expected = nominal_flanges(pieces.calibrated_chain(), q)
-
-    def checked(text: str, largest: float = LARGEST) -> float:
-        with tempfile.TemporaryDirectory() as folder:
-            (path := Path(folder) / "written.csv").write_text(text, encoding="utf-8")
-            return _apart(nominal_flanges(read_dh(path, convention), q), expected, largest)
-
-    apart, beta = checked(rigid_files.dh_csv(lines)), None
-    comments = [
-        f"{_note(calibrated, kept)}; {convention} convention: {rigid_files.FORMULA[convention]}",
-        f"rounding of this table: {apart * 1e6:.2g} um at the flange",
-    ]
-    if any(row[4] for _, _, row in lines):
-        four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
-        beta = checked(rigid_files.dh_csv(four), largest=np.inf)
-        comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
-    text = rigid_files.dh_csv(lines, comments)
-    checked(text)
-    return Written(text, apart, "elastocal's own reader of DH tables", (), beta)
-
-
-WRITERS = {"urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh, "corrections": _corrections}

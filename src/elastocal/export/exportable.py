@@ -19,7 +19,7 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import read_text
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
-from elastocal.model.arm import row_inputs
+from elastocal.model.arm import Spring, row_inputs
 from elastocal.model.calibrated import (
     RECORDED,
     CalibratedArm,
@@ -188,24 +188,14 @@ PAYLOAD = ("load.payload_scale", *(f"load.load_point_{k}" for k in "xyz"))
 
 
 @dataclass(frozen=True)
-class SpringValue:
-    """A spring of the arm with its compliance in rad/(N m) or m/N; the rest as in Spring."""
-
-    name: str
-    site: str
-    kind: str
-    axis: tuple[float, float, float]
-    compliance: float
-
-
-@dataclass(frozen=True)
 class ExportNumbers:
     """The arm in numbers, in SI units.
 
     `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of
     the joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point`
     (3,) in the flange frame; `load_scale`: what acts per newton declared; `springs`: those that
-    yield; `masses`: as in Chain, empty where no weights act.
+    yield, with their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no
+    weights act.
     """
 
     chain: Chain
@@ -215,7 +205,7 @@ class ExportNumbers:
     markers: dict[str, Array]
     load_point: Array
     load_scale: float
-    springs: tuple[SpringValue, ...]
+    springs: dict[Spring, float]
     masses: tuple[LinkMass, ...]
 
     def offset_motion(self, i: int) -> Array:
@@ -228,8 +218,8 @@ class ExportNumbers:
         """`masses`, else those of the robot's description, where no weights act in the model."""
         return self.masses or self.chain.masses
 
-    def springs_at(self, site: str) -> list[SpringValue]:
-        return [s for s in self.springs if s.site == site]
+    def springs_at(self, site: str) -> dict[Spring, float]:
+        return {s: k for s, k in self.springs.items() if s.site == site}
 
     @property
     def points(self) -> Array:
@@ -278,7 +268,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     ]
     function = ca.Function("pieces", [*arm.inputs.values(), symbolic.p], expressions)
     found = (value.full() for value in function.call([*inputs, part.x]))
-    offsets, T_tracker_base, compliances, *placed = found
+    offsets, T_tracker_base, compliance, *placed = found
     n, values = model.chain.n_joints, part.values
     scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
     return ExportNumbers(
@@ -289,11 +279,9 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
         markers=dict(zip(arm.markers, placed[n:], strict=True)),
         load_point=model.cell.tool.load_point + np.array(shift),
         load_scale=1.0 + scale,
-        springs=tuple(
-            SpringValue(s.name, s.site, s.kind, s.axis, float(k))
-            for s, k in zip(arm.springs, compliances[:, 0], strict=True)
-            if k > 0
-        ),
+        springs={
+            s: k for s, k in zip(arm.springs, compliance[:, 0].tolist(), strict=True) if k > 0
+        },
         masses=_masses(model.chain, values, model.cell.model.link_gravity),
     )
 

@@ -14,9 +14,10 @@ from scipy.optimize import root
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError, InputError
-from elastocal.export.exportable import ExportNumbers, SpringValue, nothing, numbers, placed_body
+from elastocal.export.exportable import ExportNumbers, nothing, numbers, placed_body
 from elastocal.export.rigid_files import PREFIX, tool_frames
 from elastocal.files import read_bytes
+from elastocal.model.arm import Spring
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
@@ -72,7 +73,7 @@ def calibrated_mjcf(
     actuators = ET.Element("actuator")
     body = _body(world, "base", pieces.T_tracker_base if base_frame else np.eye(4))
     _passive(body, pieces.springs_at("base"))
-    before: list[SpringValue] = []
+    before: dict[Spring, float] = {}
     for i, (joint, name) in enumerate(zip(chain.joints, motor_names(chain), strict=True)):
         offset, T = pieces.offset_motion(i), pieces.placement(i)
         if before:  # on a body of their own: MuJoCo takes six joints at most in one
@@ -88,8 +89,8 @@ def calibrated_mjcf(
         springs = pieces.springs_at(f"joint{i + 1}")
         own = all(s.axis == tuple(joint.axis) and s.kind == joint.kind for s in springs)
         # Their axes stand before the body was turned by the joint's offset.
-        _passive(body, [] if own else springs, np.asarray(np.linalg.inv(offset)))
-        _motor(body, actuators, joint, name, sum(s.compliance for s in springs if own))
+        _passive(body, {} if own else springs, np.asarray(np.linalg.inv(offset)))
+        _motor(body, actuators, joint, name, sum(springs.values()) if own else 0.0)
         if compensated:
             # The offset turns the frame about the axis before the joint moves, and the model's
             # angle counts it; so the arm's end stands at angle zero of the joint's own frame.
@@ -125,14 +126,14 @@ def _body(
     return body
 
 
-def _passive(body: ET.Element, springs: Sequence[SpringValue], frame: Array = IDENTITY) -> None:
-    for spring in springs:
-        ET.SubElement(body, "joint", spring_joint("spring_", spring, frame))
+def _passive(body: ET.Element, springs: dict[Spring, float], frame: Array = IDENTITY) -> None:
+    for spring, compliance in springs.items():
+        ET.SubElement(body, "joint", spring_joint("spring_", spring, compliance, frame))
 
 
-def spring_joint(prefix: str, spring: SpringValue, F: Array) -> dict[str, str]:
+def spring_joint(prefix: str, spring: Spring, compliance: float, F: Array) -> dict[str, str]:
     """Attributes of the passive joint of a spring whose frame is F (4, 4) in the moved body's."""
-    stiffness = 1.0 / spring.compliance
+    stiffness = 1.0 / compliance
     return {
         "name": prefix + spring.name, "type": MOTIONS[spring.kind],
         "pos": numbers(F[:3, 3]), "axis": numbers(F[:3, :3] @ spring.axis),
@@ -251,10 +252,11 @@ class MujocoRest:
         return np.array([self._data.site(name).xpos.copy() for name in names])
 
     def points(self, q: Array, force: Array, pieces: ExportNumbers) -> Array:
-        """Positions (k, 3) of `pieces.points` in the world of the user's file, the same; `force` in
-        the tracker's axes."""
+        """Positions (k, 3) of `pieces.points` in the world of the file, the same; `force` in the
+        tracker's axes."""
         arm, data = self._arm, self._data
-        assert arm is not None
+        if arm is None:
+            return self.sites(q, force, ["flange", *(f"marker_{name}" for name in pieces.markers)])
         R = arm.tree.placed(arm.base)[:3, :3] @ pieces.T_tracker_base[:3, :3].T
         load, flange = pieces.load_scale * R @ force, arm.flange_body
 
@@ -398,7 +400,7 @@ class _MjcfText(XmlFile):
         """Put the springs between link i and joint i before the joint; returns how many."""
         pieces, model = self.pieces, self.model
         proximal = pieces.springs_at(f"link{i}" if i else "base")
-        springs = [*proximal, *pieces.springs_at(f"joint{i + 1}")]
+        springs = proximal | pieces.springs_at(f"joint{i + 1}")
         body = int(model.jnt_bodyid[j])
         first = int(model.body_jntadr[body])
         tags = self.joints(body)
@@ -414,7 +416,7 @@ class _MjcfText(XmlFile):
         # The springs' frame in that of the moved body: before the joint turns by its offset.
         F = before(model, j) @ np.linalg.inv(pieces.offset_motion(i))
         base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame there
-        placed = [(s, base if s.site == "base" else F) for s in springs]
+        placed = ((s, k, base if s.site == "base" else F) for s, k in springs.items())
         joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)
         self.insert(tags[j - first].start, "".join(f"{joint} " for joint in joints))
         return len(springs) - len(old)
