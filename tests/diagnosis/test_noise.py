@@ -16,7 +16,6 @@ from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
-    covariance,
     fit_noise,
     log_prior,
     project,
@@ -59,7 +58,7 @@ def drawn(true_noise: NoiseValues, n: int, seed: int) -> NoisyData:
     blocks = Blocks.of(configuration, visit, 3)
     base = random_data(seed, blocks, p=5, joints=len(true_noise.joint))
     base = replace(base, left_out=blocks.absent, precision=np.full(5, 1e-6))
-    V = covariance(base, true_noise)
+    V = base.V(true_noise)
     noise = (np.linalg.cholesky(V) @ rng.normal(size=(*V.shape[:2], 1)))[..., 0]
     return replace(base, r=base.masked(noise + base.X @ rng.normal(size=5)))
 

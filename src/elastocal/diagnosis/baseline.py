@@ -51,8 +51,28 @@ class Blocks:
         return len(self.visit)
 
     @cached_property
-    def places(self) -> VisitPlaces:
-        return VisitPlaces.of(self)
+    def in_visit(self) -> Array:
+        """Which rows belong to each visit (C, m, v), as ones and zeros."""
+        visit = np.append(self.visit, -1)[self.member]
+        local = np.full(visit.shape, -1)
+        for c, row in enumerate(visit.tolist()):
+            number = {v: k for k, v in enumerate(dict.fromkeys(v for v in row if v >= 0))}
+            local[c] = [number.get(v, -1) for v in row]
+        one_hot = (local[:, :, None] == np.arange(max(local.max() + 1, 1))).astype(float)
+        return np.repeat(one_hot, self.size, axis=1)
+
+    @cached_property
+    def example(self) -> IntArray:
+        """An observation of each visit (C, v), −1 where a block has fewer visits."""
+        one_hot = self.in_visit[:, :: self.size]
+        first = np.take_along_axis(self.member, one_hot.argmax(axis=1), axis=1)
+        return np.where(one_hot.any(axis=1), first, -1)
+
+    def of_visits(self, values: Array) -> Array:
+        """Per observation (N, …) → per visit (C, v, …), zero where there is none."""
+        out = values[np.maximum(self.example, 0)]
+        out[self.example < 0] = 0.0
+        return out
 
     def pack(self, rows: Array) -> Array:
         """(N, size, k) → (C, M·size, k), zeros where there is no observation."""
@@ -89,34 +109,6 @@ class Blocks:
     def absent(self) -> NDArray[np.bool_]:
         """Rows (C, M·size) that hold no observation."""
         return np.repeat(self.member == self.n, self.size, axis=1)
-
-
-@dataclass(frozen=True)
-class VisitPlaces:
-    """Where visits stand in the blocks: `one_hot` (C, m, v), and an observation of each visit,
-    `example` (C, v), −1 where a block has fewer visits."""
-
-    one_hot: Array
-    example: IntArray
-
-    @classmethod
-    def of(cls, blocks: Blocks) -> VisitPlaces:
-        member = blocks.member
-        visit = np.concatenate([blocks.visit, [-1]])[member]
-        local = np.full(visit.shape, -1)
-        for c, row in enumerate(visit.tolist()):
-            number = {v: k for k, v in enumerate(dict.fromkeys(v for v in row if v >= 0))}
-            local[c] = [number.get(v, -1) for v in row]
-        one_hot = (local[:, :, None] == np.arange(max(local.max() + 1, 1))).astype(float)
-        first = np.take_along_axis(member, one_hot.argmax(axis=1), axis=1)
-        example = np.where(one_hot.any(axis=1), first, -1)
-        return cls(np.repeat(one_hot, blocks.size, axis=1), example)
-
-    def gather(self, values: Array) -> Array:
-        """Per observation (N, …) → per visit (C, v, …), zero where there is none."""
-        out = values[np.maximum(self.example, 0)]
-        out[self.example < 0] = 0.0
-        return out
 
 
 @dataclass(frozen=True)

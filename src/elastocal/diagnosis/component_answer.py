@@ -37,7 +37,7 @@ from elastocal.diagnosis.diagnosis import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import corrects
 from elastocal.diagnosis.model_set import spans_of
-from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
+from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
 from elastocal.diagnosis.stated_floor import (
     SupportedFloor,
@@ -383,7 +383,7 @@ class SumAnswer:
     @cached_property
     def _uncertain(self) -> Array:
         """Variance (rows,) in m² that the fit itself is uncertain by at poses left out."""
-        V = covariance(self.found.data, self.found.noise)
+        V = self.found.data.V(self.found.noise)
         uncertain = np.linalg.inv(self.at.P) - V
         return np.asarray(np.diagonal(uncertain, axis1=1, axis2=2)[self._rows])
 

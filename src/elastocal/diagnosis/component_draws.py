@@ -58,17 +58,18 @@ def drawn(
     own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
     c = indices([every[k] for k in own])
     x = np.setdiff1d(np.arange(len(prior)), c)
-    L = linalg.cholesky(at.M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
-    across = linalg.solve_triangular(L, at.M[np.ix_(x, c)], lower=True)
-    S = at.M[np.ix_(c, c)] - across.T @ across
+    M, right = at.products.M, at.products.z
+    L = linalg.cholesky(M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
+    across = linalg.solve_triangular(L, M[np.ix_(x, c)], lower=True)
+    S = M[np.ix_(c, c)] - across.T @ across
     kinds = _kinds(components, own)
     spans = {key: span for kind in kinds for key, span in kind.spans.items()}
     sizes = {(k, i): float(found.sizes.size[k]) for k, i in spans if k < len(found.components)}
     sized = np.full(len(c), np.inf)  # prior precisions; infinite where there is nothing
     for key, size in sizes.items():
         sized[spans[key]] = np.exp(-2 * size)
-    out, z = np.zeros((len(prior), n)), linalg.solve_triangular(L, at.z[x], lower=True)
-    t = at.z[c] - across.T @ z
+    out, z = np.zeros((len(prior), n)), linalg.solve_triangular(L, right[x], lower=True)
+    t = right[c] - across.T @ z
     for sweep in range(-SETTLING, n):
         for kind in kinds:
             spread = kind.spread(sizes, rng)

@@ -451,9 +451,9 @@ class Beside:
 
     def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
         sums = found.sums
-        w, products = sums.weighted, sums.products(columns)
+        w, products = sums.weighted, sums.across(columns)
         self.root = w.prior(np.concatenate([sums.data.precision, 1 / found.variances])) ** -0.5
-        self.sum = Standardised.of(w.M, w.z, self.root)
+        self.sum = Standardised.of(w.products.M, w.products.z, self.root)
         own = [self.root[:, None] * each.beside for each in products]
         self.halves = [linalg.solve_triangular(self.sum.L, t, lower=True) for t in own]
         half = self.sum.L.T @ self.sum.b
@@ -492,7 +492,7 @@ def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
     taken, data = {id(item.what) for item in chosen.items}, chosen.data
     others = [c for c in components if id(c.hypothesis) not in taken]
     sums, p = posed(data, others, chosen.noise), len(data.precision)
-    M, z = sums.weighted.M, sums.weighted.z
+    M, z = sums.products.M, sums.products.z
     prior = data.precision + ROUNDING * np.diag(M)[:p]
     ((A, b),) = beside(M, z, prior, np.arange(p), [slice(p, len(M))])
     total, left = 0.0, list(zip(spans_of([c.width for c in others], len(b)), others, strict=True))
@@ -637,7 +637,7 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
     elif GearRipple.name in without:
         kept += possible(base.model, base.observed.table, CATALOGUE.keys() - {GearRipple.name})[0]
     more = judged_together(base.model, base.observed.table, without)
-    return dataset.changed(hypotheses=(*kept, *more))
+    return replace(dataset, hypotheses=(*kept, *more))
 
 
 def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:

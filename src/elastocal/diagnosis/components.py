@@ -256,17 +256,13 @@ class SumOfComponents:
     noise: NoiseValues
     weighted: Weighted
 
-    @cached_property
-    def rows(self) -> int:
-        return self.data.n_rows
-
-    @cached_property
-    def squares(self) -> float:
-        return float(np.vdot(self.weighted.r, self.weighted.r))
+    @property
+    def products(self) -> Products:
+        return self.weighted.products
 
     @cached_property
     def spans(self) -> tuple[slice, ...]:
-        return spans_of([c.width for c in self.components], len(self.weighted.z))
+        return spans_of([c.width for c in self.components], len(self.products.z))
 
     @cached_property
     def waved(self) -> IntArray:
@@ -277,32 +273,25 @@ class SumOfComponents:
     def sized(self) -> Array:
         """By how much (p + Σ k, K + W) the logarithms of prior variances grow with those of sizes;
         zero where lengths stand."""
-        out = np.zeros((len(self.weighted.z), len(self.components) + len(self.waved)))
+        out = np.zeros((len(self.products.z), len(self.components) + len(self.waved)))
         for k, span in enumerate(self.spans):
             out[span, k] = 2.0
         return out
 
-    @cached_property
-    def products_of_all(self) -> Products:
-        return Products(self.weighted.M, self.weighted.z, self.squares, self.rows)
-
-    @property
-    def constant(self) -> float:
-        """What of −2ℓ does not change with sizes: log|V| + n log 2π."""
-        return self.weighted.alone - self.squares
-
     def scaled(self, factor: float) -> SumOfComponents:
         """The same under e^factor times the noise."""
-        w, a = self.weighted, float(np.exp(factor))
-        alone = w.alone - self.squares + self.squares / a**2 + 2 * self.rows * factor
-        weighted = Weighted(w.root / a, w.X / a, w.r / a, w.M / a**2, w.z / a**2, alone)
+        w, own, a = self.weighted, self.products, float(np.exp(factor))
+        products = Products(own.M / a**2, own.z / a**2, own.squares / a**2, own.rows)
+        constant = w.constant + 2 * own.rows * factor
+        weighted = Weighted(w.root / a, w.X / a, w.r / a, products, constant)
         noise = replace(self.noise, factor=self.noise.factor * a, joint=self.noise.joint * a)
         return replace(self, weighted=weighted, noise=noise)
 
     def only(self, kept: Sequence[int]) -> SumOfComponents:
-        w, own = self.weighted, np.arange(len(self.data.precision))
+        every, own = self.products, np.arange(len(self.data.precision))
         index = np.concatenate([own, indices([self.spans[k] for k in kept])])
-        narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
+        products = replace(every, M=every.M[np.ix_(index, index)], z=every.z[index])
+        narrow = replace(self.weighted, products=products)
         return replace(self, weighted=narrow, components=tuple(self.components[k] for k in kept))
 
     @cached_property
@@ -323,7 +312,7 @@ class SumOfComponents:
     def _known(self) -> dict[int, Across]:
         return {}
 
-    def products(self, columns: Sequence[Array]) -> list[Across]:
+    def across(self, columns: Sequence[Array]) -> list[Across]:
         """Of each of these columns beside the data's own and the components'; kept, since a search
         comes back to the same ones."""
         new = {id(c): c for c in columns if id(c) not in self._known}
@@ -347,8 +336,8 @@ class SumOfComponents:
 
     def factored(self, at: Sizes) -> tuple[Standardised, float]:
         """The coefficients under e^factor times the noise, and −2ℓ."""
-        found = self.products_of_all.at(self.variances(at), at.factor)
-        return found, self.constant + self.products_of_all.value(found)
+        found = self.products.at(self.variances(at), at.factor)
+        return found, self.weighted.constant + self.products.value(found)
 
     def objective(self, theta: Array) -> tuple[float, Array, Array]:
         """−2 log posterior of the logarithms, its slope and its average information (1 + 2 K,
@@ -363,12 +352,12 @@ class SumOfComponents:
         grown = self.sized.copy()  # of the logarithms of prior variances
         for n, k in enumerate(waved, K):
             grown[self.spans[k], n] = self.components[k].shares(at.length[k])[1]
-        value, own, between = self.products_of_all.objective(self.variances(at), grown, at.factor)
+        value, own, between = self.products.objective(self.variances(at), grown, at.factor)
         index = np.concatenate([np.arange(1 + K), 1 + K + waved])
         slope, information = np.zeros_like(theta), np.zeros((len(theta), len(theta)))
         slope[index], information[np.ix_(index, index)] = own, between
         prior, of_sizes = self.pool.penalty(at.size)
-        value += self.constant + prior
+        value += self.weighted.constant + prior
         slope[1 : K + 1] += of_sizes
         information[1 : K + 1, 1 : K + 1] += 2 * self.pool.precision
         if self.data.stated:
@@ -444,8 +433,8 @@ def posed(
         there = [k for k, c in enumerate(components) if id(c) in old]
         at = np.r_[(slice(0, p), *(spans[k] for k in there))]
         before = np.r_[(slice(0, p), *(old[id(components[k])] for k in there))]
-        M[np.ix_(at, at)] = own.M[np.ix_(before, before)]
-        z[at] = own.z[before]
+        M[np.ix_(at, at)] = own.products.M[np.ix_(before, before)]
+        z[at] = own.products.z[before]
         new = [k for k, c in enumerate(components) if id(c) not in old]
         if new:
             columns = side_by_side(data, [components[k].columns for k in new])
@@ -468,7 +457,8 @@ def posed(
             flat = _rows(X)
             M += flat.T @ flat
             z += flat.T @ own.r[some].ravel()
-    return SumOfComponents(data, tuple(components), noise, replace(own, M=M, z=z))
+    summed = replace(own, products=replace(own.products, M=M, z=z))
+    return SumOfComponents(data, tuple(components), noise, summed)
 
 
 def _rows(columns: Array) -> Array:

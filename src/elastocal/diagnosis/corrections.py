@@ -145,7 +145,7 @@ def _response(
     largest = float(np.abs(tau).max(initial=0.0)) or 1.0
     F = effect.at_rows(tau / largest, np.ones_like(tau) if came is None else came[:, i])
     if np.ptp(F, axis=0).max() > 0:
-        D = dataset.places.gather(F[dataset.lead])[:, :, None, :] * MOTION
+        D = dataset.blocks.of_visits(F[dataset.lead])[:, :, None, :] * MOTION
         block = Generic("", "", where, effect.stage, (JointMotion.name, (where,)), D)
         yield _scored(grams, effect, block, {f"{effect.name}_Nm": largest})
 

@@ -315,35 +315,31 @@ def _sum_of_all(
     """The sum of all that may act at once, None where a few causes are the better answer, by how
     many nats it is more probable than nothing, and what has no name in it."""
     progress("judging all that may act at once")
-    dataset, found, without = few.before, few.selected, options.without
+    found = few.selected
+    chosen, nothing = found.chosen, found.nothing.score
     open_ = few.verdict == "unknown_effect" or few.supported.open
-    if (searched := search_components(dataset, found.chosen, open_, without, progress)) is None:
+
+    def summed(dataset: DiagnosisData, without: set[str]) -> tuple[SumAnswer, float] | None:
+        if (searched := search_components(dataset, chosen, open_, without, progress)) is None:
+            return None
+        full, total, hidden = searched
+        answer = SumAnswer(dataset, full, total, hidden, few.rng).decided
+        return answer, compared_score(full, total) - nothing
+
+    if (searched := summed(few.before, {*options.without})) is None:
         return None, 0.0, ()
-    full, total, hidden = searched
-    answer, nothing = SumAnswer(dataset, full, total, hidden, few.rng).decided, found.nothing.score
-    over = compared_score(full, total) - nothing
-    if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
-        return None, 0.0, _beside(few, answer, open_, without, progress)
-    return answer, over, ()
-
-
-def _beside(
-    few: FewAnswer, answer: SumAnswer, open_: bool, without: Sequence[str], progress: Progress
-) -> tuple[FoundEffect, ...]:
-    """What corrects the arm beside the few causes: what has no name in the sum, searched again
-    without the names that the verdict does not know where they stand for what is unknown."""
-    chosen = few.selected.chosen
+    answer, over = searched
+    if over > CLEARLY + max(chosen.score - nothing, 0.0) and answer.n_causes >= MANY:
+        return answer, over, ()
     causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
-    keys = {h.key for h in known}
     named = {(c.effect.name, c.where) for c in answer.found.components if c.effect.name in causes}
-    if not open_ or named <= keys:
-        return answer.without_names
-    bare = few.before.changed(hypotheses=tuple(known))
-    searched = search_components(bare, chosen, True, {*without, *causes}, progress)
-    assert searched is not None  # as the verdict is open
-    full, total, hidden = searched
-    return SumAnswer(bare, full, total, hidden, few.rng).decided.without_names
+    if open_ and not named <= {h.key for h in known}:
+        # Names that the verdict does not know stand for what is unknown: searched without them.
+        bare = replace(few.before, hypotheses=tuple(known))
+        if (searched := summed(bare, {*options.without, *causes})) is not None:
+            answer, _ = searched
+    return None, 0.0, answer.without_names
 
 
 def _pieces(
@@ -388,8 +384,8 @@ def _searched(
 
     def search_without(faulty: BoolArray) -> tuple[ForwardSelection, SelectedEffects]:
         good = dataset.without(faulty)
-        blocks, level = generic_blocks(good), options.false_alarm
-        search = ForwardSelection(good, blocks, good.noise, level, options.seed)
+        blocks = generic_blocks(good)
+        search = ForwardSelection(good, blocks, options.false_alarm, options.seed)
         return search, search.run()
 
     progress("noise floor")

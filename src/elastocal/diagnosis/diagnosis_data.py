@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from elastocal.diagnosis.baseline import (
     Baseline,
     Blocks,
-    VisitPlaces,
     from_centre,
     prior_deviations,
 )
 from elastocal.diagnosis.hypotheses import (
+    KEPT,
     NO_SETTINGS,
     Columns,
     EntryKey,
@@ -28,7 +27,7 @@ from elastocal.diagnosis.hypotheses import (
     moments_between,
     recorded,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
+from elastocal.diagnosis.noise_floor import NoisyData
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import TIME, stated_deviations
 from elastocal.identification.start import as_placed
@@ -41,26 +40,8 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray, IntArray
 
-KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
 # The load hangs on a flange frame that the markers' freedom leaves undetermined to millimetres.
 LOAD_POINT_TOLERANCE = 2e-3
-
-
-@dataclass
-class KeptColumns:
-    """What was packed and evaluated of the same columns, whatever hypotheses and noise stand
-    beside them: `packed` ones of entries and hypotheses, `regressors` of driven hypotheses, and
-    their `directions` at settings, for as long as there is `room`, in numbers, for one more."""
-
-    packed: dict[EntryKey | tuple[str, str], Array] = field(default_factory=dict)
-    regressors: dict[tuple[str, str], RegressorDirection] = field(default_factory=dict)
-    directions: dict[tuple[str, str, bytes], Array] = field(default_factory=dict)
-    room: int = KEPT
-
-    def keep(self, key: tuple[str, str, bytes], direction: Array) -> None:
-        if direction.size <= self.room:
-            self.room -= direction.size
-            self.directions[key] = direction
 
 
 @dataclass(frozen=True)
@@ -82,7 +63,6 @@ class DiagnosisData:
     fitted: tuple[str, ...]
     load_point: Array | None = None
     other_backlash: float = 0.0
-    kept: KeptColumns = field(default_factory=KeptColumns, repr=False)
 
     @property
     def blocks(self) -> Blocks:
@@ -92,10 +72,6 @@ class DiagnosisData:
     def drift(self) -> float:
         """The drift in m that the cell states, and that is noise here; of distances none is."""
         return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
-
-    @property
-    def places(self) -> VisitPlaces:
-        return self.blocks.places
 
     @property
     def table(self) -> Measurements:
@@ -117,18 +93,14 @@ class DiagnosisData:
         return self.base.observed.place
 
     @cached_property
-    def noise(self) -> NoiseValues:
-        return fit_noise(self.data)
-
-    @cached_property
     def visit_table(self) -> Measurements:
         """One row for each visit (C·v), the first of its readings."""
-        return self.table.take(self.lead[np.maximum(self.places.example, 0)].ravel())
+        return self.table.take(self.lead[np.maximum(self.blocks.example, 0)].ravel())
 
     @property
     def present(self) -> BoolArray:
         """Which of the visits' places (C, v) hold one."""
-        return self.places.example >= 0
+        return self.blocks.example >= 0
 
     def pack(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → packed (C, m, k)."""
@@ -136,9 +108,10 @@ class DiagnosisData:
 
     def entry(self, key: EntryKey) -> Array:
         """Packed columns (C, m, d) of an entry; not to be written to."""
-        if key not in self.kept.packed:
-            self.kept.packed[key] = self.pack(self.columns.entry(key))
-        return self.kept.packed[key]
+        known = self.columns.packed
+        if key not in known:
+            known[key] = self.pack(self.columns.entry(key))
+        return known[key]
 
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
@@ -155,7 +128,7 @@ class DiagnosisData:
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
         chain, cell = self.base.model.chain, as_placed(self.base.model, self.base.x)
-        known, driven = self.kept.regressors, [h for h in self.hypotheses if h.driven]
+        known, driven = self.columns.regressors, [h for h in self.hypotheses if h.driven]
         for h in driven:
             if h.key not in known:
                 known[h.key] = RegressorDirection(h, chain, cell)
@@ -180,14 +153,16 @@ class DiagnosisData:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
         where it is the same in all visits of a configuration."""
         key = *h.key, settings.tobytes()
-        if key in self.kept.directions:
-            return self.kept.directions[key]
+        known = self.columns.directions
+        if key in known:
+            return known[key]
         visits, present = self._driven_visits[h.key]
         D = self.directions[h.key](visits, settings)
         D = D.reshape(*present.shape, *D.shape[1:]).transpose(0, 1, 3, 2, 4)
         D = np.multiply(D, self.sizes[h.key], order="C")
         D[~present] = 0.0
-        self.kept.keep(key, D)
+        if D.size + sum(other.size for other in known.values()) <= KEPT:
+            known[key] = D
         return D
 
     @cached_property
@@ -210,9 +185,10 @@ class DiagnosisData:
         written to."""
         size = self.sizes[h.key]
         if not h.driven:
-            if h.key not in self.kept.packed:
-                self.kept.packed[h.key] = self.pack(self.columns.of(h)) * size
-            return self.kept.packed[h.key]
+            known = self.columns.packed
+            if h.key not in known:
+                known[h.key] = self.pack(self.columns.of(h)) * size
+            return known[h.key]
         D = self.directions[h.key](self.table, settings[None])[:, 0]
         return self.pack(self.columns.entry(h.entry_key(self.base.model)) @ D) * size
 
@@ -221,14 +197,6 @@ class DiagnosisData:
         """When each observation (N,) was made; its row in the table where no times are recorded."""
         time = self.table.time
         return self.lead.astype(float) if time is None else time[self.lead]
-
-    def changed(self, **changes: Any) -> DiagnosisData:
-        """The same readings with other columns: their noise beside the fitted parameters stays."""
-        anew = changes.keys() & {"base", "columns", "data"}
-        other = replace(self, kept=KeptColumns() if anew else self.kept, **changes)
-        if "noise" in self.__dict__:
-            other.__dict__["noise"] = self.noise
-        return other
 
     def without(self, faulty: BoolArray) -> DiagnosisData:
         """The same with the observations where `faulty` (N,) holds left out."""

@@ -16,7 +16,7 @@ from elastocal.diagnosis.diagnosis import RivalPair
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import evidence_of
 from elastocal.diagnosis.model_set import PLAUSIBLE, packed_columns, spans_of
-from elastocal.diagnosis.noise_floor import NoiseValues, covariance
+from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.rivals import (
     RivalSet,
     Suspects,
@@ -271,7 +271,7 @@ class Discrimination:
         fitted, n = data.X.shape[2], len(rivals.rivals)
         nuisance = fitted + sum(C.shape[2] for C in beside)
         W = np.concatenate([data.X, *beside, *own, data.r[:, :, None]], axis=2)
-        L = np.linalg.cholesky(covariance(data, noise))
+        L = np.linalg.cholesky(data.V(noise))
         white = np.linalg.solve(L, data.masked(W))
         known = white[:measured].reshape(-1, W.shape[2])
         gram = known.T @ known

@@ -182,7 +182,6 @@ class ForwardSelection:
 
     dataset: DiagnosisData
     generic: list[Generic]
-    noise: NoiseValues
     level: float
     seed: int
     _start: DiagnosisData = field(init=False)
@@ -198,7 +197,7 @@ class ForwardSelection:
 
     def run(self) -> SelectedEffects:
         self._start = dataset = self.dataset
-        nothing = current = fit_set(dataset, (), self.noise)
+        nothing = current = fit_set(dataset, (), dataset.data.noise)
         scanned = first = alone = self._scan(current, beside=current)
         slots: list[Slot] = []
         start: list[Slot] = []
@@ -258,7 +257,7 @@ class ForwardSelection:
                     default=-np.inf)  # fmt: skip
         if not found.chosen.unknown or alone <= PART * first.scores.max():
             return found
-        named = ForwardSelection(self._start, [], self.noise, self.level, self.seed).run()
+        named = ForwardSelection(self._start, [], self.level, self.seed).run()
         if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
             return found
         self.dataset = named.dataset

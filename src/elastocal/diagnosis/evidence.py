@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import logsumexp
 
-from elastocal.diagnosis.baseline import VisitPlaces
+from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
@@ -237,13 +237,11 @@ class EntrySums:
     h: Array
 
     @classmethod
-    def of(
-        cls, E: Array, places: VisitPlaces, at: Projection, flips: Flips | None = None
-    ) -> EntrySums:
+    def of(cls, E: Array, blocks: Blocks, at: Projection, flips: Flips | None = None) -> EntrySums:
         """E (C, m, d): the entry's packed columns, zero in rows that do not count."""
         C, m, d = E.shape
-        v = places.one_hot.shape[2]
-        wide = (places.one_hot[:, :, :, None] * E[:, :, None, :]).reshape(C, m, v * d)
+        v = blocks.in_visit.shape[2]
+        wide = (blocks.in_visit[:, :, :, None] * E[:, :, None, :]).reshape(C, m, v * d)
         local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
         H = np.ascontiguousarray((at.H.transpose(0, 2, 1) @ wide).transpose(1, 0, 2))  # (p, C, v·d)
         b = np.einsum("cmk,cm->ck", wide, at.u)
@@ -362,7 +360,7 @@ class Grams:
     def entry(self, key: EntryKey) -> EntrySums:
         if key not in self._entries:
             E = self.data.masked(self.dataset.entry(key))
-            self._entries[key] = EntrySums.of(E, self.dataset.places, self.at, self.flips)
+            self._entries[key] = EntrySums.of(E, self.data.blocks, self.at, self.flips)
         return self._entries[key]
 
     def of(self, h: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:

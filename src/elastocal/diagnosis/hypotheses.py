@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar
 
@@ -609,6 +609,7 @@ def own_columns(full: Model, h: Hypothesis) -> list[int]:
 
 # Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
 
+KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
 ENTRIES: tuple[Entry, ...] = (
     JointMotion(), LinkLength(), LinkFrame(), BaseMotion(), MarkerMotion()
 )  # fmt: skip
@@ -629,6 +630,11 @@ class Columns:
     full: Model
     x: Array
     shares: dict[tuple[str, str], float]
+    # What was packed and evaluated of them, whatever hypotheses and noise stand beside them: of
+    # entries and hypotheses, of driven hypotheses, and at settings, KEPT numbers of these.
+    packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
+    regressors: dict[tuple[str, str], RegressorDirection] = field(init=False, default_factory=dict)
+    directions: dict[tuple[str, str, bytes], Array] = field(init=False, default_factory=dict)
 
     def observed(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → per observation (N, size, k)."""

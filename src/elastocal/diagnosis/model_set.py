@@ -119,7 +119,7 @@ def packed_columns(dataset: DiagnosisData, item: Item) -> Array:
     if what.columns is not None:
         return what.columns
     assert what.entry is not None and what.direction is not None
-    direction = np.einsum("cmv,cvdk->cmdk", dataset.places.one_hot, what.direction)
+    direction = np.einsum("cmv,cvdk->cmdk", dataset.blocks.in_visit, what.direction)
     return np.einsum("cmd,cmdk->cmk", dataset.entry(what.entry), direction)
 
 
@@ -394,7 +394,7 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     Where no side of approach is recorded, the cell has play already, or no reading tells the two
     apart, it stays as it is.
     """
-    model, noise = dataset.base.model, dataset.noise
+    model, noise = dataset.base.model, dataset.data.noise
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
@@ -403,11 +403,11 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     for h, own in zip(play, columns_alone(other, play), strict=True):
         columns.rows[:, :, columns.places[h.key]] = own
     # Of the fitted parameters none is of play: their columns are those they were.
-    under_other = dataset.changed(base=other, columns=columns)
+    under_other = replace(dataset, base=other, columns=columns)
     here, there = (_likeliest(d, noise) for d in (dataset, under_other))
     if there.score <= here.score + ALIKE:
-        return dataset.changed(other_backlash=doubt(here, there))
-    return under_other.changed(other_backlash=doubt(there, here))
+        return replace(dataset, other_backlash=doubt(here, there))
+    return replace(under_other, other_backlash=doubt(there, here))
 
 
 def under_other_backlash_model(model: Model) -> Model:

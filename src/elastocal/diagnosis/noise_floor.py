@@ -120,6 +120,10 @@ class NoisyData:
         """Observations (N,) that are left out."""
         return self.blocks.unpack(self.left_out[..., None].astype(float))[:, 0, 0] > 0
 
+    @cached_property
+    def noise(self) -> NoiseValues:
+        return fit_noise(self)
+
     @property
     def n_rows(self) -> int:
         return int((~self.left_out).sum())
@@ -136,10 +140,14 @@ class NoisyData:
         keep = ~self.left_out
         return packed * keep.reshape(keep.shape + (1,) * (packed.ndim - 2))
 
+    def V(self, noise: NoiseValues) -> Array:
+        """V (C, m, m); rows left out have unit variance of their own."""
+        return self.model.packs[0].V(noise.theta)
+
     @cached_property
     def model(self) -> Mixed:
         """Of the variances `NoiseValues.theta`, with their prior."""
-        (C, _, J), visit = self.G.shape, self.blocks.places.one_hot
+        (C, _, J), visit = self.G.shape, self.blocks.in_visit
         G = np.ascontiguousarray(self.G.transpose(0, 2, 1))[..., None]  # (C, joints, m, 1)
 
         def numbers(first: int, k: int) -> IntArray:
@@ -153,14 +161,6 @@ class NoisyData:
         )  # fmt: skip
         pack = Pack(self.X, self.r, parts, self.left_out)
         return Mixed((pack,), 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
-
-
-def covariance(data: NoisyData, noise: NoiseValues) -> Array:
-    """V (C, m, m); rows left out have unit variance of their own."""
-    V, keep = data.model.packs[0].V(noise.theta), ~data.left_out
-    V *= keep[:, :, None] & keep[:, None, :]
-    np.einsum("cii->ci", V)[:] += data.left_out
-    return V
 
 
 @cache
@@ -252,35 +252,33 @@ def _power(blocks: Array, exponent: float) -> Array:
 @dataclass(frozen=True)
 class Weighted:
     """The data whitened by one noise V = KKᵀ, whatever the prior of the coefficients: K⁻¹
-    (C, m, m), K⁻¹X (C, m, p), K⁻¹r (C, m), M = XᵀV⁻¹X (p, p), z = XᵀV⁻¹r (p,), and the part of
-    −2ℓ that stands without X, log|V| + rᵀV⁻¹r + n log 2π."""
+    (C, m, m), K⁻¹X (C, m, p), K⁻¹r (C, m), the products of these, and what of −2ℓ no coefficient
+    changes, log|V| + n log 2π."""
 
     root: Array
     X: Array
     r: Array
-    M: Array
-    z: Array
-    alone: float
+    products: Products
+    constant: float
 
     @classmethod
     def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        white = Whitened(data.model.packs[0], noise.theta)
+        white, n = Whitened(data.model.packs[0], noise.theta), data.n_rows
         flat, r = white.B.reshape(-1, white.B.shape[2]), white.e
-        alone = white.log_det + float(np.vdot(r, r)) + data.n_rows * LOG_2PI
-        return cls(white.root, white.B, r, flat.T @ flat, flat.T @ r.ravel(), alone)
+        products = Products(flat.T @ flat, flat.T @ r.ravel(), float(np.vdot(r, r)), n)
+        return cls(white.root, white.B, r, products, white.log_det + n * LOG_2PI)
 
     def prior(self, precision: Array) -> Array:
         """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
         must not drown in rounding.  By each column's own size: a prior must not tighten because
         another column is large."""
-        return precision + ROUNDING * np.diag(self.M)
+        return precision + ROUNDING * np.diag(self.products.M)
 
     def factored(self, precision: Array) -> tuple[Standardised, float]:
         """The coefficients under a prior of precision Λ (p,), and ℓ."""
-        products, least = Products(self.M, self.z, 0.0, 0), self.prior(precision)
-        at = products.at(1 / least)
-        spared = float(np.log(least / precision).sum())
-        return at, -0.5 * (self.alone + products.value(at) + spared)
+        least = self.prior(precision)
+        at, spared = self.products.at(1 / least), float(np.log(least / precision).sum())
+        return at, -0.5 * (self.constant + self.products.value(at) + spared)
 
     def marginal(self, precision: Array) -> float:
         return self.factored(precision)[1]

@@ -30,7 +30,6 @@ from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
     Projection,
-    covariance,
     project,
 )
 from elastocal.model.observations import pure_error
@@ -41,7 +40,7 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
     """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
     (square, dof), at = repeats(dataset), project(data, noise)
     variance = np.diagonal(data.covariance, axis1=1, axis2=2)
-    ratio = noise_rms(data, noise) / np.sqrt(_per_reading(data, variance))
+    ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
     variance = variance[~data.left_out]
     return NoiseFloor(
         data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
@@ -292,17 +291,14 @@ class SupportedFloor:
 
 def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
     """3-D rms in m that the noise alone gives a reading."""
-    V = covariance(data, noise)
-    return float(np.sqrt(_per_reading(data, np.diagonal(V, axis1=1, axis2=2))))
+    variance = np.diagonal(data.V(noise), axis1=1, axis2=2)
+    return float(np.sqrt(mean_square(data, np.sqrt(variance))))
 
 
-def _per_reading(data: NoisyData, variance: Array) -> float:
-    """Mean over the readings of the sum of their components' `variance` (C, m)."""
-    C, M = data.blocks.member.shape
-    size = data.blocks.size
-    used = ~data.left_out
-    part = (variance * used).reshape(C, M, size)[:, :, : min(size, 3)]
-    return float(part.sum() / used.reshape(C, M, size)[:, :, 0].sum())
+def mean_square(data: NoisyData, packed: Array) -> float:
+    """Mean over the readings of the squared 3-D length of `packed` (C, m)."""
+    squares, count = squared_lengths(data, packed)
+    return float(squares.sum() / count.sum())
 
 
 def supported_floor(
@@ -324,9 +320,10 @@ def supported_floor(
         excess = scatter_beyond(noise)
         smooth = np.maximum(smooth, excess)
         above = max(noise.factor**2 - MOST_STATED**2, 0.0)
-    stated = np.diagonal(data.covariance, axis1=1, axis2=2)
-    joints = np.array([_per_reading(data, g) for g in np.moveaxis(data.G**2 * smooth, 2, 0)])
-    instrument = _per_reading(data, above * stated)
+    stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
+    moved = np.moveaxis(data.G * np.sqrt(smooth), 2, 0)
+    joints = np.array([mean_square(data, g) for g in moved])
+    instrument = above * mean_square(data, stated)
     variance = max(fitted**2 - joints.sum() - instrument, 0.0)
     total, dof = repeats(dataset, come_back=True)
     near = near_repeats(dataset, data, at)
@@ -405,5 +402,4 @@ def left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | No
 
 def left_out_square(data: NoisyData, noise: NoiseValues, together: IntArray | None = None) -> float:
     """Mean square (m²) of the 3-D error of a reading whose configuration was left out."""
-    squares, count = squared_lengths(data, left_out_residual(project(data, noise), together))
-    return float(squares.sum() / count.sum())
+    return mean_square(data, left_out_residual(project(data, noise), together))

@@ -40,7 +40,7 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
     table, present = dataset.table, dataset.present
 
     def of_visits(values: Array) -> Array:
-        return dataset.places.gather(values[dataset.lead])
+        return dataset.blocks.of_visits(values[dataset.lead])
 
     def if_recorded(name: str) -> Array | None:
         return of_visits(getattr(table, name)) if recorded(table, name) else None
@@ -124,7 +124,7 @@ def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Arr
         if E.shape[1] < 3:
             return
         wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
-        wrench = dataset.places.gather(wrench[dataset.lead])
+        wrench = dataset.blocks.of_visits(wrench[dataset.lead])
         yield place, key, wrench[:, :, :3], wrench[:, :, 3:]
 
 
@@ -230,7 +230,7 @@ def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
         if by.kind in ("angle", "time") and dataset.load_point is not None:
             # The load point moves: few functions for each of its directions, under load only.
             few = by.functions[:, :, :FEW_WAVES]
-            W = np.einsum("cmv,cvf->cmf", dataset.places.one_hot, few) * LOAD_POINT_MOTION
+            W = np.einsum("cmv,cvf->cmf", dataset.blocks.in_visit, few) * LOAD_POINT_MOTION
             moved = np.einsum("cmd,cmf->cmdf", dataset.load_point, W)
             columns = moved.reshape(*moved.shape[:2], -1)
             yield Generic(f"{by.kind} → load", by.name, "load", "load", columns=columns)

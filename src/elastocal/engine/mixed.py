@@ -98,10 +98,13 @@ class Pack:
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
     def V(self, theta: Array) -> Array:
-        """V (C, m, m) at θ (K,), absent rows as any others."""
-        V = np.zeros((*self.e.shape, self.e.shape[1]))
+        """V (C, m, m) at θ (K,), absent rows of unit variance by themselves."""
+        V, here = np.zeros((*self.e.shape, self.e.shape[1])), ~self.absent
         for part in self.parts:
             part.add(V, theta[part.of])
+        if not here.all():
+            V *= here[:, :, None] & here[:, None, :]
+            np.einsum("cii->ci", V)[:] += self.absent
         return V
 
 
@@ -109,17 +112,12 @@ class Whitened:
     """A pack under V = RRᵀ: `root` R⁻¹ (C, m, m), R⁻¹B and R⁻¹e, zeros in absent rows, log|V|."""
 
     def __init__(self, pack: Pack, theta: Array) -> None:
-        V, out = pack.V(theta), pack.absent
         self.pack = pack
-        if out.any():
-            here = ~out
-            V *= here[:, :, None] & here[:, None, :]
-            np.einsum("cii->ci", V)[:] += out
-        R = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
+        R = np.asarray(np.linalg.cholesky(pack.V(theta)), dtype=np.float64)
         self.log_det = 2 * float(np.log(np.einsum("cii->ci", R)).sum())
         self.root = lower_inverse(R)
-        if out.any():
-            self.root *= here[:, None, :]
+        if pack.absent.any():
+            self.root *= ~pack.absent[:, None, :]
         self.B = self.root @ pack.B
         self.e = (self.root @ pack.e[..., None])[..., 0]
 
