@@ -68,45 +68,11 @@ CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
 LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
 
 
-class NumpyFunction:
-    """A function's instructions, and `evaluate`, which carries them out on whole blocks of rows.
-
-    Results stand in the registers that CasADi gave the instructions, each as long as a block: few
-    are in use at a time, and these stay in cache.  What is the same in all rows is one number.
-    Raises NotImplementedError for a CasADi operation that numpy has no counterpart for.
-    """
-
-    def __init__(self, function: ca.Function) -> None:
-        self._steps, self.n_registers = instructions(function)
-        width = self.n_registers + sum(function.numel_out(k) for k in range(function.n_out()))
-        self.largest_block = max(LARGEST_BUFFER // max(width, 1), 1)
-
-    def evaluate(
-        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
-    ) -> None:
-        """Rows of `blocks` of `results` (n, rows, columns), all of one type."""
-        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
-        held: list[Any] = [None] * self.n_registers
-        for block in blocks:
-            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
-            outputs = [np.zeros((f.shape[1], block.stop - block.start), f.dtype) for f in flat]
-            for kind, what, out, a, b in zip(*self._steps, strict=True):
-                if kind == BINARY_OP:
-                    held[out] = what(held[a], held[b])
-                elif kind == UNARY_OP:
-                    held[out] = what(held[a])
-                elif kind == READ:
-                    held[out] = given[a][b]
-                elif kind == CONSTANT:
-                    held[out] = what
-                else:
-                    outputs[a][b] = held[out]
-            for f, output in zip(flat, outputs, strict=True):
-                f[block] = output.T
-
-
 def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
-    """`_steps` of a function as five lists, and its number of registers.
+    """`_steps` of a function as five lists, and its number of registers: those that CasADi gave
+    the instructions, of which few are in use at a time.
+
+    Raises NotImplementedError for a CasADi operation that numpy has no counterpart for.
 
     Not a tuple for every step: thousands of these would have Python look for garbage in all that
     is loaded, 0.07 s each time.
@@ -169,21 +135,6 @@ def row_blocks(n: int, size: int) -> list[slice]:
     count = -(-n // max(size, 1))
     edges = [n * k // count for k in range(count + 1)] if count else [0]
     return [slice(a, b) for a, b in pairwise(edges)]
-
-
-def run_blocks(
-    work: Callable[[Sequence[slice]], None], blocks: Sequence[slice], threads: int
-) -> None:
-    """`work` on contiguous shares of `blocks`, one share per thread; what one raises is raised.
-
-    Every thread runs in a copy of the caller's context, which holds `numpy.errstate`.
-    """
-    shares = (
-        (contextvars.copy_context(), blocks[share])
-        for share in row_blocks(len(blocks), -(-len(blocks) // threads))
-    )
-    for _ in ahead(lambda share: share[0].run(work, share[1]), shares, threads):
-        pass
 
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
@@ -271,8 +222,8 @@ class BatchFunction:
         return {key: value for key, value in self.__dict__.items() if key != "_by_numpy"}
 
     @cached_property
-    def _by_numpy(self) -> NumpyFunction:
-        return NumpyFunction(self._function)
+    def _by_numpy(self) -> tuple[tuple[list[Any], ...], int]:
+        return instructions(self._function)
 
     def __call__(self, *inputs: NDArray, chunk: int = CHUNK) -> list[NDArray]:
         arrays, n = self._rows(inputs)
@@ -282,13 +233,43 @@ class BatchFunction:
         if few and chosen_backend(self._asked) == "auto":
             self._by_casadi(arrays, results)
             return results
-        engine = self._by_numpy
-        blocks = row_blocks(n, min(chunk, engine.largest_block))
+        width = self._by_numpy[1] + sum(r * c for r, c in self.shapes)
+        blocks = row_blocks(n, min(chunk, max(LARGEST_BUFFER // max(width, 1), 1)))
         # In a thread of the caller's own one: who started it has shared the work out already.
         alone = threading.current_thread() is not threading.main_thread()
         threads = 1 if alone else max(1, min(len(blocks), thread_count()))
-        run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
+        # Every thread runs in a copy of the caller's context, which holds `numpy.errstate`.
+        shares = (
+            (contextvars.copy_context(), blocks[share])
+            for share in row_blocks(len(blocks), -(-len(blocks) // threads))
+        )
+        list(ahead(lambda s: s[0].run(self._carry_out, arrays, results, s[1]), shares, threads))
         return results
+
+    def _carry_out(
+        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
+    ) -> None:
+        """Rows of `blocks` of `results` (n, rows, columns), all of one type: registers are as long
+        as a block, so that they stay in cache.  What is the same in all rows is one number."""
+        steps, registers = self._by_numpy
+        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
+        held: list[Any] = [None] * registers
+        for block in blocks:
+            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
+            outputs = [np.zeros((f.shape[1], block.stop - block.start), f.dtype) for f in flat]
+            for kind, what, out, a, b in zip(*steps, strict=True):
+                if kind == BINARY_OP:
+                    held[out] = what(held[a], held[b])
+                elif kind == UNARY_OP:
+                    held[out] = what(held[a])
+                elif kind == READ:
+                    held[out] = given[a][b]
+                elif kind == CONSTANT:
+                    held[out] = what
+                else:
+                    outputs[a][b] = held[out]
+            for f, output in zip(flat, outputs, strict=True):
+                f[block] = output.T
 
     def _by_casadi(self, arrays: Sequence[NDArray], results: Sequence[NDArray]) -> None:
         """CasADi takes rows side by side, and what is the same in all of them once."""

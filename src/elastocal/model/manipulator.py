@@ -343,9 +343,7 @@ class Model(ByValue):
             >>> bool(abs(model.deflection(loaded)).max() < 0.01)
             True
         """
-        x = self._at(x)
-        # A copy: what the caller does to it must not change the answer that is kept.
-        return self._settle(row_inputs(self._symbolic.arm, table), x).copy()
+        return self._symbolic.equilibrium(row_inputs(self._symbolic.arm, table), self._at(x))[0]
 
     def _at(self, x: ArrayLike | None, several: bool = False) -> NDArray:
         """Parameter values (parameters,), the nominal ones by default; or `several` (k, …)."""
@@ -363,11 +361,6 @@ class Model(ByValue):
             f"an array of shape {values.shape}",
         )
         return values
-
-    def _settle(self, inputs: list[NDArray], x: NDArray) -> NDArray:
-        if not self._symbolic.implicit:
-            return np.zeros((len(inputs[0]), len(self._symbolic.arm.springs)), dtype=x.dtype)
-        return self._symbolic.equilibrium.solve(inputs, x)[0]
 
     @checked_arguments
     def predict(
@@ -405,7 +398,9 @@ class Model(ByValue):
 
     def _readings(self, inputs: list[NDArray], x: NDArray) -> NDArray:
         """Readings (rows, size) at values x (parameters,), or (rows, parameters) by row."""
-        return self._symbolic.readings(*inputs, x, self._settle(inputs, x))[0][..., 0]
+        return self._symbolic.readings(*inputs, x, self._symbolic.equilibrium(inputs, x)[0])[0][
+            ..., 0
+        ]
 
     @checked_arguments
     def B(self, table: Measurements, x: Array | None = None) -> NDArray:
@@ -462,7 +457,7 @@ class Model(ByValue):
     def _frames(self, table: Measurements, x: Array | None) -> list[NDArray]:
         x = self._at(x)
         inputs = row_inputs(self._symbolic.arm, table)
-        return self._symbolic.frames(*inputs, x, self._settle(inputs, x))
+        return self._symbolic.frames(*inputs, x, self._symbolic.equilibrium(inputs, x)[0])
 
 
 def check_equilibrium(table: Measurements, predicted: Array) -> None:

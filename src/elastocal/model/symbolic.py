@@ -21,7 +21,7 @@ from elastocal.model.evaluate import BatchFunction
 from elastocal.model.observations import observe
 from elastocal.units import Array
 
-# The static equilibrium of all poses at once, and the exact derivative through it.
+# Of the static equilibrium of all poses at once.
 
 MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
@@ -48,73 +48,6 @@ class Recent:
             # Bound anew, not changed: threads may look it up at the same time.
             self._kept = dict([*self._kept.items()][1 - KEPT :]) | {key: found}
         return found[0].copy(), found[1].copy()
-
-
-class Equilibrium:
-    """Deflections θ with F(θ) = θ − law(τ(θ)) = 0, τ = −∂V/∂θ at the deflected pose.
-
-    Written with compliances, so a rigid joint (k = 0) needs no special case.  Only a stable
-    equilibrium with deflections below LARGEST counts: beyond that no arm is elastic any more.
-    """
-
-    def __init__(self, arm: SymbolicArm) -> None:
-        theta = arm.arm.theta
-        self.size = theta.shape[0]
-        outputs = [arm.residual, ca.jacobian(arm.residual, theta)]  # F and F_θ
-        inputs = [*arm.arm.inputs.values(), arm.p, theta]
-        self._residual = BatchFunction(inputs, outputs, arm.backend)
-        self._recent = Recent()
-
-    def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
-        """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there; p
-        (parameters,), or (n, parameters) by row.
-
-        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
-        """
-        return self._recent((), [p, *inputs], lambda: self._settled(inputs, p))
-
-    def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
-        theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
-        with np.errstate(invalid="ignore"):
-            theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
-        theta[self._unstable(F_theta.real)] = np.nan
-        F_theta[~np.isfinite(theta).all(axis=1)] = np.eye(self.size)
-        return theta, F_theta
-
-    def _unstable(self, F_theta: NDArray) -> NDArray:
-        """Indices of the rows whose stationary point is no minimum of the potential."""
-        # F_θ = 1 − C·H with the potential's Hessian H: stable while its eigenvalues are positive,
-        # which they are wherever C·H is small; only soft poses need the eigenvalues themselves.
-        soft = np.abs(F_theta - np.eye(self.size)).sum(axis=2).max(axis=1) >= 1
-        rows = np.flatnonzero(soft & np.isfinite(F_theta).all(axis=(1, 2)))
-        if not len(rows):
-            return rows
-        return rows[np.linalg.eigvals(F_theta[rows]).real.min(axis=1) <= 0]
-
-    def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> tuple[NDArray, NDArray]:
-        """θ (n, size), NaN where it does not settle, and F_θ where the last step was taken: that
-        step is rounding, so F_θ is that of θ."""
-        theta = np.zeros((n, self.size), dtype=np.result_type(np.float64, p, *inputs))
-        slope = np.full((n, self.size, self.size), np.nan, dtype=theta.dtype)
-        active = np.arange(n)
-        for _ in range(MAX_STEPS):
-            if not len(active):
-                break
-            *rows, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
-            F, F_theta = self._residual(*rows, at, theta[active])
-            finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
-            theta[active[~finite]] = np.nan
-            active, F, F_theta = active[finite], F[finite], F_theta[finite]
-            try:
-                step = np.linalg.solve(F_theta, F)[..., 0]
-            except np.linalg.LinAlgError:  # a pose at the verge of buckling
-                break
-            theta[active] -= step
-            slope[active] = F_theta
-            settled = np.abs(step).max(axis=1) <= TOLERANCE + 1e-12 * np.abs(theta[active]).max(1)
-            active = active[~settled]
-        theta[active] = np.nan
-        return theta, slope
 
 
 class SymbolicArm:
@@ -160,20 +93,16 @@ class SymbolicArm:
         self.parameters = tuple(parameters)
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
         # The reading h of one row (3, 6 or 1 components) in inputs, X and θ.
-        self.reading = self._expression(cell.model.observe)
+        kind = cell.model.observe
+        self.reading = arm.reading["distance" if kind == "distance" else "position"]
+        if kind == "pose":
+            measured = rigid.rotation_from_vector(arm.input("rotation", 3))
+            turned = rigid.vector_from_rotation(measured.T @ arm.reading["rotation"])
+            self.reading = ca.vertcat(self.reading, turned)
+        self._recent = Recent()
         # Deflections by eq. (3), or by the equilibrium F(θ) = 0.
         self._linear = bool(arm.springs) and cell.model.deflection_model == "linear"
         self.implicit = bool(arm.springs) and not self._linear
-
-    def _expression(self, observe: str) -> ca.SX:
-        arm = self.arm
-        if observe == "distance":
-            return arm.reading["distance"]
-        if observe == "pose":
-            measured = rigid.rotation_from_vector(arm.input("rotation", 3))
-            relative = measured.T @ arm.reading["rotation"]
-            return ca.vertcat(arm.reading["position"], rigid.vector_from_rotation(relative))
-        return arm.reading["position"]
 
     @cached_property
     def residual(self) -> ca.SX:
@@ -182,14 +111,6 @@ class SymbolicArm:
         tau = -ca.gradient(arm.potential, arm.theta)  # of the loads on each spring
         return arm.theta - ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(arm.springs)])
 
-    def _linearised(self, expression: ca.SX) -> ca.SX:
-        """Eq. (3): h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose."""
-        theta = self.arm.theta
-        rest = ca.SX.zeros(theta.shape[0], 1)
-        deflection = ca.substitute(theta - self.residual, theta, rest)
-        slope = ca.substitute(ca.jacobian(expression, theta), theta, rest)
-        return ca.substitute(expression, theta, rest) + slope @ deflection
-
     def explicit(self, expression: ca.SX, steps: int) -> ca.SX:
         """`expression` of inputs, X and θ as one of inputs and X alone.
 
@@ -197,20 +118,77 @@ class SymbolicArm:
         θ ← law(τ(θ)) from rest, each of which divides the error by the ratio of a joint's
         stiffness to the change of the load's torque with its angle (a hundred and more).
         """
-        if self._linear:
-            return ca.reshape(self._linearised(ca.vec(expression)), *expression.shape)
         theta = self.arm.theta
+        law, settled = theta - self.residual, ca.SX.zeros(theta.shape[0], 1)
+        if self._linear:  # h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose
+            y, deflection = ca.vec(expression), ca.substitute(law, theta, settled)
+            slope = ca.substitute(ca.jacobian(y, theta), theta, settled)
+            y = ca.substitute(y, theta, settled) + slope @ deflection
+            return ca.reshape(y, *expression.shape)
         if not self.implicit:
             return expression
-        law = theta - self.residual
-        settled = ca.SX.zeros(theta.shape[0], 1)
         for _ in range(steps):
             settled = ca.substitute(law, theta, settled)
         return ca.substitute(expression, theta, settled)
 
     @cached_property
-    def equilibrium(self) -> Equilibrium:
-        return Equilibrium(self)
+    def _equations(self) -> BatchFunction:
+        theta = self.arm.theta
+        outputs = [self.residual, ca.jacobian(self.residual, theta)]  # F and F_θ
+        return BatchFunction([*self.arm.inputs.values(), self.p, theta], outputs, self.backend)
+
+    def equilibrium(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+        """Deflections θ (n, springs) with F(θ) = θ − law(τ(θ)) = 0, τ = −∂V/∂θ at the deflected
+        pose, by Newton's method on all rows, and F_θ (n, springs, springs) there; p (parameters,),
+        or (n, parameters) by row.  Zeros where the model is linear or rigid.
+
+        Written with compliances, so a rigid joint (k = 0) needs no special case.  Only a stable
+        equilibrium with deflections below LARGEST counts: beyond that no arm is elastic any more.
+        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
+        """
+        if self.implicit:
+            return self._recent((), [p, *inputs], lambda: self._settled(inputs, p))
+        n, size = len(inputs[0]), len(self.arm.springs)
+        return np.zeros((n, size), dtype=p.dtype), np.zeros((n, size, size))
+
+    def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+        theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
+        with np.errstate(invalid="ignore"):
+            theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
+        # F_θ = 1 − C·H with the potential's Hessian H: a minimum while its eigenvalues are
+        # positive, which they are wherever C·H is small; only soft poses need the eigenvalues.
+        one = np.eye(F_theta.shape[1])
+        soft = np.abs(F_theta.real - one).sum(axis=2).max(axis=1) >= 1
+        rows = np.flatnonzero(soft & np.isfinite(F_theta.real).all(axis=(1, 2)))
+        theta[rows[np.linalg.eigvals(F_theta.real[rows]).real.min(axis=1) <= 0]] = np.nan
+        F_theta[~np.isfinite(theta).all(axis=1)] = one
+        return theta, F_theta
+
+    def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> tuple[NDArray, NDArray]:
+        """θ (n, size), NaN where it does not settle, and F_θ where the last step was taken: that
+        step is rounding, so F_θ is that of θ."""
+        size = len(self.arm.springs)
+        theta = np.zeros((n, size), dtype=np.result_type(np.float64, p, *inputs))
+        slope = np.full((n, size, size), np.nan, dtype=theta.dtype)
+        active = np.arange(n)
+        for _ in range(MAX_STEPS):
+            if not len(active):
+                break
+            *rows, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
+            F, F_theta = self._equations(*rows, at, theta[active])
+            finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
+            theta[active[~finite]] = np.nan
+            active, F, F_theta = active[finite], F[finite], F_theta[finite]
+            try:
+                step = np.linalg.solve(F_theta, F)[..., 0]
+            except np.linalg.LinAlgError:  # a pose at the verge of buckling
+                break
+            theta[active] -= step
+            slope[active] = F_theta
+            settled = np.abs(step).max(axis=1) <= TOLERANCE + 1e-12 * np.abs(theta[active]).max(1)
+            active = active[~settled]
+        theta[active] = np.nan
+        return theta, slope
 
     def _of_rows(self, *outputs: ca.SX) -> BatchFunction:
         inputs = [*self.arm.inputs.values(), self.p, self.arm.theta]
@@ -290,10 +268,10 @@ class Total:
         self, inputs: list[NDArray], x: Array, extra: Sequence[NDArray], asked: tuple[int, ...]
     ) -> tuple[Array, Array]:
         arm, function, given = self._arm, self._function(asked), [*inputs, *extra, x]
+        theta, F_theta = arm.equilibrium(inputs, x)
         if not arm.implicit:
-            y, slope = function(*given, np.zeros((len(inputs[0]), arm.arm.theta.shape[0])))
+            y, slope = function(*given, theta)
             return y[..., 0], slope
-        theta, F_theta = arm.equilibrium.solve(inputs, x)
         y_theta = self._slopes(*given, theta)[0]
         y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
@@ -332,9 +310,15 @@ def configuration_rows(
     and X: eq. (3) for a linear model, `steps` fixed-point steps for the equilibrium.  Where poses
     are observed, the rotation is taken as measured without error, as in planning.
     """
-    arm = symbolic.arm
+    arm, p = symbolic.arm, symbolic.p
     observed = observe(template, arm.cell.model.observe)
-    row = _row(symbolic, list(columns), steps)
+    B = ca.jacobian(symbolic.explicit(symbolic.reading, steps), p)[:, list(columns)]
+    if arm.cell.model.observe == "pose":
+        # Substituted after differentiation: the measured rotation is data, not a prediction.
+        predicted = symbolic.explicit(arm.reading["rotation"], steps)
+        B = ca.substitute(B, arm.inputs["rotation"], rigid.vector_from_rotation(predicted))
+    # (inputs …, X) → B of one table row (size, columns)
+    row = ca.Function("row", [*arm.inputs.values(), p], [B], {"cse": True})
     q = ca.SX.sym("q", arm.chain.n_joints)
     x = ca.SX.sym("x", len(symbolic.parameters))
     given = dict(zip(arm.inputs, row_inputs(arm, template), strict=True))
@@ -351,14 +335,3 @@ def configuration_rows(
     gradient = ca.gradient(ca.dot(W, B), q)
     cse = {"cse": True}
     return ca.Function("B", [q, x], [B], cse), ca.Function("adjoint", [q, x, W], [gradient], cse)
-
-
-def _row(symbolic: SymbolicArm, columns: list[int], steps: int) -> ca.Function:
-    """(inputs …, X) → B of one table row (size, columns)."""
-    arm, p = symbolic.arm, symbolic.p
-    B = ca.jacobian(symbolic.explicit(symbolic.reading, steps), p)[:, columns]
-    if arm.cell.model.observe == "pose":
-        # Substituted after differentiation: the measured rotation is data, not a prediction.
-        predicted = symbolic.explicit(arm.reading["rotation"], steps)
-        B = ca.substitute(B, arm.inputs["rotation"], rigid.vector_from_rotation(predicted))
-    return ca.Function("row", [*arm.inputs.values(), p], [B], {"cse": True})
