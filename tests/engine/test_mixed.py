@@ -1,6 +1,7 @@
 """The mixed model against dense matrices, statsmodels, and published Kenward–Roger figures."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -81,7 +82,7 @@ def test_nested_effects_equal_statsmodels(unbalanced):
     table = Table(size=1, configurations=14, markers=4, repeats=4, unbalanced=unbalanced)
     r = readings(table, 4, noise=1.0, shared=0.8)
     rng = np.random.default_rng(0)
-    r = r.moved(r.e + 0.7 * rng.normal(size=(14, 4))[r.configuration, r.marker][:, None])
+    r = replace(r, e=r.e + 0.7 * rng.normal(size=(14, 4))[r.configuration, r.marker][:, None])
     found = fitted(r, NESTED)
     assert [d.name for d, _ in found.found] == NAMES
     theirs = mixed_lm(r, re_formula="1", vc_formula={"marker": "0 + C(marker)"})

@@ -47,7 +47,7 @@ def test_each_noise_is_told_apart(kind):
     """In at least 4 of 5 tables the very kind: Schwarz's criterion picks a structure with two
     variances too many in 0.2 % of tables of 432 rows, Akaike's shared effects in 1 of 6 at most."""
     rng, r = np.random.default_rng(3), readings(BASE, 9)
-    chosen = Counter(estimate_noise(r.moved(drawn(kind, rng, r))).kind for _ in range(5))
+    chosen = Counter(estimate_noise(replace(r, e=drawn(kind, rng, r))).kind for _ in range(5))
     assert chosen[kind] >= 4, chosen
 
 
@@ -136,5 +136,5 @@ def test_false_alarms_on_clean_tables_are_as_rare_as_stated(kind):
     r = table(1, configurations=10, repeats=3, unbalanced=False)
     tables = 120 if kind == "independent" else 15
     for _ in range(tables):
-        alarms += not settle(r.moved(1e-5 * rng.normal(size=r.e.shape)), kind)[1].all()
+        alarms += not settle(replace(r, e=1e-5 * rng.normal(size=r.e.shape)), kind)[1].all()
     assert alarms <= stats.binom.ppf(0.9999, tables, FALSE_ALARM)

@@ -1,5 +1,7 @@
 """Joints that settle anew at each visit and drift in time: formulas, choice, false alarms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from engine.dense import Dense
@@ -48,7 +50,7 @@ def course(r, lasting):
 
 def drawn(r, rng, joints=0.0, drift=0.0):
     V = covariance(r, joints, drift)
-    return r.moved((np.linalg.cholesky(V) @ rng.normal(size=len(V))).reshape(-1, 3))
+    return replace(r, e=(np.linalg.cholesky(V) @ rng.normal(size=len(V))).reshape(-1, 3))
 
 
 @pytest.mark.parametrize("kind", ["independent+joints", "independent+time"])

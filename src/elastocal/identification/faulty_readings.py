@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
@@ -338,7 +338,7 @@ def report_faulty(
     observed, table = problem.observations, problem.observations.table
     readings = linearised(problem.model, observed, clean.fit.x, columns)
     if residual is not None:
-        readings = readings.moved(residual)
+        readings = replace(readings, e=residual)
     width = prior_widths(problem.model, clean.sizes)[columns]
     B, e = readings.B.reshape(len(observed.value), -1) * width, readings.e.ravel()
     shared = noise is not None and (bool((noise.fit.common > 0).any()) or noise.lasting is not None)

@@ -6,7 +6,6 @@ stated weights, the published ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -37,7 +36,13 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.noise_summary import noise_of
-from elastocal.identification.options import ROBUST, IntervalKind, MethodResult, Options
+from elastocal.identification.options import (
+    ROBUST,
+    Course,
+    IntervalKind,
+    MethodResult,
+    Options,
+)
 from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
@@ -123,10 +128,11 @@ def identify(
     if copies:
         observed = subset(observed, ~again)
         options = _without(options, again, observed.size)
-    every, sound, found = _fitted(model, table, observed, options, progress)
+    course = _course(model, table, observed, options, progress)
+    found = run_method(course)
     progress("intervals and held-out residuals")
-    outliers = describe(every, found.solution, ~found.good)
-    result = summarise(every, sound, found, outliers, new_poses, copies)
+    outliers = describe(course.every, found.solution, ~found.good)
+    result = summarise(course, found, outliers, new_poses, copies)
     body = solved_body(table, float(found.solution.fit.residual.std()))
     told = (*told, *_disordered(model, table, test), *_fallen(model, table, result.x))
     result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
@@ -150,9 +156,9 @@ def _disordered(model: Model, *tables: Measurements | None) -> tuple[str, ...]:
     return tuple(f"{text}; effects of the last move are wrong there" for text in found if text)
 
 
-def _fitted(
+def _course(
     model: Model, table: Measurements, observed: Observations, options: Options, progress: Progress
-) -> tuple[Solution, Solution, MethodResult]:
+) -> Course:
     progress("finding the start")
     free = fixed_and_free(model, options.fixed)
     x0 = start_values(model, table, options.seed, free)
@@ -176,7 +182,7 @@ def _fitted(
         model, sound.problem.observations, sound.fit.x, sound.fit.residual, table,
         subset(observed, faulty) if faulty.any() and sound is not every else None,
     )  # fmt: skip
-    return every, sound, run_method(every, sound, faulty, free, refit, options, progress)
+    return Course(every, sound, faulty, free, refit, options, progress)
 
 
 def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:
@@ -237,15 +243,16 @@ NOT_SHOWN = "held: the readings do not show the smooth function that it is part 
 
 
 def summarise(
-    every: Solution, sound: Solution, found: MethodResult, faulty: tuple[Outlier, ...],
-    new_poses: NewPoses | None, copies: tuple[int, ...],
+    course: Course, found: MethodResult, faulty: tuple[Outlier, ...], new_poses: NewPoses | None,
+    copies: tuple[int, ...],
 ) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    `every` holds all readings, `sound` the fit to those that agree; `faulty` are those beyond the
-    noise.  `new_poses`: where the arm will be used, by default the workspace.
+    `faulty` are the readings beyond the noise.  `new_poses`: where the arm will be used, by default
+    the workspace.
     """
-    solution, final, covariance = found.solution, found.solution.fit, found.spread.matrix
+    every, solution, covariance = course.every, found.solution, found.spread.matrix
+    final = solution.fit
     kept, problem = solution.reduction.kept, solution.problem
     model, observed, weights = problem.model, problem.observations, problem.weights
     spent = len(kept) if found.effective is None else found.effective
@@ -259,7 +266,7 @@ def summarise(
     plainly_large = problem.large and solution.held is None
     report = None
     if not every.exact:
-        fitted = found.solution if set_apart or found.smooth else sound
+        fitted = found.solution if set_apart or found.smooth else course.sound
         report = report_faulty(every, fitted, found.noise, found.good, found.standard)
     result = Calibration(
         model=model, method=found.method, noise=noise, weights=weights,
@@ -406,8 +413,6 @@ def _correlations(
 
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
 
-Refit = Callable[[BoolArray], Solution]  # of these observations
-
 ROUNDS, RESTARTS = 14, 2
 # Of a standard deviation: what relinearising may still move an estimate by at the end, and where
 # the kind of noise is chosen.
@@ -421,30 +426,29 @@ OF_READINGS = "auto, of readings"  # the best noise model but those that know th
 
 
 def _adapted(
-    every: Solution, start: Solution, good: BoolArray, kind: str, progress: Progress,
-    refit: Refit | None, noise: NoiseFit | None = None,
+    course: Course, start: Solution, good: BoolArray, kind: str, noise: NoiseFit | None = None,
+    judging: bool = True,
 ) -> Adapted:  # fmt: skip
     """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
 
-    `every` holds all observations, `start` the fit to the `good` (N,) ones.  Noise and good
-    readings are settled at its values and the kept parameters fitted anew with these weights, until
-    neither changes.  Then what was chosen on the way is chosen again by what is there now:
-    the parameters, if other readings are good or the weights show more, and the kind of noise,
-    unless one is given.  More parameters that do not settle are none: the fit without them stays.
-    Without `refit` no reading is judged.
+    `start` is the fit to the `good` (N,) observations.  Noise and good readings are settled at its
+    values and the kept parameters fitted anew with these weights, until neither changes.  Then what
+    was chosen on the way is chosen again by what is there now: the parameters, if other readings
+    are good or the weights show more, and the kind of noise, unless one is given.  More parameters
+    that do not settle are none: the fit without them stays.  Readings are judged if `judging`.
     """
-    asked = "auto" if kind == OF_READINGS else kind
+    asked, every = "auto" if kind == OF_READINGS else kind, course.every
     problem, solution, now, fitted = every.problem, start, good, good
     readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
     check_supported(asked, readings)
     sure, restarts, fewer = False, 0, None
     for left in reversed(range(ROUNDS)):
         before, kept, first = now, start.reduction.kept, noise is None
-        if refit is None:
-            noise = estimate_noise(readings, asked, noise)
-        else:
+        if judging:
             noise, now = settle(readings, asked, now, noise)
-        progress(f"fitting with the noise found ({noise.kind})")
+        else:
+            noise = estimate_noise(readings, asked, noise)
+        course.progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
         solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
         readings = _linearised(problem, solution.fit.x, kept, kind)
@@ -454,9 +458,9 @@ def _adapted(
         sure = sure or (first and same and moved.max(initial=0.0) < LINEAR)
         if moved.max(initial=0.0) >= SETTLED or not same:
             continue
-        others = refit is not None and restarts < RESTARTS and not np.array_equal(now, fitted)
-        if others and refit is not None:
-            start, fitted, restarts = every if now.all() else refit(now), now, restarts + 1
+        others = judging and restarts < RESTARTS and not np.array_equal(now, fitted)
+        if others:
+            start, fitted, restarts = every if now.all() else course.refit(now), now, restarts + 1
             solution, more = start, start.reduction
         else:
             # Weights that make light of what is noisy may show more than those of the first fit.
@@ -552,39 +556,31 @@ COMPUTED = (
 )
 
 
-def run_method(
-    every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, refit: Refit,
-    options: Options, progress: Progress,
-) -> MethodResult:  # fmt: skip
-    """Carry out `options.method` from the fit to all observations and that to the good ones.
-
-    `sound` is the fit to the observations that are not `faulty` (N,), `refit` makes another such;
-    they know nothing of smooth functions among the parameters `free`.  Constraints and prior come
-    last, on the weights and the readings that the method ends with.
-    """
-    alone, smooth = options, every.problem.model.shrunk[free].any()
-    if options.knows:
-        alone = replace(options, constraints=None, prior=None, intervals="auto")
+def run_method(course: Course) -> MethodResult:
+    """Carry out `options.method`; constraints and prior come last, on the weights and the readings
+    that the method ends with."""
+    options, smooth = course.options, course.every.problem.model.shrunk[course.free].any()
     if smooth:
         from elastocal.identification.smooth_fit import fit_smooth  # few models have any
 
-        found = fit_smooth(every, sound, faulty, free, options, progress)
+        found = fit_smooth(course)
+    elif options.knows:
+        alone = replace(options, constraints=None, prior=None, intervals="auto")
+        found = _by_method(replace(course, options=alone))
     else:
-        found = _by_method(every, sound, faulty, refit, alone, progress)
+        found = _by_method(course)
     if options.knows:
         from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
 
-        return fit_with_knowledge(found, options, progress)
-    return found if smooth else with_limits(every, found, options)
+        return fit_with_knowledge(found, options, course.progress)
+    return found if smooth else with_limits(course.every, found, options)
 
 
-def _by_method(
-    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, options: Options,
-    progress: Progress,
-) -> MethodResult:  # fmt: skip
+def _by_method(course: Course) -> MethodResult:
+    every, sound, faulty, options = course.every, course.sound, course.faulty, course.options
     method, exact = options.resolved, sound.exact
     if method == "reml" and not every.problem.large and not exact:
-        return _reml(every, sound, faulty, refit, options, progress)
+        return _reml(course)
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
@@ -594,7 +590,7 @@ def _by_method(
     )
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):
-        return _published(method, every, solution, good, options, progress)
+        return _published(course, solution)
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
     spread = spread_of(solution, options.intervals, None)
     return MethodResult(
@@ -682,31 +678,28 @@ def _holding(
     return replace(found, solution=solution, spread=spread, noise=noise)
 
 
-def _reml(
-    every: Solution,
-    sound: Solution,
-    faulty: BoolArray,
-    refit: Refit,
-    options: Options,
-    progress: Progress,
-) -> MethodResult:
+def _reml(course: Course) -> MethodResult:
+    every, sound, options = course.every, course.sound, course.options
+
     def found(
         start: Solution, good: BoolArray, kind: str, known: NoiseFit | None = None
     ) -> Adapted:
-        solution, noise, good = _adapted(every, start, good, kind, progress, refit, known)
+        solution, noise, good = _adapted(course, start, good, kind, known)
         explained = partial(_explained, every, solution, noise, good)
         if not good.all() and not options.sets_aside(~good, explained):
             # So many faulty readings look like anything that scatters or drifts.
             plainly, everything = OF_READINGS if kind == "auto" else kind, np.ones_like(good)
-            solution, noise, _ = _adapted(every, every, everything, plainly, progress, None)
+            solution, noise, _ = _adapted(course, every, everything, plainly, judging=False)
         return solution, noise, good
 
-    solution, noise, good = found(sound, ~faulty, options.noise)
+    solution, noise, good = found(sound, ~course.faulty, options.noise)
     if options.noise == "auto" and Kind.of(noise.kind).by_visit:
         # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
         # which make light of it let the fit go where poses left out are predicted worse.
-        progress("comparing with noise of the readings alone")
-        agreed = sound if np.array_equal(good, ~faulty) else every if good.all() else refit(good)
+        course.progress("comparing with noise of the readings alone")
+        agreed = every if good.all() else sound
+        if not good.all() and not np.array_equal(good, ~course.faulty):
+            agreed = course.refit(good)
         plain = found(agreed, good, OF_READINGS, noise.of_readings())
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
             tests = noise.tests
@@ -745,20 +738,13 @@ def _held_out_rms(solution: Solution, judge: Solution) -> float:
     return float(np.sqrt(np.mean(known**2)))
 
 
-def _published(
-    method: str,
-    every: Solution,
-    start: Solution,
-    good: BoolArray,
-    options: Options,
-    progress: Progress,
-) -> MethodResult:
+def _published(course: Course, start: Solution) -> MethodResult:
     """Eq. (14) on the linearised model, and a fit of the exact one with the weights it ends at."""
     from elastocal.identification import published
 
-    progress("iterating the weights of eq. (14)")
-    observed, fit = start.problem.observations, start.fit
-    group = None
+    course.progress("iterating the weights of eq. (14)")
+    observed, fit, options = start.problem.observations, start.fit, course.options
+    method, good, group = options.resolved, ~course.faulty, None
     if method == "eq14":
         key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
         group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
@@ -767,12 +753,11 @@ def _published(
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
     fitted = good if len(observed.lead) < len(good) else np.ones_like(good)
-    solution = refined(every, start, start.fit.x, fitted, weights)
-    if options.intervals != "auto":
-        own = spread_of(solution, options.intervals, None)
-        return MethodResult(method, solution, own, None, good)
+    solution = refined(course.every, start, start.fit.x, fitted, weights)
     covariance = Covariance(
         "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),
         "as published, eq. (13) with the σ of eq. (14): not corrected for estimated weights",
     )  # fmt: skip
+    if options.intervals != "auto":
+        covariance = spread_of(solution, options.intervals, None)
     return MethodResult(method, solution, covariance, None, good)

@@ -108,7 +108,9 @@ class Fit:
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
-        return self.r_factor.cofactor(self.sizes[self.columns])
+        size = self.sizes[self.columns]
+        inverse = self.r_factor.scaled(size).half
+        return (inverse @ inverse.T) * np.outer(size, size)
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ class NoisyReadings:
         """
         theta = np.ones(self.own)
         found: list[int] = []
-        if self.structure.index.shape[1] > 1 and not shrunk(self.kind):
+        if self.structure.index.shape[1] > 1 and not self.kind.shrunk:
             for k in reversed(range(self.own)):  # the last that can be spared first
                 theta[k] = 0.0
                 if np.linalg.eigvalsh(self.structure.covariance(theta)).min() > 0:
@@ -211,11 +211,6 @@ def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
     return Parts(of, loading.reshape(C, numbers, M * size, M * size))
 
 
-def shrunk(kind: Kind) -> bool:
-    """Whether the variances of single readings are many, and share a prior."""
-    return bool(getattr(STRUCTURES[kind.own], "shrunk", False))
-
-
 # A kind of noise fitted to readings.
 
 
@@ -283,7 +278,7 @@ def fitted(
             return max(tried, key=lambda one: one.log_likelihood)
     noisy, prior = NoisyReadings(readings, kind, lasting), None
     start = noisy.start(like)
-    if shrunk(kind):
+    if kind.shrunk:
         if TIME in kind.parts:
             raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
         prior = prior_of_groups(noisy)
@@ -524,7 +519,7 @@ class _Choice:
         except InsufficientDataError:
             return
         own = found.noisy.own
-        if shrunk(kind):
+        if kind.shrunk:
             own = self.readings.size + 2  # means of log θ and its two variances
         spent = len(found.found) + (found.lasting is not None)
         if EACH in found.kind.parts:  # what tells their sizes apart, none of them included
@@ -570,7 +565,7 @@ class _Choice:
         """
         less = self.best
         assert less is not None
-        if shrunk(kind) and part == TIME:
+        if kind.shrunk and part == TIME:
             kind = kind._replace(own=self.names[0])
             less = fitted(self.readings, kind, less, None, ROUGHLY)
         wanted = kind.with_part(part)
@@ -587,7 +582,7 @@ class _Choice:
             self.attempt(wanted, lasting[0], more)
             for each in lasting[1:]:
                 self.attempt(wanted, each)
-            if shrunk(kind):
+            if kind.shrunk:
                 self.attempt(wanted._replace(own=self.names[0]), lasting[0])
 
 
@@ -657,9 +652,12 @@ def linearised(
     model: Model, observed: Observations, x: Array, columns: NDArray[np.int64]
 ) -> Readings:
     at = model.regressor(observed.table, x, columns, observed)
-    n, size = len(observed.lead), observed.size
-    table = observed.table
-    sight, reach = _sight(model, observed)
+    n, size, table, sight, reach = len(observed.lead), observed.size, observed.table, None, None
+    if table.position is not None and size == 3:
+        offset = table.position[observed.lead] - model.cell.tracker.position
+        length = np.linalg.norm(offset, axis=1)
+        if (length > 0).all():
+            sight, reach = polar_axes(offset), length
     return Readings(
         at.B.reshape(n, size, -1), at.residual.reshape(n, size), observed.configuration,
         observed.load, table.marker[observed.lead], sight, reach,
@@ -705,14 +703,3 @@ def with_stated_sharing(own: Weights, model: Model, observed: Observations, x: A
         return own
     stated = [(d, 1.0) for d in stated_deviations(model, observed, x)]
     return weights_sharing(own, stated, observed.configuration)
-
-
-def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | None]:
-    position = observed.table.position
-    if position is None or observed.size != 3:
-        return None, None
-    offset = position[observed.lead] - model.cell.tracker.position
-    reach = np.linalg.norm(offset, axis=1)
-    if not (reach > 0).all():
-        return None, None
-    return polar_axes(offset), reach

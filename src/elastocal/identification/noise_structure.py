@@ -105,7 +105,11 @@ def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord 
     place = np.arange(m) < count[:, None]
     row, share = np.zeros((n, m), dtype=np.int64), np.zeros((n, m))
     row[place], share[place] = combine.indices, combine.data
-    moved = _joint_motion(model, table, x)[row] * share[:, :, None, None]
+    # ∂(reading)/∂q (rows, size, joints) of the nominal arm, base and markers where x has them.
+    moving, at = model.moving, dict(zip(model.names, x.tolist(), strict=True))
+    here = np.array([at.get(p.name, p.nominal) for p in moving.parameters])
+    joints = np.flatnonzero([p.effect == JointMotion.name for p in moving.parameters])
+    motion = moving.regressor(table, here, joints).B.reshape(len(table), -1, len(joints))
     when, span, timed = _when(table)
     turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
     visit = np.where(place, visits(table)[row], -1)
@@ -113,7 +117,8 @@ def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord 
     stated = noise.drift > 0
     drifts = stated or in_random_order(table.take(np.argsort(when, kind="stable")))
     lasting = (noise.lasting / span,) if stated and timed else LASTING
-    return VisitRecord(visit, moved, share, when[row], turning, timed, span, drifts, lasting)
+    motion = motion[row] * share[:, :, None, None]
+    return VisitRecord(visit, motion, share, when[row], turning, timed, span, drifts, lasting)
 
 
 SYSTEMATIC = 0.01
@@ -134,15 +139,6 @@ def in_random_order(table: Measurements) -> bool:
     ratio = (np.diff(q, axis=0) ** 2).sum(axis=0) / n
     deviation = np.sqrt(4 * (n - 2) / (n**2 - 1) / q.shape[1])
     return bool(ratio.mean() - 2 > special.ndtri(SYSTEMATIC) * deviation)
-
-
-def _joint_motion(model: Model, table: Measurements, x: Array) -> Array:
-    """∂(reading)/∂q (rows, size, joints) of the nominal arm, base and markers where x has them."""
-    moving = model.moving
-    at = dict(zip(model.names, x.tolist(), strict=True))
-    here = np.array([at.get(p.name, p.nominal) for p in moving.parameters])
-    joints = np.flatnonzero([p.effect == JointMotion.name for p in moving.parameters])
-    return moving.regressor(table, here, joints).B.reshape(len(table), -1, len(joints))
 
 
 def _when(table: Measurements) -> tuple[Array, float, bool]:
@@ -254,9 +250,6 @@ class Readings:
         order = np.random.default_rng(0).permutation(len(count))
         return self.take(np.isin(code, order[: np.searchsorted(np.cumsum(count[order]), n) + 1]))
 
-    def moved(self, e: Array) -> Readings:
-        return replace(self, e=e)
-
 
 # What single readings scatter by: one variance, or several.
 
@@ -293,6 +286,8 @@ class NoiseModel:
 
     name: ClassVar[str]
     description: ClassVar[str]
+    words: ClassVar[str] = ""  # in a list of others, where the description is too long
+    shrunk: ClassVar[bool] = False  # whether the variances are many, and share a prior
 
     def components(self, readings: Readings) -> Mapping[str, Array]:
         """The name of each variance → S, (N,) times the identity or (N, size, size), of N readings.
@@ -306,10 +301,6 @@ class NoiseModel:
     def supports(self, readings: Readings) -> bool:
         """Whether these readings have what the model needs; where not, it is not tried."""
         return True
-
-    @property
-    def words(self) -> str:
-        return self.description
 
     def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         """The model for the likelihood, of the variances `names` where it may have several sets;
@@ -352,20 +343,12 @@ class NoiseModel:
         return full
 
 
-class BuiltIn(NoiseModel):
-    """A model of this package, in `words` for a list of others; its variances may be many that
-    share a prior (`shrunk`).  `supports` says whether the table can tell its variances."""
-
-    words: ClassVar[str] = ""
-    shrunk: ClassVar[bool] = False
-
-
 def _axes(size: int) -> Array:
     """E_a (size, size, size), 1 at a, a and 0 elsewhere."""
     return np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
 
 
-class Independent(BuiltIn):
+class Independent(NoiseModel):
     """One variance for positions, and one for rotations."""
 
     name, words = "independent", "equal noise"
@@ -378,7 +361,7 @@ class Independent(BuiltIn):
         return ["position", "rotation"], [(0, np.diag(1.0 - turns)), (1, np.diag(1.0 * turns))]
 
 
-class ByAxis(BuiltIn):
+class ByAxis(NoiseModel):
     """One variance for each component of a reading."""
 
     name, description, words = "axis", "one variance per axis", "one size per axis"
@@ -391,7 +374,7 @@ class ByAxis(BuiltIn):
         return own[: readings.size], list(enumerate(_axes(readings.size)))
 
 
-class ByMarker(BuiltIn):
+class ByMarker(NoiseModel):
     name, description, words = "marker", "one variance per marker", "one size per marker"
 
     def supports(self, readings: Readings) -> bool:
@@ -403,7 +386,7 @@ class ByMarker(BuiltIn):
         return [f"marker {m}" for m in labels], [(number.ravel(), np.eye(3))]
 
 
-class ByGroup(BuiltIn):
+class ByGroup(NoiseModel):
     """One variance for each configuration (under each load) in each direction.
 
     The group of Klimchik et al. 2013, section 4: its markers and repeats share one σ.
@@ -432,7 +415,7 @@ class ByGroup(BuiltIn):
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 
 
-class Polar(BuiltIn):
+class Polar(NoiseModel):
     """Variances along the line of sight, across it, and across it growing with the distance.
 
     Σ = θ_r u uᵀ + (θ_t + θ_a d²)(I − u uᵀ) with u the line of sight and d its length in m: range
@@ -459,7 +442,7 @@ class Polar(BuiltIn):
         return tuple(own), list(enumerate(own.values()))
 
 
-class AsStated(BuiltIn):
+class AsStated(NoiseModel):
     """The stated noise times one factor, which the residuals tell."""
 
     name, description = "stated", "the stated noise times one factor"
@@ -712,13 +695,17 @@ class Kind(NamedTuple):
         return found.with_part(TIME) if noise.drift > 0 else found
 
     @property
+    def shrunk(self) -> bool:
+        return STRUCTURES[self.own].shrunk
+
+    @property
     def by_visit(self) -> bool:
         return any(part in BY_VISIT for part in self.parts)
 
     @property
     def words(self) -> str:
         model = STRUCTURES.get(self.own)
-        own = self.own if model is None else model.words
+        own = self.own if model is None else model.words or model.description
         return " + ".join([own, *(PARTS[part][1] for part in self.parts if part in PARTS)])
 
     def deviations(
@@ -748,9 +735,9 @@ def noise_models() -> tuple[str, ...]:
 def check_supported(kind: str, readings: Readings) -> None:
     """Raise InputError where a noise model of a plug-in lacks something in these readings."""
     own = Kind.parsed(kind).own
-    model = STRUCTURES.get(own)
+    model = STRUCTURES.get(own, NoiseModel())
     require(
-        model is None or isinstance(model, BuiltIn) or model.supports(readings),
+        type(model).components is NoiseModel.components or model.supports(readings),
         f"{option('noise', kind)}: this table does not support the noise model '{own}'; add the "
         "columns that it needs, or take another one",
     )

@@ -19,7 +19,7 @@ from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import WeightKind
 from elastocal.model.manipulator import SmoothGroup
 from elastocal.text import did_you_mean, quoted
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 IntervalKind = Literal[
     "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
@@ -180,7 +180,7 @@ class MethodResult:
         return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
 
 
-# How to identify: method, noise, what is held, what becomes of faulty readings.
+# How to identify: method, noise, what is held, what becomes of faulty readings, where it starts.
 
 Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "l1"]
 FaultyReadings = Literal["auto", "drop", "keep"]
@@ -305,3 +305,21 @@ class Options:
         if self.weights == "auto" and self.covariance is None:
             return "reml"
         return "ols" if self.weights == "none" else "wls"
+
+
+Refit = Callable[[BoolArray], Solution]  # of these observations
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a method starts from: fits to all observations, and to those that are not `faulty` (N,);
+    `refit` makes another such.  They know nothing of smooth functions among the parameters `free`.
+    """
+
+    every: Solution
+    sound: Solution
+    faulty: BoolArray
+    free: IntArray
+    refit: Refit
+    options: Options
+    progress: Progress

@@ -25,10 +25,10 @@ from elastocal.identification.least_squares import Covariance, Fit, PriorRows, P
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import FunctionPrior, MethodResult, Options, SmoothPart
+from elastocal.identification.options import Course, FunctionPrior, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, choose, is_placed
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, is_placed
 from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import (
     Part,
@@ -43,7 +43,7 @@ from elastocal.identification.weighted_problem import (
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations
 from elastocal.text import listed
-from elastocal.units import Array, BoolArray, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray
 
 # Parameters with a prior beside parameters without one: sizes by restricted likelihood, posterior.
 #
@@ -327,27 +327,21 @@ class JointFit:
 # The course: fit, noise and faulty readings in turn, then what else may change.
 
 
-def fit_smooth(
-    every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, options: Options,
-    progress: Progress,
-) -> MethodResult:  # fmt: skip
-    """All free parameters fitted together, from fits of the ordinary ones alone.
-
-    `every` holds all observations, `sound` the fit to those that are not `faulty` (N,); both know
-    nothing of the smooth functions, whose parameters are among `free`.
-    """
-    model, size, tried = every.problem.model, every.problem.observations.size, []
+def fit_smooth(course: Course) -> MethodResult:
+    """All free parameters fitted together, from fits of the ordinary ones alone."""
+    sound, free, problem, tried = course.sound, course.free, course.every.problem, []
+    model, size = problem.model, problem.observations.size
     for sized in (sized_of(model, free), free[:0]):
-        progress("fitting smooth functions")
-        search = _Course(every, sound, Functions.of(model, free, sized), options, progress)
-        fit, noise, good = search.settled(~faulty)
+        course.progress("fitting smooth functions")
+        search = _Search(course, Functions.of(model, free, sized))
+        fit, noise, good = search.settled(~course.faulty)
         fit, cross = search.without_those_that_harm(fit)
         held = rms_3d(cross[0], size)
         tried.append((not fit.found.converged, held, search, (fit, cross, noise, good)))
         # A prior that leads astray predicts worse than the ordinary parameters alone.
         if not len(sized) or (fit.found.converged and held <= rms_3d(sound.crossed[0], size)):
             break
-    _, _, search, parts = min(tried, key=lambda course: course[:2])
+    _, _, search, parts = min(tried, key=lambda one: one[:2])
     return search.result(*parts)
 
 
@@ -362,12 +356,10 @@ def _followed(observed: Observations, group: SmoothGroup) -> Array:
     return np.asarray(table.q[observed.lead, group.joint])
 
 
-class _Course:
-    def __init__(
-        self, every: Solution, sound: Solution, functions: Functions, options: Options,
-        progress: Progress,
-    ) -> None:  # fmt: skip
-        self.every, self.options, self.progress = every, options, progress
+class _Search:
+    def __init__(self, course: Course, functions: Functions) -> None:
+        self.every, self.options, self.progress = course.every, course.options, course.progress
+        every, sound = course.every, course.sound
         self.model, self.observed = every.problem.model, every.problem.observations
         self.functions, self.harmful = functions, list[str]()
         own = np.setdiff1d(sound.problem.free, functions.columns)
@@ -375,7 +367,7 @@ class _Course:
         self.sound = replace(
             sound, fit=replace(sound.fit, problem=problem), reduction=sound.reduction.among(own)
         )
-        self.estimating = options.resolved == "reml" and not every.problem.large
+        self.estimating = self.options.resolved == "reml" and not every.problem.large
         # Labels of each reading, and one column that no residual follows: they have paid for the
         # parameters already.
         bare = linearised(self.model, self.observed, every.fit.x, np.zeros(0, dtype=np.int64))
@@ -476,7 +468,8 @@ class _Course:
         if self.estimating:
             # From the second round on, whose fit has such weights, the kind of noise is known.
             known = noise if k > 1 else None
-            return settle(self.readings.moved(self.standard), self.options.noise, good, known)
+            readings = replace(self.readings, e=self.standard)
+            return settle(readings, self.options.noise, good, known)
         n, size = len(self.standard), self.observed.size
         e = self.every.problem.weights.apply(self.standard.ravel()).reshape(n, size)
         squared, dof = (e**2).sum(axis=1), max(int(good.sum()) * size, 1)

@@ -401,11 +401,6 @@ class RFactor:
         cond = max(self.rows, self.columns) * np.finfo(float).eps
         return scale * least_norm(self.R * scale, self.projected, cond=cond)
 
-    def cofactor(self, scale: Array) -> Array:
-        """(BᵀB)⁻¹ (p, p) of a B with full column rank."""
-        inverse = self.scaled(scale).half
-        return (inverse @ inverse.T) * np.outer(scale, scale)
-
 
 def least_norm(A: Array, b: Array, cond: float | None = None) -> Array:
     """x (k, …) of least norm among those that minimise |A x − b|, by singular values; those below
