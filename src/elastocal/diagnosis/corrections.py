@@ -39,14 +39,14 @@ from elastocal.model.effects.base import (
     turning_joints,
 )
 from elastocal.model.effects.gears import BY_ORDER
-from elastocal.model.effects.nameless import (
+from elastocal.model.effects.smooth import (
     ApproachResponse,
     JointResponse,
     LoadResponse,
+    ResidualField,
     ResidualStep,
     TorqueResponse,
 )
-from elastocal.model.effects.smooth import ResidualField
 from elastocal.units import Array
 
 

@@ -16,14 +16,7 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, require
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.effects import (
-    compliances,
-    gears,
-    loads,
-    nameless,
-    placements,
-    smooth,
-)
+from elastocal.model.effects import compliances, gears, loads, placements, smooth
 from elastocal.model.effects.base import Effect, check
 from elastocal.plugin_loader import load_installed, load_named, same_class
 from elastocal.text import did_you_mean, listed
@@ -54,12 +47,12 @@ CATALOGUE: dict[str, Effect] = {
         compliances.JointHardening(),
         gears.Backlash(),
         gears.Hysteresis(),
-        nameless.TorqueResponse(),
-        nameless.ApproachResponse(),
+        smooth.TorqueResponse(),
+        smooth.ApproachResponse(),
         compliances.OffAxisCompliance(),
         compliances.LinkBending(),
         compliances.BaseCompliance(),
-        nameless.LoadResponse(),
+        smooth.LoadResponse(),
         loads.GravityCompensator(),
         loads.LinkGravity(),
         loads.LinkMassError(),
@@ -69,7 +62,7 @@ CATALOGUE: dict[str, Effect] = {
         placements.MarkerPosition(),
         placements.MarkerSlip(),
         smooth.ResidualField(),
-        nameless.ResidualStep(),
+        smooth.ResidualStep(),
         placements.MarkerOrientation(),
         placements.BaseDrift(),
         placements.FrameJump(),
