@@ -247,10 +247,13 @@ class Goals:
     position: Array
     rotation: Array | None
 
+    def through(self, T: Array) -> Goals:
+        """These in the frame to which T (n, 4, 4) takes them."""
+        position = np.einsum("nij,nj->ni", T[:, :3, :3], self.position) + T[:, :3, 3]
+        return Goals(position, None if self.rotation is None else T[:, :3, :3] @ self.rotation)
+
     def in_base(self, T: Array) -> Goals:
-        back = T[:, :3, :3].transpose(0, 2, 1)
-        position = np.einsum("nij,nj->ni", back, self.position - T[:, :3, 3])
-        return Goals(position, None if self.rotation is None else back @ self.rotation)
+        return self.through(np.asarray(np.linalg.inv(T)))
 
 
 class Commanding(BoundedSearch):
@@ -439,17 +442,14 @@ def _check_unit(targets: Targets, position: Array, chain: Chain, T: Array) -> No
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
-    position, rotation = targets.position, targets.rotation
-    if position is None:
+    if targets.position is not None:
+        goals = Goals(targets.position, targets.rotation)
+    else:
         assert targets.q is not None  # read_targets: positions or joints
-        flange = nominal_flanges(chain, targets.q)
-        position = flange[:, :3, 3] + np.einsum("nij,nj->ni", flange[:, :3, :3], place)
         # Fewer than six joints cannot keep the rotation too.
-        rotation = flange[:, :3, :3] @ turn if chain.n_joints >= 6 else None
-    if targets.frame == "base":
-        position = T[:, :3, 3] + np.einsum("nij,nj->ni", T[:, :3, :3], position)
-        rotation = None if rotation is None else T[:, :3, :3] @ rotation
-    return Goals(position, rotation)
+        goals = Goals(place, turn if chain.n_joints >= 6 else None)
+        goals = goals.through(nominal_flanges(chain, targets.q))
+    return goals.through(T) if targets.frame == "base" else goals
 
 
 def _is_reached(missed: Array) -> BoolArray:

@@ -187,16 +187,14 @@ def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Target
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
     aimed = result.goals.in_base(result.T_data_base)
-    position, rotation = aimed.position, aimed.rotation
-    flange = nominal_flanges(tool.chain, result.q)
-    there = flange[:, :3, 3] + np.einsum("nij,nj->ni", flange[:, :3, :3], result.place)
-    exact = _between(position, rotation, there, flange[:, :3, :3] @ result.turned)
-    p, R = _achieved(tool, result, result.nominal)
-    first_order = _between(p, R if rotation is not None else None, position, rotation)
+    nominal = Goals(result.place, result.turned).through(nominal_flanges(tool.chain, result.q))
+    exact = _between(aimed, nominal)
+    achieved = _achieved(tool, result, result.nominal)
+    first_order = _between(achieved, aimed)
     step = np.abs(result.q - result.nominal).max(axis=1)
     close = result.reached & (step <= LARGE_CORRECTION)
     # A nominal command that misses its own target is none that a correction could start from.
-    usable = np.isfinite(p).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
+    usable = np.isfinite(achieved.position).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
     correction = np.where(close[:, None], exact, first_order)
     correction[~(close | usable)] = np.nan
     status = tuple(
@@ -206,20 +204,21 @@ def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tup
     return correction, status
 
 
-def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> tuple[Array, Any]:
+def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> Goals:
+    """Where the calibrated tool is at joints q, in the base frame."""
     rows = tool.rows(replace(result.targets.table, force=result.force))
-    there = Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
-    return there.position, there.rotation
+    return Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
 
 
-def _between(p: Array, R: Array | None, p_new: Array, R_new: Array | None) -> Array:
-    """(n, 6) from pose (p, R) to pose (p_new, R_new): p_new − p, rotation vector of R_new Rᵀ."""
-    turned = np.zeros_like(p)
-    if R is not None and R_new is not None:
-        good = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(R_new).all(axis=(1, 2))
-        change = R_new[good] @ R[good].transpose(0, 2, 1)
-        turned[good] = Rotation.from_matrix(change).as_rotvec()
-    return np.hstack([p_new - p, turned])
+def _between(one: Goals, other: Goals) -> Array:
+    """(n, 6) from one pose to another: p' − p, and the rotation vector of R' Rᵀ, zero where a
+    rotation is any."""
+    turned = np.zeros_like(one.position)
+    if one.rotation is not None and other.rotation is not None:
+        change = other.rotation @ one.rotation.transpose(0, 2, 1)
+        good = np.isfinite(change).all(axis=(1, 2))
+        turned[good] = Rotation.from_matrix(change[good]).as_rotvec()
+    return np.hstack([other.position - one.position, turned])
 
 
 def _with_table(
@@ -227,23 +226,20 @@ def _with_table(
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
     aimed = check.goals.in_base(check.T_data_base)
-    position, rotation = aimed.position, aimed.rotation
     known = np.flatnonzero(
         np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
     )
-    moved = position + correction[:, :3]
-    flange = None
-    if rotation is not None:
-        turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix() @ rotation
-        flange = (turned @ check.turned.transpose(0, 2, 1))[known]
+    moved, flange = aimed.position + correction[:, :3], None
+    if aimed.rotation is not None:
+        turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix()
+        flange = (turned @ aimed.rotation @ check.turned.transpose(0, 2, 1))[known]
     limits = np.full(tool.chain.n_joints, -np.inf), np.full(tool.chain.n_joints, np.inf)
     controller = Reaching(tool.chain, moved[known], flange, check.place[0], None, *limits)
     q = check.nominal.copy()
     q[known] = controller.solve(q[known], np.arange(len(known)))[0]
     errors = []
     for joints in (check.nominal, q):
-        p, R = _achieved(tool, check, joints)
-        off = _between(p, None if rotation is None else R, position, rotation)[known]
+        off = _between(_achieved(tool, check, joints), aimed)[known]
         errors.append(np.column_stack([np.linalg.norm(off[:, k : k + 3], axis=1) for k in (0, 3)]))
     return errors[0], errors[1]
 

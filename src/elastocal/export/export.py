@@ -396,11 +396,7 @@ class _Writing:
         return self.done.written(text, *warnings, read=self.at_rest(MujocoRest(text), placed))
 
     def corrected(self, path: Path) -> Exported:
-        cell, pieces, robot = (
-            self.calibrated.model.cell,
-            self.pieces,
-            self.calibrated.model.cell.robot,
-        )
+        cell, pieces = self.calibrated.model.cell, self.pieces
         if self.wish.base_frame:
             raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
         if _compensator(self.kept.exported) is not None:
@@ -408,9 +404,9 @@ class _Writing:
         if pieces.masses and not cell.model.link_gravity:
             how = "without those of the file (link_gravity = false)"
             raise NotInPlace(f"weights were identified {how}")
-        text, warnings = mjcf_file.corrected_mjcf(robot, pieces, self.wish.frames, self.note)
-        added = f'name="{mjcf_file.FLANGE}"' in text
-        arm = MjcfArm.read(path, robot.base, mjcf_file.FLANGE if added else robot.flange, text)
+        text, warnings = mjcf_file.corrected_mjcf(cell.robot, pieces, self.wish.frames, self.note)
+        flange = mjcf_file.FLANGE if f'name="{mjcf_file.FLANGE}"' in text else cell.robot.flange
+        arm = MjcfArm.read(path, cell.robot.base, flange, text)
         if not pieces.masses:
             arm.model.opt.gravity[:] = 0.0
         read = self.at_rest(MujocoRest(text, arm), arm.tree.placed(arm.base))

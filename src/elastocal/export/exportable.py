@@ -51,9 +51,9 @@ def numbers(values: ArrayLike) -> str:
 
 def placed_body(name: str | None, T: Array) -> dict[str, str]:
     """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
-    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    turned = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
     called = {} if name is None else {"name": name}
-    return called | {"pos": numbers(T[:3, 3]), "quat": numbers((w, x, y, z))}
+    return called | {"pos": numbers(T[:3, 3]), "quat": numbers(turned)}
 
 
 def origin_attributes(T: Array) -> dict[str, str]:

@@ -579,9 +579,17 @@ class CalibratedTool:
             place, turn = rigid.constant(point.place), ca.SX.eye(3)
         else:
             place, turn = own.markers[point.marker], own.marker_rotation[point.marker]
-        self._place, self._turn = place, turn
-        self._position = rigid.point(own.T_tracker_flange, place)
-        self._rotation = own.T_tracker_flange[:3, :3] @ turn
+        position, p, q = rigid.point(own.T_tracker_flange, place), self._symbolic.p, own.q_commanded
+        rotation, turned = own.T_tracker_flange[:3, :3] @ turn, ca.SX.sym("turned", 9)
+        y = ca.vertcat(position, ca.vec(rotation))
+        self._pose = Total(self._symbolic, y, ca.SX.zeros(0, 1))
+        self._sensitivity = Total(self._symbolic, position, p)
+        tilt = rigid.vector_from_rotation(ca.reshape(turned, 3, 3).T @ rotation)
+        y = ca.vertcat(position, ARM_LENGTH * tilt)
+        self._placing = Total(self._symbolic, position, q)
+        self._turning = Total(self._symbolic, y, q, (turned,))
+        inputs, frames = [*own.inputs.values(), p], [own.T_tracker_base, place, turn]
+        self._frames = BatchFunction(inputs, frames, self._symbolic.backend)
 
     def rows(self, table: Measurements) -> list[NDArray]:
         """What the model asks of the table's rows, one array per input; joints are put in later."""
@@ -611,33 +619,14 @@ class CalibratedTool:
                 )
         return list(found.values())
 
-    @cached_property
-    def _pose(self) -> Total:
-        y = ca.vertcat(self._position, ca.vec(self._rotation))
-        return Total(self._symbolic, y, ca.SX.zeros(0, 1))
-
     def poses(self, rows: list[NDArray], q: Array) -> tuple[Array, Array]:
         """Position (n, 3) m and rotation (n, 3, 3) of the tool; NaN without an equilibrium."""
         y = self._pose(self._at(rows, q), self.x)[0]
         return y[:, :3], y[:, 3:].reshape(-1, 3, 3).transpose(0, 2, 1)
 
-    @cached_property
-    def _sensitivity(self) -> Total:
-        return Total(self._symbolic, self._position, self._symbolic.p)
-
     def sensitivity(self, rows: list[NDArray], q: Array) -> Array:
         """A (n, 3, parameters) = d(position)/dX in m per unit, at commanded joints q."""
         return self._sensitivity(self._at(rows, q), self.x)[1]
-
-    @cached_property
-    def _errors(self) -> dict[bool, Total]:
-        turned, q = ca.SX.sym("turned", 9), self._symbolic.arm.q_commanded
-        tilt = rigid.vector_from_rotation(ca.reshape(turned, 3, 3).T @ self._rotation)
-        y = ca.vertcat(self._position, ARM_LENGTH * tilt)
-        return {
-            False: Total(self._symbolic, self._position, q),
-            True: Total(self._symbolic, y, q, (turned,)),
-        }
 
     def errors(
         self, rows: list[NDArray], q: Array, position: Array, rotation: Array | None
@@ -646,19 +635,13 @@ class CalibratedTool:
 
         `position` (n, 3) m and `rotation` (n, 3, 3), or None for any, are in the data's frame.
         """
-        oriented = rotation is not None
-        extra = [rotation.transpose(0, 2, 1).reshape(-1, 9)] if rotation is not None else []
-        r, slope = self._errors[oriented](self._at(rows, q), self.x, extra)
+        if rotation is None:
+            r, slope = self._placing(self._at(rows, q), self.x)
+        else:
+            turned = rotation.transpose(0, 2, 1).reshape(-1, 9)
+            r, slope = self._turning(self._at(rows, q), self.x, [turned])
         r[:, :3] -= position
         return r, slope
-
-    @cached_property
-    def _frames(self) -> BatchFunction:
-        own = self._symbolic.arm
-        inputs = [*own.inputs.values(), self._symbolic.p]
-        return BatchFunction(
-            inputs, [own.T_tracker_base, self._place, self._turn], self._symbolic.backend
-        )
 
     def frames(self, rows: list[NDArray]) -> tuple[Array, Array, Array]:
         """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for;

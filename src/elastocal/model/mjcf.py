@@ -13,7 +13,6 @@ joint stands a link without mass, and the body on the last one.
 from __future__ import annotations
 
 import copy
-import math
 import re
 import warnings
 from collections.abc import Iterable, Sequence
@@ -24,6 +23,7 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, require
 from elastocal.model import rigid
@@ -160,12 +160,10 @@ class MjcfArm:
         up = -gravity / size
         if np.abs(up - [0.0, 0.0, 1.0]).max() < 1e-9:
             return np.eye(3), f"of {base} in the file, z up"
-        from scipy.spatial.transform import Rotation
-
-        axis = np.cross(up, [0.0, 0.0, 1.0])
-        size = float(np.linalg.norm(axis))
-        axis = axis / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
-        turn = Rotation.from_rotvec(math.atan2(size, up[2]) * axis).as_matrix()
+        # The shortest turn; about x where the file stands on its head.
+        turn = np.diag([1.0, -1.0, -1.0])
+        if np.abs(up[:2]).max() > 1e-9:
+            turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()
         return turn, f"of {base}, up against the file's gravity"
 
     def _weights_told(self) -> list[str]:
@@ -319,10 +317,7 @@ def _ref(model: Any, j: int) -> float:
 
 def transform(position: Sequence[float] | Array, quaternion: Sequence[float] | Array) -> Array:
     """(4, 4) of a position (3,) in m and a quaternion (w, x, y, z)."""
-    from scipy.spatial.transform import Rotation
-
-    w, x, y, z = quaternion
-    return pose_at(position, Rotation.from_quat([x, y, z, w]).as_matrix())
+    return pose_at(position, Rotation.from_quat(quaternion, scalar_first=True).as_matrix())
 
 
 def import_mujoco(what: str = "a MuJoCo model") -> Any:
@@ -384,9 +379,13 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
     fields = [g for g in spec.geoms if g.hfieldname]
     strip(spec, [*fields, *(g for b in stated for g in b.geoms if not g.hfieldname)])
     first: ValueError | None = None
+
+    def is_mesh(file: Path) -> bool:
+        return file.is_file() and file.stat().st_size <= MOST_MESH_BYTES
+
     used, folder = {g.meshname for g in spec.geoms}, path.parent / (spec.compiler.meshdir or "")
     missing = {m.name: m.file for m in spec.meshes
-               if m.name in used and m.file and not _is_mesh(folder / m.file)}  # fmt: skip
+               if m.name in used and m.file and not is_mesh(folder / m.file)}  # fmt: skip
     for lost in (missing, None):  # those, then all
         try:  # a spec that could not be compiled says so again at whatever is asked of it
             geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
@@ -411,10 +410,6 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
             )
         return model, unweighed, notes
     raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first or ValueError())}")
-
-
-def _is_mesh(path: Path) -> bool:
-    return path.is_file() and path.stat().st_size <= MOST_MESH_BYTES
 
 
 def strip(spec: Any, geoms: Iterable[Any]) -> None:
