@@ -219,6 +219,6 @@ def check_registered(thing: object, base: type, what: str, example: str) -> None
 
 
 def same_class(known: object, new: object) -> bool:
-    """Whether one class, perhaps defined anew in a notebook, made both."""
-    a, b = type(known), type(new)
+    """Whether both are, or were made by, one class, perhaps defined anew in a notebook."""
+    a, b = (thing if isinstance(thing, type) else type(thing) for thing in (known, new))
     return (a.__module__, a.__qualname__) == (b.__module__, b.__qualname__)

@@ -12,7 +12,6 @@ from elastocal.planning.relaxation import (
     DesignProblem,
     exact_plan,
     exchange,
-    first_allowed,
     relax,
     sized_plans,
 )
@@ -124,7 +123,7 @@ def test_too_few_poses_and_pools_that_leave_something_open_are_refused():
         problem.balanced()
 
 
-def test_sizes_fall_with_the_number_of_poses_and_bounds_tell_where_a_target_may_be_met():
+def test_sizes_fall_with_the_number_of_poses_and_bounds_lie_below():
     def of(n):
         return problem_of("test_pose", 6, N=40, n=n)
 
@@ -132,7 +131,3 @@ def test_sizes_fall_with_the_number_of_poses_and_bounds_tell_where_a_target_may_
     values = [value for value, _ in found.values()]
     assert list(found) == [4, 6, 9] and values == sorted(values, reverse=True)
     assert all(bound <= value for value, bound in found.values())
-    first = first_allowed(of, values[1] * 1.05, 3, 20)
-    assert first <= 6
-    assert first == 3 or relax(of(first - 1).balanced(), 1e-3).bound > values[1] * 1.05
-    assert first_allowed(of, values[2] / 100, 3, 20) == 21

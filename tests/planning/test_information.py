@@ -107,8 +107,8 @@ def test_a_marker_is_seen_in_range_turned_to_the_tracker_and_behind_nothing() ->
     one = rules(1)
     assert one.seen is not None
     assert one.seen(q[:2], NOTHING).tolist() == [[False, True, False]] * 2
-    assert one.feasible(q, NOTHING).tolist() == [True, True, False, False]
-    assert not rules(2).feasible(q, NOTHING).any()
+    assert one.under(q, NOTHING[None]).ok.tolist() == [True, True, False, False]
+    assert not rules(2).under(q, NOTHING[None]).ok.any()
     assert rules(3).seen is None
     assert "min_markers" in rules(2).advice(rules(2).check(q, NOTHING))
 

@@ -40,7 +40,7 @@ def made(share: float | None) -> Setup:
 def test_the_criterion_is_the_weighted_mean_of_both_errors() -> None:
     setup = made(0.25)
     M = setup.gathered(setup.information.blocks(Q)[:8])
-    e = Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None], M)
+    e = setup.everywhere(M, M[None], M)
     assert e is not None
     mean = 0.75 * e.test_poses**2 + 0.25 * e.elsewhere**2
     assert float(setup.criterion.of_information(M)) == pytest.approx(mean, rel=1e-9)

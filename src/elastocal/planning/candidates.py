@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limit
 from elastocal.model.manipulator import Model
 from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import plan_forces
+from elastocal.planning.plan import CandidateCounts
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -52,6 +53,13 @@ class JointSpace:
         q[:, free] += unit * (upper - lower)[free]
         return q
 
+    def nearest_level(self, q: Array) -> tuple[IntArray, Array]:
+        """The group of each pose q (N, n), and how far in rad or m it is from its level."""
+        if self.held is None:
+            return np.zeros(len(q), dtype=np.int64), np.zeros(len(q))
+        away = np.abs(q[:, [self.held]] - np.array(self.levels))
+        return away.argmin(axis=1), away.min(axis=1)
+
 
 def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     lower, upper = finite_ranges(chain, *joint_limits(cell, chain))
@@ -82,24 +90,22 @@ PER_TASK = 4  # chunks that a process checks at a time
 TRIES = 200  # per pose wanted, at most
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Feasible poses q (N, n) and their `group` (N,): the level of the held joint.  `removed_by`:
-    what was tried in vain by the first rule broken, tried = feasible + Σ removed_by."""
+class Candidates(NamedTuple):
+    """Feasible poses q (N, n), their `group` (N,), the level of the held joint, and how many were
+    tried for them."""
 
     q: Array
     group: IntArray
-    tried: int
-    feasible: int
-    removed_by: dict[str, int]
+    counts: CandidateCounts
 
     @classmethod
     def join(cls, lots: Sequence[Candidates]) -> Candidates:
-        rules = lots[0].removed_by
-        removed = {rule: sum(lot.removed_by.get(rule, 0) for lot in lots) for rule in rules}
-        q, group = (np.concatenate([getattr(lot, name) for lot in lots]) for name in ("q", "group"))
-        tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
-        return cls(q, group, tried, ok, removed)
+        q, group, counts = zip(*lots, strict=True)
+        rules = {r: sum(c.removed_by.get(r, 0) for c in counts) for r in counts[0].removed_by}
+        whole = CandidateCounts(
+            sum(c.tried for c in counts), sum(c.feasible for c in counts), rules
+        )
+        return cls(np.concatenate(q), np.concatenate(group), whole)
 
 
 def draw(
@@ -134,8 +140,8 @@ def draw(
                 f"{cell.path or cell.name}: no feasible pose found{at}; "
                 f"{rules.advice(rules.every(some, forces))}"
             )
-        lot = Candidates.join(lots)
-        drawn.append(replace(lot, q=lot.q[:wanted], group=lot.group[:wanted]))
+        q, own, counts = Candidates.join(lots)
+        drawn.append(Candidates(q[:wanted], own[:wanted], counts))
     return Candidates.join(drawn)
 
 
@@ -153,10 +159,8 @@ def brought(
     order = np.argsort(first, kind="stable")
     q = table.q[first[order]].copy()
     names = [table.configuration_labels[k] for k in table.configuration[first[order]]]
-    group, off = np.zeros(len(q), dtype=np.int64), np.zeros(len(q))
+    group, off = space.nearest_level(q)
     if space.held is not None:
-        away = np.abs(q[:, [space.held]] - np.array(space.levels))
-        group, off = away.argmin(axis=1), away.min(axis=1)
         q[:, space.held] = np.array(space.levels)[group]
     own = np.flatnonzero(off <= LEVEL_SLACK)
     own = own[np.argsort(group[own], kind="stable")]
@@ -184,7 +188,7 @@ def brought(
     if pins is not None and len(pins.q):
         near = np.abs(q[ok, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
         new = ok[~near]
-    found = Candidates(q[new], group[new], len(q), len(ok), removed)
+    found = Candidates(q[new], group[new], CandidateCounts(len(q), len(ok), removed))
     return found, [names[k] for k in new], told
 
 
@@ -207,7 +211,8 @@ def points(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Ite
 def _check(rules: Feasibility, forces: Array, group: int, q: Array) -> Candidates:
     verdict = rules.under(q, forces)
     n = int(verdict.ok.sum())
-    return Candidates(q[verdict.ok], np.full(n, group), len(q), n, verdict.removed_by)
+    counts = CandidateCounts(len(q), n, verdict.removed_by)
+    return Candidates(q[verdict.ok], np.full(n, group), counts)
 
 
 def _checked(
@@ -307,17 +312,15 @@ class Pins:
 
     def placed(self, rules: Feasibility) -> IntArray:
         """The level (k,) of each pose that stays."""
-        cell = rules.cell
-        group = np.zeros(len(self.q), dtype=np.int64)
+        cell, space = rules.cell, joint_space(rules.cell, rules.chain)
+        group, off = space.nearest_level(self.q)
         verdict = rules.every(self.q, plan_forces(cell))
         # That it stands near one struck out is the user's choice.
         broken = verdict.broken & (np.array(verdict.rules) != Struck.name)
-        for k, (label, q) in enumerate(zip(self.names, self.q, strict=True)):
+        for k, label in enumerate(self.names):
             where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
-            for joint, levels in cell.design.levels.items():
-                away = np.abs(np.array(levels) - q[joint_index(joint)])
-                group[k] = int(away.argmin())
-                require(away.min() < LEVEL_SLACK, f"{where} is at no level of {joint}")
+            joint = next(iter(cell.design.levels), "")
+            require(off[k] < LEVEL_SLACK, f"{where} is at no level of {joint}")
             require(
                 not broken[k].any(),
                 f"{where} breaks {verdict.rules[int(broken[k].argmax())]}; strike it "

@@ -235,11 +235,11 @@ class Choice:
             elif cell.design.load_states == "chosen":
                 ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
                 setup = replace(setup, ways=ways)
-            pool = setup.pool(drawn.q, drawn.group)
+            pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
             relaxed = relax(setup.problem(pool, shares).balanced(), GAIN / 10)
         except ElastocalError:
             return None
-        return RelaxedPoint(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)
+        return RelaxedPoint(cell, setup, pool, relaxed, tried.feasible / tried.tried)
 
 
 def _mobile(

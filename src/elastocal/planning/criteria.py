@@ -22,6 +22,7 @@ import numpy as np
 
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.errors import InputError, require
+from elastocal.plugin_loader import same_class
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -78,7 +79,8 @@ def mean_curvature(x: Array, q: float) -> Array:
 
 
 def triangular(F: Array) -> Array:
-    R = np.linalg.qr(F, mode="r") if len(F) > F.shape[1] else F
+    """R (..., r, p), r ≤ p, with RᵀR = FᵀF, F (..., q, p)."""
+    R = np.linalg.qr(F, mode="r") if F.shape[-2] > F.shape[-1] else F
     return np.asarray(R, dtype=np.float64)
 
 
@@ -260,14 +262,17 @@ class Turned(ScenarioCriterion):
 class TraceCriterion(ScenarioCriterion):
     """Φ = tr(F V Fᵀ), L-optimality: the summed variance of the linear functions F (q, p) of y.
 
-    Nuisance parameters are marginalised by their columns of F being zero.  `figure` is `scale` · √Φ
-    in `unit`.  1/Φ is concave for any F.  Raises InputError where F is zero or not finite.
+    Of several such sums, F (T, q, p), the power mean of `order` over T: smooth, and for inf the
+    largest.  Nuisance parameters are marginalised by their columns of F being zero.  `figure` is
+    `scale` · √Φ in `unit`.  1/Φ is concave for any F.  Raises InputError where F is zero or not
+    finite.
     Source: Fedorov 1972; Atkinson, Donev & Tobias 2007, ch. 10 (L- or linear optimality).
     """
 
     F: Array
     name = "L"
     certifiable = True
+    order = 1.0  # of a subclass's instances where that makes it a field
 
     def __post_init__(self) -> None:
         require(
@@ -278,13 +283,25 @@ class TraceCriterion(ScenarioCriterion):
 
     @cached_property
     def C(self) -> Array:
-        return np.asarray(self.F.T @ self.F)
+        return np.asarray((self.F.swapaxes(-1, -2) @ self.F).reshape(-1, self.F.shape[-1] ** 2))
+
+    def _each(self, V: Array) -> Array:
+        return np.asarray(V.reshape(*V.shape[:-2], -1) @ self.C.T)
 
     def value(self, V: Array) -> Array:
-        return np.asarray(((self.F @ V) * self.F).sum(axis=(-1, -2)))
+        return power_mean(self._each(V), self.order)
 
     def slope(self, V: Array) -> tuple[float, Array]:
-        return float(self.value(V)), self.C
+        each = self._each(V)
+        C = (mean_slope(each, self.order) @ self.C).reshape(V.shape)
+        return float(power_mean(each, self.order)), C
+
+    def curvature(self, V: Array, X: Array) -> Array | float:
+        along = self._each(X)
+        return np.asarray(along @ mean_curvature(self._each(V), self.order) @ along.T)
+
+    def weight(self, V: Array) -> float:
+        return float(mean_slope(self._each(V), self.order).sum())
 
     def turned(self, T: Array) -> ScenarioCriterion:
         if type(self).value is not TraceCriterion.value:
@@ -485,31 +502,6 @@ class GCriterion(TraceCriterion):
     def of(cls, inputs: CriterionInputs) -> Self:
         return cls(inputs.targets())
 
-    @cached_property
-    def C(self) -> Array:
-        return np.asarray((self.F.swapaxes(-1, -2) @ self.F).reshape(len(self.F), -1))
-
-    def _each(self, V: Array) -> Array:
-        return np.asarray(V.reshape(*V.shape[:-2], -1) @ self.C.T)
-
-    def value(self, V: Array) -> Array:
-        return power_mean(self._each(V), self.order)
-
-    def slope(self, V: Array) -> tuple[float, Array]:
-        each = self._each(V)
-        C = (mean_slope(each, self.order) @ self.C).reshape(V.shape)
-        return float(power_mean(each, self.order)), C
-
-    def curvature(self, V: Array, X: Array) -> Array | float:
-        along = self._each(X)
-        return np.asarray(along @ mean_curvature(self._each(V), self.order) @ along.T)
-
-    def weight(self, V: Array) -> float:
-        return float(mean_slope(self._each(V), self.order).sum())
-
-    def turned(self, T: Array) -> GCriterion:
-        return replace(self, F=self.F @ T)
-
 
 @dataclass(frozen=True)
 class DeterminantCriterion(MeanCriterion):
@@ -663,18 +655,17 @@ def register(criterion: Registered) -> Registered:
         )
     taken = CRITERIA.get(name, criterion)
     require(
-        _place(taken) == _place(criterion),
+        same_class(taken, criterion),
         f"{known}: the name {quoted(name)} is taken by {taken.__name__}; choose another than "
         f"{listed(CRITERIA)}",
     )
     made = criterion.of.__func__ is not ScenarioCriterion.of.__func__  # type: ignore[attr-defined]
     missing = sorted(getattr(criterion, "__abstractmethods__", ())) + ([] if made else ["of"])
     require(not missing, f"{known} ({quoted(name)}) is not complete: define {listed(missing)}")
-    bent = criterion.curvature is not ScenarioCriterion.curvature
+    bases = ScenarioCriterion, TraceCriterion, SpectralCriterion
+    bent = criterion.curvature not in [base.curvature for base in bases]
     if issubclass(criterion, SpectralCriterion):
-        bent = criterion.curvature is not SpectralCriterion.curvature or (
-            criterion.phi_curvature is not SpectralCriterion.phi_curvature
-        )
+        bent |= criterion.phi_curvature is not SpectralCriterion.phi_curvature
     linear = issubclass(criterion, TraceCriterion) and criterion.value is TraceCriterion.value
     require(
         bent or linear or not criterion.certifiable,
@@ -683,10 +674,6 @@ def register(criterion: Registered) -> Registered:
     )
     CRITERIA[name] = criterion
     return criterion
-
-
-def _place(criterion: type[ScenarioCriterion]) -> tuple[str, str]:
-    return criterion.__module__, criterion.__qualname__
 
 
 def criterion_named(name: str, what: str = "criterion") -> type[ScenarioCriterion]:

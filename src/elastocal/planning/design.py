@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import count
@@ -42,7 +43,6 @@ from elastocal.planning.information import (
 from elastocal.planning.plan import (
     CandidateCounts,
     Chance,
-    Everywhere,
     Gain,
     LoadStates,
     Plan,
@@ -51,7 +51,7 @@ from elastocal.planning.plan import (
     reasons,
 )
 from elastocal.planning.polish import Searches
-from elastocal.planning.relaxation import DesignProblem, first_allowed, sized_plans
+from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
 from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, ordered
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
@@ -318,9 +318,8 @@ class _Design:
             n = spec.candidates or 1
             lots.append(draw(*asked, n, options.seed, options.jobs, self.progress))
         drawn = Candidates.join(lots)
-        counts = asdict(CandidateCounts(drawn.tried, drawn.feasible, drawn.removed_by))
         found = {"q": drawn.q, "group": drawn.group, "names": np.array(names, dtype=np.str_)}
-        return found | {"told": told, "counts": json.dumps(counts)}
+        return found | {"told": told, "counts": json.dumps(asdict(drawn.counts))}
 
     def _curve(self, setup: Setup, pool: FeasiblePool) -> tuple[PlanSize, ...]:
         if not self.options.curve:
@@ -363,7 +362,10 @@ class _Design:
         def problem_of(n: int) -> DesignProblem:
             return setup.problem(pool, self._shares(n))
 
-        n = first_allowed(problem_of, target, low, most)
+        n = low + bisect_left(
+            range(low, most + 1), True,
+            key=lambda n: prospects(problem_of(n).balanced(), 1e-3).bound <= target,
+        )  # fmt: skip
         if n > most:
             value, _ = sized_plans(problem_of, [most], self.options.seed, self.progress)[most]
             tried[most], low = PlanSize(most, figure(value), None), high
@@ -441,9 +443,7 @@ class _Design:
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(pool, chosen, len(found.pool)),
             chance=Chance.of(drawn, found.value, setup.criterion),
-            everywhere=Everywhere.of(
-                R, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
-            ),
+            everywhere=setup.everywhere(M, drawn, left),
             seen=None if seen.all() else seen,
             readings=readings,
             states=self.states,

@@ -367,9 +367,6 @@ class Feasibility:
             verdict.broken[left] = self.check(q[left], force, every=False).broken
         return verdict
 
-    def feasible(self, q: Array, forces: Array) -> BoolArray:
-        return self.under(q, np.atleast_2d(forces)).ok
-
     @property
     def seen(self) -> Callable[[Array, Array], BoolArray] | None:
         """Joints (N, n), force (3,) → (N, markers): which markers the tracker sees of poses that

@@ -238,21 +238,6 @@ class Everywhere:
     share: float = 0.0
     cap: float = 0.0
 
-    @classmethod
-    def of(
-        cls, own: Array | None, elsewhere: Array | None, M: Array, random: Array, left: Array,
-        share: float = 0.0, cap: float = 0.0,
-    ) -> Everywhere | None:  # fmt: skip
-        """Of R (r, p) at both, where they are known, the plan's information M (p, p), random plans'
-        (n, p, p), and what a drift leaves of the plan's (p, p)."""
-        if own is None or elsewhere is None:
-            return None
-        of = own, elsewhere
-        chance = [float(np.median([remaining_rms(R, m) for m in random])) for R in of]
-        at, beyond = (value if np.isfinite(value) else None for value in chance)
-        e = [remaining_rms(R, K) for K in (M, left) for R in of]
-        return cls(e[0], e[1], at, beyond, e[2], e[3], share, cap)
-
 
 def remaining_rms(R: Array, M: Array) -> float:
     """√tr(R M⁻¹ Rᵀ); inf where M (p, p) is singular."""

@@ -53,7 +53,7 @@ class Searches:
     _rows: dict[int, tuple[ca.Function, ca.Function]] = field(default_factory=dict)
 
     def feasible(self, q: Array) -> BoolArray:
-        return self.checker.feasible(q, self.setup.information.forces)
+        return self.checker.under(q, self.setup.information.forces).ok
 
     def rows(self, q: Array, level: int) -> tuple[ca.Function, ca.Function]:
         """B (q, x) and its adjoint (q, x, W) of poses at a level, as q (n,) is."""

@@ -12,7 +12,6 @@ Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -514,14 +513,3 @@ def sized_plans(
         found[n] = value, relaxed.bound if problem.criterion.certifiable else np.nan
         progress(f"{n} poses: {value:.6g}")
     return found
-
-
-def first_allowed(
-    problem_of: Callable[[int], DesignProblem], target: float, low: int, high: int
-) -> int:
-    """The least n in [low, high] for which the bound, which falls with n, allows Φ ≤ `target`;
-    high + 1 where there is none."""
-    return low + bisect_left(
-        range(low, high + 1), True,
-        key=lambda n: prospects(problem_of(n).balanced(), 1e-3).bound <= target,
-    )  # fmt: skip

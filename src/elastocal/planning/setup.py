@@ -28,7 +28,7 @@ from elastocal.planning.information import (
     marker_sigmas,
     whitened,
 )
-from elastocal.planning.plan import Plan, Scheduled, predicted, remaining_rms
+from elastocal.planning.plan import Everywhere, Plan, Scheduled, predicted, remaining_rms
 from elastocal.planning.relaxation import DesignProblem, relax
 from elastocal.planning.test_poses import TargetPoses, known_rows
 from elastocal.simulation import expand_plan, simulate
@@ -99,6 +99,18 @@ class Setup:
     @cached_property
     def elsewhere_rows(self) -> Array | None:
         return None if self.beyond is None else root(*self.beyond)
+
+    def everywhere(self, M: Array, random: Array, left: Array) -> Everywhere | None:
+        """Of a plan's information M (p, p), random plans' (n, p, p), and what a drift leaves of the
+        plan's (p, p); None where one of the errors is not known."""
+        if self.target_rows is None or self.elsewhere_rows is None:
+            return None
+        of = self.target_rows, self.elsewhere_rows
+        chance = [float(np.median([remaining_rms(R, m) for m in random])) for R in of]
+        at, beyond = (value if np.isfinite(value) else None for value in chance)
+        e = [remaining_rms(R, K) for K in (M, left) for R in of]
+        cap = self.information.model.cell.design.cap
+        return Everywhere(e[0], e[1], at, beyond, e[2], e[3], self.share, cap)
 
     def pool(self, q: Array, group: IntArray, readings: IntArray | None = None) -> FeasiblePool:
         """Candidates q (N, n) read as `readings` (N, L) say, or in each of the ways in turn."""

@@ -353,7 +353,7 @@ class _Sources:
         if rules is not None:
             found = [q[:0]]
             for part in np.split(q, range(LOT, count, LOT)):
-                found.append(part[rules.feasible(part, self.loads)])
+                found.append(part[rules.under(part, self.loads).ok])
                 if sum(map(len, found)) >= most:
                     break
             q = np.concatenate(found)[:most]

@@ -93,7 +93,7 @@ def test_free_moves_are_free_wherever_one_looks(loaded):
     rules = Feasibility(kr270_cell(), KR270_CHAIN)
     force = DOWN if loaded else NOTHING
     q = kr270_poses(250)
-    q = q[rules.feasible(q, force)]
+    q = q[rules.under(q, force[None]).ok]
     # Short and long moves: to the next pose, and a tenth of the way to it.
     start, end = q[:-1], q[1:]
     start, end = np.vstack([start, start]), np.vstack([end, start + 0.1 * (end - start)])
