@@ -21,7 +21,7 @@ from elastocal.planning.candidates import draw, shares_of
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import Known, plan_forces, rows_of
+from elastocal.planning.information import Known, plan_forces
 from elastocal.planning.plan import Plan
 from elastocal.planning.setup import set_up
 from elastocal.planning.test_poses import test_poses
@@ -105,7 +105,7 @@ def _instruments(name: str) -> tuple[Study, Tool]:
 def _some(name: str, q: np.ndarray, seeds: list) -> np.ndarray:
     study, tool = _instruments(name)
     repeats = study.cell.design.repeats
-    rows = rows_of(q, study.forces, tuple(study.cell.tool.markers))
+    rows = study.setup.information.rows(q)
     n = len(rows)
     table = rows.take(np.repeat(np.arange(n), repeats))
     table = replace(table, repeat=np.tile(np.arange(repeats), n), row=np.arange(n * repeats) + 2)

@@ -202,3 +202,10 @@ def _of_plugin(error: Exception) -> str:
 def require(condition: bool, message: str) -> None:
     if not condition:
         raise InputError(message)
+
+
+def check_known(name: str, there: Collection[str], told: str, them: str = "there are") -> None:
+    """Raise InputError unless `name` is one of those that are `there`: behind what is `told` of it
+    stand the nearest of them, and all."""
+    if name not in there:
+        raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there)}")

@@ -21,7 +21,7 @@ from elastocal.planning import test_poses as target_poses
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, _Design
 from elastocal.planning.information import Known
-from elastocal.planning.plan import Everywhere, Plan
+from elastocal.planning.plan import Plan
 from elastocal.planning.relaxation import exact_plan, relax
 from elastocal.planning.setup import Setup, set_up, share_within
 from elastocal.planning.test_poses import ELSEWHERE, everywhere

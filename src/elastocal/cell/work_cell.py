@@ -46,7 +46,7 @@ from elastocal.config import (
     record,
     stated,
 )
-from elastocal.errors import require
+from elastocal.errors import check_known, require
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, is_label, listed, quoted
@@ -485,6 +485,11 @@ class Cell:
         cell.check(known_effects)
         return cell
 
+    @property
+    def source(self) -> str:
+        """Its file, or its name, as messages begin."""
+        return str(self.path or self.name)
+
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         return {"path": spot.path, "name": table.get("name") or spot.path.stem}
@@ -499,7 +504,7 @@ class Cell:
             InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
                 there is none of.
         """
-        where, sight = self.path or self.name, self.workspace.visibility
+        where, sight = self.source, self.workspace.visibility
         self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
         least = None if sight is None else sight.min_markers
         require(
@@ -515,20 +520,18 @@ class Cell:
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
             "for capsules along the links instead",
         )
-        known = None if known_effects is None else tuple(known_effects)
-        for i, choice in enumerate(self.model.effects):
-            require(
-                known is None or choice.name in known,
-                f"{where}: key model.effects[{i}] names the unknown effect {quoted(choice.name)}"
-                f"{did_you_mean(choice.name, known or ())}; known effects: {listed(known or ())}",
-            )
+        if known_effects is not None:
+            for i, choice in enumerate(self.model.effects):
+                told = f"{where}: key model.effects[{i}] names the unknown effect"
+                told = f"{told} {quoted(choice.name)}"
+                check_known(choice.name, tuple(known_effects), told, "known effects:")
 
     def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
         markers = tuple(self.tool.markers)
         for name in names:
             require(
                 name in markers,
-                f"{self.path or self.name}: {header(table)} names {quoted(name)}, which is no "
+                f"{self.source}: {header(table)} names {quoted(name)}, which is no "
                 f"marker of the cell{did_you_mean(name, markers)}; [tool.markers_m] has "
                 f"{listed(markers) or 'none'}",
             )

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, check_known, require
 from elastocal.files import check_regular
 from elastocal.model.chain import Chain
-from elastocal.text import did_you_mean, listed
 from elastocal.units import Array, pose_at
 
 # What a solid is to geometry: its hull, its support function and its coal shape.
@@ -155,7 +154,7 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
     import pinocchio as pin
 
     path = cell.robot.urdf
-    where = f'{cell.path or cell.name}: [workspace] geometry = "urdf"'
+    where = f'{cell.source}: [workspace] geometry = "urdf"'
     if path is None:
         raise InputError(f"{where}, but the robot has no URDF; give link_radius_mm instead")
     folders = [str(folder) for folder in path.resolve().parents[:PARENTS]]
@@ -255,7 +254,7 @@ def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
     for k, name in enumerate(names):
         require(
             name not in names[:k],
-            f"{cell.path or cell.name}: [workspace] has two bodies named '{name}'; rename one "
+            f"{cell.source}: [workspace] has two bodies named '{name}'; rename one "
             "(base, link1 … and rope are taken)",
         )
     return bodies
@@ -263,7 +262,7 @@ def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
 
 def _arm(cell: Cell, chain: Chain) -> Iterator[Body]:
     workspace = cell.workspace
-    where = f"{cell.path or cell.name}: [workspace]"
+    where = f"{cell.source}: [workspace]"
     require(
         not (workspace.urdf_geometry and workspace.link_radius),
         f'{where} gives link_radius and geometry = "urdf"; the arm can have only one',
@@ -309,11 +308,8 @@ def _carried(body: CarriedBody, cell: Cell, chain: Chain) -> Body:
         return Body(_moved(chain.flange_placement, solid), chain.n_joints - 1, "carried")
     links = [f"link{i + 1}" for i in range(chain.n_joints)]
     valid = ["base", *links, "flange"]
-    require(
-        body.on in valid,
-        f"{cell.path or cell.name}: [workspace] body '{solid.name}' is on '{body.on}'"
-        f"{did_you_mean(body.on, valid)}; valid: {listed(valid)}",
-    )
+    told = f"{cell.source}: [workspace] body '{solid.name}' is on '{body.on}'"
+    check_known(body.on, valid, told, "valid:")
     return Body(solid, links.index(body.on), "carried")
 
 
@@ -368,11 +364,8 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     workspace = cell.workspace
     valid = [body.name for body in bodies] + [space.name for space in workspace.keep_out]
     for name in sum(workspace.ignored_pairs, ()):
-        require(
-            name in valid,
-            f"{cell.path or cell.name}: [workspace] ignored_pairs names '{name}', but the cell has "
-            f"no such body{did_you_mean(name, valid)}; valid: {listed(valid)}",
-        )
+        told = f"{cell.source}: [workspace] ignored_pairs names '{name}', but the cell has no such"
+        check_known(name, valid, f"{told} body", "valid:")
     ignored = {frozenset(pair) for pair in workspace.ignored_pairs}
     moving = [body for body in bodies if body.carrier != WORLD]
     own = [body for body in bodies if body.kind != "obstacle"]
@@ -415,7 +408,7 @@ def mounting_plane(cell: Cell, chain: Chain) -> HalfSpace | None:
         return HalfSpace("mounting plane", T[:3, 3], np.sign(height) * T[:3, 2])
     if asked:
         raise InputError(
-            f"{cell.path or cell.name}: key workspace.mounting_plane is true, but the base's frame "
+            f"{cell.source}: key workspace.mounting_plane is true, but the base's frame "
             f"of robot '{chain.name}' does not stand on it: joint 1 does not turn about its z, or "
             "joint 2 lies at z = 0; state the plane as [[workspace.keep_out]]"
         )

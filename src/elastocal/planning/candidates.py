@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.errors import InputError, InsufficientDataError, check_known, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import plan_forces
 from elastocal.planning.plan import CandidateCounts
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
 # Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
@@ -72,7 +72,7 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
         stated = ", ".join(f"{math.degrees(v) if turns else v:.6g}" for v in levels)
         instead = f" instead of {next(iter(wanted))}" if wanted else ""
         raise InputError(
-            f"{cell.path or cell.name}: [model.compliance_levels] has {joint} at levels, and the "
+            f"{cell.source}: [model.compliance_levels] has {joint} at levels, and the "
             f"plan must keep to them; add [design.levels] {joint}_{'deg' if turns else 'm'} = "
             f"[{stated}]{instead}"
         )
@@ -137,7 +137,7 @@ def draw(
             if j is not None:
                 at = f" with joint{j + 1} at {told(chain, j, space.levels[group])}"
             raise InsufficientDataError(
-                f"{cell.path or cell.name}: no feasible pose found{at}; "
+                f"{cell.source}: no feasible pose found{at}; "
                 f"{rules.advice(rules.every(some, forces))}"
             )
         q, own, counts = Candidates.join(lots)
@@ -242,7 +242,7 @@ def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
     what does not divide evenly goes to the first levels."""
     spec = cell.design
     levels = _levels(cell)
-    where = f"{cell.path or cell.name}: [design]"
+    where = f"{cell.source}: [design]"
     if spec.per_level and n_poses is None:
         each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
         require(
@@ -268,7 +268,7 @@ def check_levels(cell: Cell, name: str, poses: int) -> None:
     levels = _levels(cell)
     require(
         not 0 < poses < levels,
-        f"{option(name, poses)}: {cell.path or cell.name} has {levels} levels, each with a pose; "
+        f"{option(name, poses)}: {cell.source} has {levels} levels, each with a pose; "
         f"ask for {levels} poses at least, or drop levels",
     )
 
@@ -281,7 +281,7 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
         return
     k, drawn = int(short[0]), cell.design.candidates or int(available.sum())
     level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
-    where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
+    where = f"{cell.source}: a plan of {int(shares.sum())} poses"
     where += level if len(shares) > 1 else ""
     if (taught := cell.design.taught) is not None:
         raise InsufficientDataError(
@@ -318,7 +318,7 @@ class Pins:
         # That it stands near one struck out is the user's choice.
         broken = verdict.broken & (np.array(verdict.rules) != Struck.name)
         for k, label in enumerate(self.names):
-            where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
+            where = f"{cell.source}: pose {quoted(label)}, which is to be kept,"
             joint = next(iter(cell.design.levels), "")
             require(off[k] < LEVEL_SLACK, f"{where} is at no level of {joint}")
             require(
@@ -345,11 +345,7 @@ def read_pins(
         table = model.read_plan(path)
         own = {name: table.q[row] for name, row in _poses(table).items()}
         for name in named:
-            require(
-                name in own,
-                f"{table.source}: there is no pose {quoted(name)}{did_you_mean(name, list(own))}; "
-                f"there are {listed(list(own))}",
-            )
+            check_known(name, own, f"{table.source}: there is no pose {quoted(name)}")
         require(bool(named) or stays, f"{option('strike')} takes poses, as in plan.csv:3,7")
         left = [name for name in own if not named or (name in named) == stays]
         clash = [name for name in left if name in kept]

@@ -112,7 +112,7 @@ class Choice:
 
     def best(self) -> Chosen:
         cell = self.work.cell
-        where, freedom = cell.path or cell.name, cell.design.choose
+        where, freedom = cell.source, cell.design.choose
         assert freedom is not None
         require(
             CRITERIA[cell.design.criterion].certifiable,
@@ -160,7 +160,7 @@ class Choice:
         sets = list(combinations(heavy, min(most, len(heavy))))
         require(
             len(sets) <= MOST_CHOICES,
-            f"{cell.path or cell.name}: {len(sets)} choices of {most} of {len(heavy)} loads; state "
+            f"{cell.source}: {len(sets)} choices of {most} of {len(heavy)} loads; state "
             f"fewer loads, up to {MOST_CHOICES} choices of them",
         )
         hung = ([i for i in range(len(given)) if i in k or i not in heavy] for k in sets)
@@ -321,7 +321,7 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
             break
     if not found:
         raise InsufficientDataError(
-            f"{cell.path or cell.name}: no plan that determines the parameters takes "
+            f"{cell.source}: no plan that determines the parameters takes "
             f"{minutes:.4g} minutes or less; allow more time, or lower dwell_s, reading_s and "
             "load_change_s of [design.motion] where they are too high"
         )
@@ -411,7 +411,7 @@ def chosen_states(
     information, cell = setup.information, setup.information.model.cell
     require(
         not cell.noise.configuration or cell.model.observe == "deflection",
-        f"{cell.path or cell.name}: [noise] configuration_um says that a pose's readings share an "
+        f"{cell.source}: [noise] configuration_um says that a pose's readings share an "
         'error in all load states, which only load_states = "all" counts with; drop one of them',
     )
     ways = single_ways(information)

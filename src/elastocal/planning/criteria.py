@@ -21,9 +21,9 @@ from typing import ClassVar, Literal, Self, TypeVar
 import numpy as np
 
 from elastocal.cell.plan_wishes import TEST_POSE
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, check_known, require
 from elastocal.plugin_loader import same_class
-from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
 Need = Literal["test_poses", "combination"]
@@ -142,12 +142,8 @@ class CriterionInputs:
         coefficients = np.zeros(self.parameters)
         sizes = np.ones(self.parameters) if self.sizes is None else self.sizes
         for name, factor in factors.items():
-            require(
-                name in self.names,
-                f"criterion {self.criterion} takes the parameter {quoted(name)}, which the model "
-                f"lacks or no pose shows{did_you_mean(name, self.names)}; there are "
-                f"{listed(self.names)}",
-            )
+            told = f"criterion {self.criterion} takes the parameter {quoted(name)}, which the model"
+            check_known(name, self.names, f"{told} lacks or no pose shows")
             i = self.names.index(name)
             coefficients[i] = factor * sizes[i]
         return coefficients
@@ -680,9 +676,5 @@ def criterion_named(name: str, what: str = "criterion") -> type[ScenarioCriterio
     """The criterion that CRITERIA has under this name; InputError that lists them for another,
     which `what` begins."""
     require(name not in GONE, f"{what} {name} is gone: {GONE.get(name)}")
-    require(
-        name in CRITERIA,
-        f"{what} {quoted(name)} is unknown{did_you_mean(name, CRITERIA)}; there are "
-        f"{listed(CRITERIA)}",
-    )
+    check_known(name, CRITERIA, f"{what} {quoted(name)} is unknown")
     return CRITERIA[name]

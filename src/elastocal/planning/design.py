@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.errors import InputError, InsufficientDataError, check_known, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
@@ -55,7 +55,7 @@ from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
 from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, ordered
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
@@ -82,11 +82,7 @@ class DesignOptions:
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
-        require(
-            self.effort in efforts,
-            f"effort '{self.effort}' is unknown{did_you_mean(self.effort, efforts)}; there are "
-            f"{listed(efforts)}",
-        )
+        check_known(self.effort, efforts, f"effort '{self.effort}' is unknown")
         require(
             self.jobs == -1 or self.jobs >= 1,
             f"jobs takes a number of processes, or -1 for all cores; found {self.jobs}",
@@ -159,9 +155,8 @@ class _Design:
             met = self.feasibility.blockers(home, home, False)
             require(
                 not met,
-                f"{cell.path or cell.name}: [design.motion] home brings {listed(met)} too close to "
-                "each other; state another home, or correct the bodies and clearances of "
-                "[workspace]",
+                f"{cell.source}: [design.motion] home brings {listed(met)} too close to each "
+                "other; state another home, or correct the bodies and clearances of [workspace]",
             )
 
     def _leave_out(self) -> None:
@@ -272,7 +267,7 @@ class _Design:
         short = np.flatnonzero(shares < 0)
         require(
             not len(short) and bool(shares.any()),
-            f"{self.cell.path or self.cell.name}: {self.pinned.sum()} poses are to be kept, and "
+            f"{self.cell.source}: {self.pinned.sum()} poses are to be kept, and "
             f"the plan has no more than {shares_of(self.cell, n_poses).sum()}"
             f"{' with their shares of the levels' if len(shares) > 1 else ''}; ask for more poses",
         )
@@ -348,7 +343,7 @@ class _Design:
         metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
         require(
             setup.criterion.unit == "µm",
-            f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
+            f"{self.cell.source}: a target in µm goes with the criteria "
             f"{', '.join(metric[:-1])} and {metric[-1]}, not with {setup.criterion.name}; drop it, "
             f"or compare by {option('curve')}",
         )
@@ -387,7 +382,7 @@ class _Design:
         if best is None:
             last = tried[max(tried)]
             raise InsufficientDataError(
-                f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
+                f"{self.cell.source}: no plan of up to {last.poses} poses meets "
                 f"the target of {wanted * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
                 "ask for less, measure more repeats, or take a better tracker"
             )
@@ -476,7 +471,7 @@ class _Design:
 
 def _check_criterion(model: Model) -> None:
     cell = model.cell
-    where, asked = cell.path or cell.name, cell.design.criterion
+    where, asked = cell.source, cell.design.criterion
     needs = criterion_named(asked, f"{where}: key design.criterion").needs
     require(
         not cell.design.elsewhere_cap or asked == TEST_POSE,
@@ -491,8 +486,5 @@ def _check_criterion(model: Model) -> None:
         f'combination = {{ "{next(iter(model.names), "joint2.compliance")}" = 1.0 }}',
     )
     for name in names:
-        require(
-            name in model.names,
-            f"{where}: [design] combination names {quoted(name)}, which is no parameter of the "
-            f"model{did_you_mean(name, model.names)}; there are {listed(model.names)}",
-        )
+        told = f"{where}: [design] combination names {quoted(name)}, which is no parameter of the"
+        check_known(name, model.names, f"{told} model")

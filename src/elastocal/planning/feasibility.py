@@ -185,10 +185,11 @@ class EnoughMarkers(Rule):
 
     name = "markers_seen"
 
-    def __init__(self, rules: Sequence[Rule], markers: Sequence[str], least: int) -> None:
-        self._bounds = [rule for rule in rules if not isinstance(rule, LineOfSight)]
-        self._sight = [rule for rule in rules if isinstance(rule, LineOfSight)]
-        self._markers, self._least = tuple(markers), least
+    def __init__(
+        self, bounds: Sequence[Rule], sight: Sequence[LineOfSight], markers: Sequence[str],
+        least: int,
+    ) -> None:  # fmt: skip
+        self._bounds, self._sight, self._markers, self._least = bounds, sight, markers, least
 
     def seen(self, poses: Poses) -> BoolArray:
         """(N, markers): which are seen; nothing is looked for behind bodies where too few remain
@@ -238,14 +239,15 @@ def rule_book(
     cell: Cell, chain: Chain, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
 ) -> tuple[Rule, ...]:
     bounds = tuple(_visibility(cell))
-    sight: tuple[Rule, ...] = ()
+    sight: tuple[LineOfSight, ...] = ()
     stated, markers, least = cell.workspace.visibility, cell.tool.markers, None
     if stated is not None:
         least, eye = stated.min_markers, cell.tracker.position
         if stated.line_of_sight:
             sight = (LineOfSight(kinematics, bodies, eye, stated.beam_radius, markers),)
+    seen: tuple[Rule, ...] = sight
     if least is not None and least < len(markers):
-        bounds, sight = (), (EnoughMarkers((*bounds, *sight), tuple(markers), least),)
+        bounds, seen = (), (EnoughMarkers(bounds, sight, tuple(markers), least),)
     units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
     joints = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
     limits = joint_limits(cell, chain)
@@ -258,7 +260,7 @@ def rule_book(
             for rule in RULES
             if (own := [pair for pair in pairs if pair.rule == rule])
         ),
-        *sight,
+        *seen,
     )
 
 
@@ -268,8 +270,7 @@ def _visibility(cell: Cell) -> Iterator[Rule]:
         return
     if not cell.tool.markers:
         raise InputError(
-            f"{cell.path or cell.name}: [workspace.visibility] needs the markers; give "
-            "[tool.markers_m]"
+            f"{cell.source}: [workspace.visibility] needs the markers; give [tool.markers_m]"
         )
     names, markers = tuple(cell.tool.markers), list(cell.tool.markers.values())
     near, far = sight.range
@@ -303,7 +304,7 @@ def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
         bound = np.array(cell.workspace.torque_limits)
         if len(bound) != chain.n_joints:
             raise InputError(
-                f"{cell.path or cell.name}: [workspace] torque_limits_Nm has {len(bound)} values, "
+                f"{cell.source}: [workspace] torque_limits_Nm has {len(bound)} values, "
                 f"but robot '{chain.name}' has {chain.n_joints} joints"
             )
         torque = StaticTorque(cell, chain)
@@ -391,24 +392,17 @@ class Feasibility:
         names = " and ".join(f"'{rule.name}'" for rule in chosen)
         text += f"; relax {names}, which {'alone stops' if len(chosen) == 1 else 'stop'} "
         text += f"{counts[best]} of them: " + "; ".join(rule.remedy(poses) for rule in chosen)
-        for a, b in self.always_in_contact:
-            text += (
-                f"; {a} and {b} are too close in every pose, which is probably a wrong size or "
-                f'place: correct it, or add ["{a}", "{b}"] to [workspace] ignored_pairs'
-            )
-        return text
-
-    @cached_property
-    def always_in_contact(self) -> tuple[tuple[str, str], ...]:
-        """Pairs too close in each of 300 random poses: likely modelling errors."""
         lower, upper = finite_ranges(self.chain, *joint_limits(self.cell, self.chain))
         q = np.random.default_rng(0).uniform(lower, upper, (MOST_TRIED, len(lower)))
         poses = self._poses(q, LOADED)
-        return tuple(
-            pair.names
-            for pair in self.pairs
-            if Collisions(self.kinematics, [pair]).hits(poses).all()
-        )
+        for pair in self.pairs:
+            if Collisions(self.kinematics, [pair]).hits(poses).all():
+                a, b = pair.names
+                text += (
+                    f"; {a} and {b} are too close in every pose, which is probably a wrong size or "
+                    f'place: correct it, or add ["{a}", "{b}"] to [workspace] ignored_pairs'
+                )
+        return text
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
         """(M,) for moves q_from → q_to (M, n), as `Paths` guarantees it, each checked once however

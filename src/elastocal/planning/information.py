@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg, sparse
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.errors import InsufficientDataError, check_known, option, require
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.noise_structure import (
@@ -34,13 +34,12 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import SIZE, Observations, available_noise, observe
 from elastocal.simulation import simulate
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.
 
 Sight = Callable[[Array, Array], BoolArray]  # joints (N, n), force (3,) → (N, markers): seen?
-NO_FORCE = 1e-9  # N
 NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
 
@@ -51,25 +50,13 @@ def plan_forces(cell: Cell) -> Array:
     forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
     if cell.model.observe != "deflection":
         return forces
-    loaded = np.linalg.norm(forces, axis=1) > NO_FORCE
+    loaded = (forces != 0).any(axis=1)
     require(
         bool(loaded.any()),
-        f'{cell.path or cell.name}: observe = "deflection" needs a load; state it as in '
+        f'{cell.source}: observe = "deflection" needs a load; state it as in '
         "[design] loads_N = [[0, 0, -2600]]",
     )
     return np.vstack([np.zeros((1, 3)), forces[loaded]])
-
-
-def rows_of(q: Array, forces: Array, names: tuple[str, ...]) -> Measurements:
-    """Table rows, not measured yet, of poses q (N, n) under each of `forces` (L, 3), of each
-    marker."""
-    pose = np.repeat(np.arange(len(q)), len(forces) * len(names))
-    force = np.tile(np.repeat(forces, len(names), axis=0), (len(q), 1))
-    return Measurements.of_poses(
-        "plan", q[pose], force, configuration=pose,
-        configuration_labels=tuple(map(str, range(1, len(q) + 1))),
-        marker=np.resize(np.arange(len(names)), len(pose)), marker_names=names,
-    )  # fmt: skip
 
 
 def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
@@ -83,7 +70,7 @@ def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
     missing = [name for name in table.marker_names if name not in stated]
     require(
         not missing,
-        f"{cell.path or cell.name}: [design] marker_sigma_um states no σ for marker "
+        f"{cell.source}: [design] marker_sigma_um states no σ for marker "
         f"{quoted(missing[0]) if missing else ''}; state one for every marker",
     )
     sigma = np.array([stated[name] for name in table.marker_names])[table.marker]
@@ -99,7 +86,7 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
     kind = available_noise(observed.table, cell.tracker)
     require(
         kind != "none" or (observed.kind == "distance" and cell.tracker.distance_sigma is not None),
-        f"{cell.path or cell.name}: a plan needs the noise of a reading; state [tracker] sigma_um, "
+        f"{cell.source}: a plan needs the noise of a reading; state [tracker] sigma_um, "
         "range_um and transverse_um, or distance_um, as the instrument's data sheet says",
     )
     single, spec = stated_covariance(observed, cell.tracker, kind)[0], cell.design
@@ -197,7 +184,14 @@ class PoseInformation:
         return np.concatenate(found)
 
     def rows(self, q: Array) -> Measurements:
-        table = rows_of(q, self.forces, tuple(self.model.cell.tool.markers))
+        """Table rows, not measured yet, of poses q (N, n) in each load state, of each marker."""
+        names, n = tuple(self.model.cell.tool.markers), len(self.forces)
+        pose = np.repeat(np.arange(len(q)), n * len(names))
+        table = Measurements.of_poses(
+            "plan", q[pose], np.tile(np.repeat(self.forces, len(names), axis=0), (len(q), 1)),
+            configuration=pose, configuration_labels=tuple(map(str, range(1, len(q) + 1))),
+            marker=np.resize(np.arange(len(names)), len(pose)), marker_names=names,
+        )  # fmt: skip
         table = simulate(self.model, table, self.x, 0, noise=False)
         return marker_sigmas(self.model.cell, table)
 
@@ -289,22 +283,21 @@ class Estimable:
         interest`, by default all but base and markers."""
         model, wanted = self.model, self.model.cell.design.interest
         kept = [model.parameters[c] for c in self.columns]
-        where = f"{model.cell.path or model.cell.name}: [design] interest"
+        where = f"{model.cell.source}: [design] interest"
         if not wanted:
             own = [k for k, p in enumerate(kept) if not effect_of(p.effect).registered]
             return np.array(own or range(len(kept)), dtype=np.int64)
         chosen: set[int] = set()
         for name in wanted:
+            told, unknown = (
+                f"{where} names {quoted(name)}",
+                "no parameter, place or effect of the model",
+            )
+            check_known(name, model.all_names, f"{told}, which is {unknown}")
             meant = model.meant_by(name)
-            if not meant:
-                valid = model.all_names
-                raise InputError(
-                    f"{where} names {quoted(name)}, which is no parameter, place or effect of the "
-                    f"model{did_you_mean(name, valid)}; there are {listed(valid)}"
-                )
             here = [k for k, c in enumerate(self.columns) if c in meant]
             if not here:
-                raise InsufficientDataError(f"{where} names {quoted(name)}; {self.why(meant[0])}")
+                raise InsufficientDataError(f"{told}; {self.why(meant[0])}")
             chosen.update(here)
         return np.array(sorted(chosen), dtype=np.int64)
 
@@ -332,7 +325,7 @@ class Estimable:
         lost = self.unpredictable(a[None, None])
         if lost is not None:
             raise InsufficientDataError(
-                f"{model.cell.path or model.cell.name}: [design] combination depends on "
+                f"{model.cell.source}: [design] combination depends on "
                 f"{model.names[lost[1]]}; {self.why(lost[1])}"
             )
         return np.asarray((a * self.sizes)[self.columns])
@@ -368,7 +361,7 @@ class Estimable:
         cell, lost = self.model.cell, self.unpredictable(A)
         if lost is not None:
             raise InsufficientDataError(
-                f"{cell.path or cell.name}: the position at test pose {lost[0] + 1} depends on "
+                f"{cell.source}: the position at test pose {lost[0] + 1} depends on "
                 f"{self.model.names[lost[1]]}; {self.why(lost[1])}; or ask for parameters instead "
                 'of test poses (criterion = "D")'
             )
@@ -424,7 +417,7 @@ def estimable(
     found = Estimable(model, reduced(WORTH_A_COLUMN), sizes, reduced(0.0))
     if not len(found.columns):
         raise InsufficientDataError(
-            f"{model.cell.path or model.cell.name}: no feasible pose shows any parameter of the "
+            f"{model.cell.source}: no feasible pose shows any parameter of the "
             "model; state the load that will hang ([design] loads_N), or choose other effects"
         )
     return found, prior[np.ix_(found.columns, found.columns)]

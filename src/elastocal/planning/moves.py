@@ -217,8 +217,7 @@ class Moves:
         if not self.loaded[self.load].any():
             return self, []
         again = np.array([v - 1 for v in tour[::-1] if not self.loaded[self.load[v - 1]]], int)
-        names = ("pose", "load", "leave", "sides", "free")
-        own = {name: getattr(self, name) for name in names}
+        own = {n: getattr(self, n) for n in ("pose", "load", "leave", "sides", "free")}
         more: dict[str, Any] = {n: np.concatenate([of, of[again]]) for n, of in own.items()}
         return replace(self, **more), (len(self.pose) + 1 + np.arange(len(again))).tolist()
 
@@ -314,9 +313,8 @@ class Moves:
         by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
         return Unreachable(
             f"{named}{more} cannot be reached{roadmap.carrying} by collision-free joint moves, "
-            f"neither directly nor through home and other poses{by}; give "
-            "another home in [design.motion], free the way, or narrow [limits] to exclude such "
-            "poses",
+            f"neither directly nor through home and other poses{by}; give another home in "
+            "[design.motion], free the way, or narrow [limits] to exclude such poses",
             np.unique(self.pose[np.isin(self.leave, lost)]),
         )
 

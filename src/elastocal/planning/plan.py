@@ -189,12 +189,6 @@ class Certificate:
         """Whether the bound says nothing: so few poses cannot be spread as its weights are."""
         return self.efficiency_pool is not None and self.efficiency_pool < 0.1
 
-    @property
-    def starts_apart(self) -> bool:
-        """Whether more starts of the search may find better: they end 2 % apart."""
-        ends = self.starts
-        return bool(ends) and max(ends) - min(ends) > 0.02 * max(map(abs, ends))
-
 
 @dataclass(frozen=True)
 class Chance:

@@ -71,12 +71,9 @@ class DesignProblem:
         rows, columns, factor = triangle(len(G))
         return np.asarray(self.packed @ (G[rows, columns] * factor))
 
-    def information(self, chosen: IntArray, weights: Array | None = None) -> Array:
-        """M (p, p) of the candidates `chosen` (k,), each once or with `weights` (k,)."""
-        B = self.blocks[chosen]
-        if weights is not None:
-            B = B * np.sqrt(weights)[:, None, None]
-        B = B.reshape(-1, B.shape[-1])
+    def information(self, chosen: IntArray) -> Array:
+        """M (p, p) of the candidates `chosen` (k,)."""
+        B = self.blocks[chosen].reshape(-1, len(self.prior))
         return np.asarray(self.prior + B.T @ B)
 
     def at(self, weights: Array) -> Array:
@@ -111,7 +108,8 @@ class DesignProblem:
         """T (p, p): parameters z, y = T z, whose information at even weights is 1.  Where base,
         markers and geometry are identified together, an update of Φ by one pose would keep no
         digits otherwise."""
-        M = self.information(np.arange(len(self.blocks)), self.even())
+        B = (self.blocks * np.sqrt(self.even())[:, None, None]).reshape(-1, len(self.prior))
+        M = self.prior + B.T @ B
         size = np.sqrt(np.maximum(np.diagonal(M), 0.0))
         scale = 1 / np.where(size > 0, size, 1.0)
         if not covariance(M)[1]:
@@ -158,9 +156,8 @@ class DesignProblem:
     def check_determined(self, value: float) -> None:
         if not np.isfinite(value):
             raise InsufficientDataError(
-                f"no plan of {self.shares.sum()} poses that determines all "
-                f"{len(self.prior)} parameters was found; plan more poses, other shares, or "
-                "state a prior"
+                f"no plan of {self.shares.sum()} poses that determines all {len(self.prior)} "
+                "parameters was found; plan more poses, other shares, or state a prior"
             )
 
     def random(self, rng: np.random.Generator) -> IntArray:
@@ -246,7 +243,7 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
         return _around(problem, full, gap, start)
     # Even weights, or `start` with a part of them, times √d_i: where the support lies (Silvey,
     # Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379).
-    weights, best = problem.even(), None
+    weights, rounds = problem.even(), list[Relaxed]()
     weights = weights if start is None else EVEN * weights + (1 - EVEN) * start
     soft = problem.judged_by(problem.criterion.softened(1.0))  # of a kink all sides count
     weights = weights * np.sqrt(np.maximum(soft.worth(inverse(problem.at(weights)))[1], 0.0))
@@ -264,11 +261,10 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
         bound = tangent_bound(problem, tangent, d)
         weights = np.zeros(len(d))
         weights[support] = w
-        best = Relaxed(weights, value, bound, tangent) if best is None else best
-        if value < best.value:
-            best = replace(best, weights=weights, value=value)
-        if bound > best.bound:
-            best = replace(best, bound=bound, tangent=tangent)
+        rounds.append(Relaxed(weights, value, bound, tangent))
+        tightest = max(rounds, key=lambda found: found.bound)
+        best = min(rounds, key=lambda found: found.value)
+        best = replace(best, bound=tightest.bound, tangent=tightest.tangent)
         if best.gap <= gap:
             break
         accuracy = min(accuracy, max(MASTER * best.gap, 0.3 * gap))
@@ -279,7 +275,6 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
         new = best_of(d, problem.group, np.maximum(sizes // 4, np.minimum(sizes, 1)))
         new = new[np.isfinite(d[new])]
         support, w = np.append(support, new), np.append(w, np.full(len(new), NEGLIGIBLE))
-    assert best is not None
     return best
 
 

@@ -124,7 +124,7 @@ class Setup:
         shares = shares * self.ways.shape[1] // np.count_nonzero(self.ways[0])
         cell = self.information.model.cell
         prior = self.prior if self.pinned is None else self.gathered(self.pinned.blocks)
-        source = f"{cell.path or cell.name}: "
+        source = f"{cell.source}: "
         return DesignProblem(pool.blocks, prior, pool.group, shares, self.criterion, source)
 
     def gathered(self, blocks: Array) -> Array:
@@ -176,11 +176,14 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
     information, found = setup.information, setup.found
     model, T = information.model, len(targets.q)
     share = model.cell.design.elsewhere or 0.0
-    both = targets if region is None else targets.with_others(region, share)
+    both, weight = targets, targets.weight
+    if region is not None:
+        both = TargetPoses.together([targets, region], targets.source)
+        weight = np.concatenate([(1 - share) * weight, share * region.weight])
     x = information.x + (at_work.nominal - model.nominal)
     rows, told = known_rows(at_work, both, x, found)
     held = [model.names[c] for c in found.structure.kept if c not in found.columns]
-    if held and (bias := found.remaining_bias(rows, both.weight)) >= WORTH_TELLING:
+    if held and (bias := found.remaining_bias(rows, weight)) >= WORTH_TELLING:
         told += (
             f"so many poses show less of {listed(held)} than their noise; identification holds "
             f"what it cannot see, and typical deviations of that move the test points by "
@@ -194,9 +197,8 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
             beyond = found.on_kept(rows[T:]), region.weight
     if share and beyond is None:
         raise InsufficientDataError(
-            f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
-            "the joint ranges, but the rules allow none, or no plan can make all of them "
-            "certain; leave it out"
+            f"{model.cell.source}: [design] elsewhere asks for poses all over the joint ranges, "
+            "but the rules allow none, or no plan can make all of them certain; leave it out"
         )
     warnings = setup.warnings + told
     return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)

@@ -36,7 +36,7 @@ LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a 
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:
-    where, motion = cell.path or cell.name, cell.design.motion
+    where, motion = cell.source, cell.design.motion
     lower, upper = joint_limits(cell, chain)
     for joint, values in cell.design.levels.items():
         i, split = joint_index(joint), cell.model.compliance_levels.get(joint)
@@ -64,7 +64,7 @@ def _check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) 
     _check_numbers(cell, chain, key, q, degrees)
     if (beyond := beyond_limits(cell, chain, q)) is not None:
         raise InputError(
-            f"{cell.path or cell.name}: key {key}: {beyond[1]}; correct the posture or the limits"
+            f"{cell.source}: key {key}: {beyond[1]}; correct the posture or the limits"
         )
 
 
@@ -83,7 +83,7 @@ def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
 def _check_numbers(
     cell: Cell, chain: Chain, key: str, found: Sized, degrees: bool, one: bool = False
 ) -> None:
-    n, where = chain.n_joints, cell.path or cell.name
+    n, where = chain.n_joints, cell.source
     require(
         len(found) == n or (one and len(found) == 1),
         f"{where}: key {key} has {len(found)} numbers, but robot '{chain.name}' has {n} joints; "
@@ -156,11 +156,6 @@ class TargetPoses(NewPoses):
         )
         weight = weight / weight.max()  # so that no sum overflows
         return cls(q, force, weight / weight.sum(), source, point, stated)
-
-    def with_others(self, others: TargetPoses, share: float) -> TargetPoses:
-        """Both, of which `others` have `share` of the weight."""
-        weight = np.concatenate([(1 - share) * self.weight, share * others.weight])
-        return replace(TargetPoses.together([self, others], self.source), weight=weight)
 
 
 def test_poses(
@@ -279,7 +274,7 @@ class _Sources:
         turned = box.rotation
         rotation = None if turned is None else np.broadcast_to(turned, (box.count, 3, 3))
 
-        where = f"{self.cell.path or self.cell.name}: [design.test_box]: the place"
+        where = f"{self.cell.source}: [design.test_box]: the place"
         q, more = self.reached(
             position, rotation, box, None,
             lambda t: "{} [{:.3f}, {:.3f}, {:.3f}] m in it".format(where, *position[t]),
@@ -359,7 +354,7 @@ class _Sources:
             q = np.concatenate(found)[:most]
             if not len(q):
                 raise InsufficientDataError(
-                    f"{cell.path or cell.name}: the cell states no test poses, and its rules allow "
+                    f"{cell.source}: the cell states no test poses, and its rules allow "
                     f"none of {count} postures drawn over the joint limits; state "
                     "[[design.test_pose]], or relax the rules of [workspace]"
                 )
@@ -435,7 +430,7 @@ def _carrying(cell: Cell, point: Array) -> Array:
     inertia = (r**2).sum() * np.eye(3) - r.T @ r
     if len(places) < 3 or np.linalg.matrix_rank(inertia, tol=1e-6 * np.trace(inertia)) < 3:
         raise InsufficientDataError(
-            f"{cell.path or cell.name}: point_m of the test poses is not known where the places of "
+            f"{cell.source}: point_m of the test poses is not known where the places of "
             "the markers are fitted, as fewer than three, or three in line, hold no point; leave "
             "out point_m, so that the markers themselves count, or measure a third marker"
         )
@@ -476,7 +471,7 @@ def known_rows(
         if off.any():
             k = int(off.argmax())
             raise InputError(
-                f"{cell.path or cell.name}: test pose {k + 1}: {joint} at "
+                f"{cell.source}: test pose {k + 1}: {joint} at "
                 f"{told(chain, j, targets.q[k, j])} is none of its levels in "
                 f"[model.compliance_levels], {listed([told(chain, j, v) for v in levels])}; "
                 "elsewhere its compliance is not known: state test poses at these, or add the level"

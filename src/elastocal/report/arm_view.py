@@ -79,7 +79,7 @@ def shells_of(cell: Cell, chain: Chain) -> Shells:
         steps = [*(joint.placement for joint in chain.joints), chain.flange_placement]
         whole = float(sum(np.linalg.norm(T[:3, 3]) for T in steps)) or 1.0
         radii = radii or tuple((whole * np.linspace(STOUT, SLIM, chain.n_joints)).tolist())
-        capsules = skeleton(chain, radii, np.eye(4), f"{cell.path or cell.name}: [workspace]")
+        capsules = skeleton(chain, radii, np.eye(4), f"{cell.source}: [workspace]")
         arm = _shells([(body.solid, body.carrier) for body in capsules])
     try:
         bodies = list(cell_bodies(cell, chain))
@@ -328,8 +328,7 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
     text = (
         f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
         f"configuration {printable(poses[first_shown].name)}, which has the largest, and in all of "
-        "them. "
-        f"The arm is drawn as {space.shells.drawn_from}."
+        f"them. The arm is drawn as {space.shells.drawn_from}."
     )
     if len(poses) < observed.n_configurations:
         text += (

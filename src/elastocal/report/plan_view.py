@@ -202,7 +202,8 @@ def plan_steps(plan: Plan) -> list[str]:
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses for a value, "
             f"{option('curve')} compares numbers of poses."
         )
-    if plan.certificate.starts_apart:
+    ends = plan.certificate.starts
+    if ends and max(ends) - min(ends) > 0.02 * max(map(abs, ends)):
         steps.append(f"For a better plan: {option('effort', 'thorough')}, which has more starts.")
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
