@@ -14,11 +14,10 @@ import numpy as np
 from bench_tools import Clock
 
 from elastocal.identification.identify import identify
-from elastocal.identification.least_squares import Problem
 from elastocal.identification.options import Options
 from elastocal.identification.solve import settle, sizes_and_check
 from elastocal.identification.start import start_values
-from elastocal.identification.weighted_problem import Weights
+from elastocal.identification.weighted_problem import Problem, Weights
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

@@ -12,7 +12,7 @@ from support.cells import random_poses
 import elastocal as ec
 from elastocal.identification import outliers, solve, weighted_problem
 from elastocal.identification.residuals import held_out_by_parts
-from elastocal.identification.weighted_problem import Weights
+from elastocal.identification.weighted_problem import Problem, Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 
@@ -55,11 +55,12 @@ def test_in_parts_equals_whole(cell, data, monkeypatch):
 def peak_of_a_pass(model, truth, observed):
     """Largest memory traced in a pass that evaluates and in one that leaves out, in bytes."""
     unit = Weights("none", None, False, "")
-    parts = weighted_problem.partition(observed, unit, len(model.parameters))
     columns, kept = np.arange(len(model.parameters)), np.arange(6)
+    problem = Problem(model, observed, unit, truth, columns)
+    assert len(problem.parts) > 1
     tracemalloc.start()
-    r_factor = weighted_problem.evaluate(model, parts, truth, columns).r_factor.of_columns(kept)
-    held_out_by_parts(model, parts, truth, kept, r_factor.half)
+    r_factor = problem.evaluate(truth, columns).r_factor.of_columns(kept)
+    held_out_by_parts(problem, truth, kept, r_factor.half)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     return peak

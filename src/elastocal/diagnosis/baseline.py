@@ -9,14 +9,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.least_squares import TOLERANCE, Problem
+from elastocal.identification.least_squares import TOLERANCE
 from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
-from elastocal.identification.weighted_problem import (
-    residual_at,
-    stated_by_observation,
-    weights_for,
-)
+from elastocal.identification.weighted_problem import Problem, stated_by_observation, weights_for
 from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -175,10 +171,10 @@ def fit_baseline(
         found = tied_fit(problem, sizes, TOLERANCE)
         x, residual = found.x, found.residual
     else:
-        x, residual = x0, residual_at(model, problem.parts, x0)
+        x, residual = x0, problem.residual(x0)
     if nominal is None:
         unknown = np.full_like(residual, np.nan)
-        nominal = unknown if started else residual_at(model, problem.parts, problem.x0)
+        nominal = unknown if started else problem.residual(problem.x0)
     stated = stated_by_observation(observed, model.cell.tracker)
     return Baseline(model, observed, x, sizes, residual, nominal, stated)
 

@@ -21,7 +21,6 @@ from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
     PriorRows,
-    Problem,
     Rows,
     clustered,
     variance_of,
@@ -78,15 +77,7 @@ from elastocal.identification.start import (
     start_values,
     without_copies,
 )
-from elastocal.identification.weighted_problem import (
-    Part,
-    Weights,
-    each,
-    partition,
-    regressor,
-    residual_at,
-    weights_for,
-)
+from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, order_contradicted, ranked
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
@@ -222,8 +213,8 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     if table.time is None and model.cell.model.clock == "rows":  # after the campaign
         table = replace(table, time=np.full(len(table), NEVER_YET))
     observed = observe(table, model.observe)
-    parts = partition(observed, Weights("none", None, False, ""), len(model.parameters))
-    error = residual_at(model, parts, result.x)
+    unit, every = Weights("none", None, False, ""), np.arange(len(model.parameters))
+    error = Problem(model, observed, unit, result.x, every).residual(result.x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
     errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
@@ -541,11 +532,11 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     V = fit.r_factor.half
 
     def rows(part: Part) -> Rows:
-        at, own = regressor(problem.model, part, fit.x, fit.columns), part.observations
+        at, own = problem.regressor(part, fit.x, fit.columns), part.observations
         labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
         return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
 
-    return clustered(each(problem.parts, rows), V, kind.upper())
+    return clustered(problem.each(rows), V, kind.upper())
 
 
 # The methods by name.

@@ -29,7 +29,7 @@ from elastocal.identification.solve import (
     reduce,
     residual_sigma,
 )
-from elastocal.identification.weighted_problem import RFactor, evaluate
+from elastocal.identification.weighted_problem import RFactor
 from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -173,7 +173,7 @@ def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntAr
         f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
     )
     named = np.intersect1d(np.union1d(known, tied), free)
-    R = evaluate(problem.model, problem.parts, solution.fit.x, free).r_factor.R
+    R = problem.evaluate(solution.fit.x, free).r_factor.R
     # An equality is exact: it counts as much as the most that anything else tells.
     A = A[:, free][A[:, free].any(axis=1)]
     most = np.linalg.norm(np.vstack([R, P[:, free]]) * solution.sizes[free], axis=0).max()
@@ -301,7 +301,7 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     } if len(P) else {}  # fmt: skip
     # Linearised, with the active constraints kept active: directions of the face are orthonormal by
     # the rows of readings and prior together.
-    crossed = held_out_by_parts(problem.model, problem.parts, found.fit.x, columns, found.face)
+    crossed = held_out_by_parts(problem, found.fit.x, columns, found.face)
     final = replace(
         solution, fit=_as_fit(found), reduction=_reduction(solution, found), held=crossed
     )
@@ -363,7 +363,7 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     columns, k = found.fit.columns, len(found.fit.columns)
     dropped = np.setdiff1d(before.dropped, columns)
     both = np.concatenate([columns, dropped])
-    R = evaluate(problem.model, problem.parts, found.fit.x, both).r_factor.R
+    R = problem.evaluate(found.fit.x, both).r_factor.R
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0

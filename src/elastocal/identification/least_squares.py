@@ -22,17 +22,11 @@ from elastocal.identification.constrained import minimise
 from elastocal.identification.knowledge import System
 from elastocal.identification.weighted_problem import (
     Evaluation,
-    Partition,
+    Problem,
     RFactor,
-    Weights,
-    evaluate,
-    is_large,
     least_norm,
-    partition,
     same_size,
 )
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
 from elastocal.units import Array, IntArray
 
 SETTLED = "the sum of squares no longer fell"
@@ -47,28 +41,6 @@ ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
 # What a step promises of the cost where a descent ends.  The last step is taken: at a million rows
 # it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
 TOLERANCE = 1e-8
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Fit parameters among those that are `free` to the observations, the others held at x0
-    (parameters,)."""
-
-    model: Model
-    observations: Observations
-    weights: Weights
-    x0: Array
-    free: NDArray[np.int64]
-
-    @cached_property
-    def parts(self) -> Partition:
-        """The table cut into parts that can be worked on alone: one, unless it is large."""
-        columns = max(int((~self.model.shrunk).sum()), len(self.free))
-        return partition(self.observations, self.weights, columns)
-
-    @property
-    def large(self) -> bool:
-        return is_large(self.observations, int((~self.model.shrunk).sum()))
 
 
 @dataclass(frozen=True)
@@ -104,7 +76,7 @@ class Fit:
         problem = self.problem
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
-        return evaluate(problem.model, problem.parts, self.x, problem.free).r_factor
+        return problem.evaluate(self.x, problem.free).r_factor
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
@@ -163,7 +135,7 @@ class Objective:
         """e, and the R factor of it and of B per unit of u; ElastocalError where the model has no
         prediction."""
         problem = self.problem
-        at = evaluate(problem.model, problem.parts, self.values(u), self.columns)
+        at = problem.evaluate(self.values(u), self.columns)
         if not np.isfinite(at.r_factor.rss):
             raise ElastocalError(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "

@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike
 from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.least_squares import Covariance, Problem, clustered, orthogonal
+from elastocal.identification.least_squares import Covariance, clustered, orthogonal
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import MethodResult
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
-from elastocal.identification.weighted_problem import Part, each, regressor, residual_at, sample
+from elastocal.identification.weighted_problem import Part, Problem
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -267,7 +267,7 @@ def find_faulty(solution: Solution) -> BoolArray:
     Of a large table a sample is judged so, and its fit judges the others.
     """
     problem, n = solution.problem, len(solution.problem.observations.lead)
-    part = sample(problem.parts, SAMPLE) if problem.large else problem.parts.part((0, n))
+    part = problem.sample(SAMPLE) if problem.large else problem.part(np.arange(n))
     width = prior_widths(problem.model, solution.sizes)[problem.free]
     x0, free = problem.x0, problem.free
     placed = is_placed(problem.model)[free]
@@ -323,7 +323,7 @@ def prior_widths(model: Model, sizes: Array) -> Array:
 
 def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
     """B (n, size, free) and residual (n, size) of a part at x, whitened."""
-    at, shape = regressor(problem.model, part, x, problem.free), (len(part.index), -1)
+    at, shape = problem.regressor(part, x, problem.free), (len(part.index), -1)
     B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
     return B.reshape(len(part.index), part.observations.size, -1), e.reshape(shape)
 
@@ -336,7 +336,7 @@ def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) 
     """
     x, n, size = problem.x0.copy(), len(problem.observations.lead), problem.observations.size
     x[problem.free] += width * fit.z
-    e = problem.weights.apply(residual_at(problem.model, problem.parts, x)).reshape(n, size)
+    e = problem.weights.apply(problem.residual(x)).reshape(n, size)
     level = FALSE_ALARM / n
     limit = float(special.fdtri(size, max(fit.dof, 1.0), 1 - level))
     beyond = (e**2).sum(axis=1) > size * fit.variance * limit
@@ -348,7 +348,7 @@ def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) 
             outside = np.zeros(len(own), dtype=bool)
             beyond[part.index] &= fit.p_values(fit.coordinates(B * width), own, outside) < level
 
-    list(each(problem.parts, of_part))
+    list(problem.each(of_part))
     return beyond
 
 
@@ -356,8 +356,7 @@ def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[O
     """The faulty observations with their error under the fit to the others, in table order."""
     if not faulty.any():
         return ()
-    observed, model = solution.problem.observations, solution.problem.model
-    error = residual_at(model, solution.problem.parts, fitted.fit.x)
+    observed, error = solution.problem.observations, solution.problem.residual(fitted.fit.x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     squared = (solution.problem.weights.apply(error).reshape(-1, observed.size) ** 2).sum(axis=1)
     sigma = median_scale(np.sqrt(squared[~faulty]), observed.size)

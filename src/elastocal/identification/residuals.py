@@ -10,16 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
-from elastocal.identification.weighted_problem import (
-    Part,
-    Partition,
-    Weights,
-    each,
-    regressor,
-    same_size,
-)
+from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
 from elastocal.measurements import firsts, numbered, ranked
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -57,31 +49,30 @@ def held_out_residual(
 
 
 def held_out_by_parts(
-    model: Model, parts: Partition, x: Array, columns: IntArray, half: Array,
-    step: Array | None = None,
-) -> tuple[Array, Array]:  # fmt: skip
+    problem: Problem, x: Array, columns: IntArray, half: Array, step: Array | None = None
+) -> tuple[Array, Array]:
     """The same with the model linearised at x, a part at a time, and the leverage (rows,) of each.
 
     `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
     the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
     step to the linear model's minimum, where x is not it.
     """
-    held, leverage = np.empty((2, len(parts.observed.value)))
-    together = parts.weights.together
+    held, leverage = np.empty((2, len(problem.observations.value)))
+    together, size = problem.weights.together, problem.observations.size
 
     def leave_out(part: Part) -> None:
-        at = regressor(model, part, x, columns)
+        at = problem.regressor(part, x, columns)
         residual = at.residual
         if step is not None:
             moved = np.flatnonzero(step)
-            residual = residual - regressor(model, part, x, moved).B @ step[moved]
+            residual = residual - problem.regressor(part, x, moved).B @ step[moved]
         B = at.B @ half
         Q, e = part.weights.apply(B), part.weights.apply(residual)
         labels = part.observations.configuration if together is None else together
-        held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, parts.observed.size))
+        held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, size))
         leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
 
-    list(each(parts, leave_out))
+    list(problem.each(leave_out))
     return held, leverage
 
 

@@ -21,7 +21,7 @@ from scipy import sparse, special
 
 from elastocal.engine.mixed import Products, climb
 from elastocal.identification.knowledge import share_of_prior
-from elastocal.identification.least_squares import Covariance, Fit, PriorRows, Problem
+from elastocal.identification.least_squares import Covariance, Fit, PriorRows
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
@@ -30,16 +30,7 @@ from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, is_placed
 from elastocal.identification.start import ordinary
-from elastocal.identification.weighted_problem import (
-    Part,
-    RFactor,
-    each,
-    evaluate,
-    part_of,
-    partition,
-    regressor,
-    same_size,
-)
+from elastocal.identification.weighted_problem import Part, Problem, RFactor, same_size
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations
 from elastocal.text import listed
@@ -295,18 +286,18 @@ class JointFit:
         """Q (rows, columns), whose squares are by how much of the noise the fit varies at the
         readings of a part, and their residual (rows,)."""
         found, apply = self.found, part.weights.apply
-        at = regressor(found.problem.model, part, found.x, found.columns)
+        at = found.problem.regressor(part, found.x, found.columns)
         return apply(at.B @ self.posterior.half), apply(at.residual)
 
     def standardised(self, others: Part | None = None) -> Array:
         """Residuals (N, size) free of the fit's part in them, in m or rad: of the fit's own
         readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of
         1 − QQᵀ."""
-        parts, side = self.found.problem.parts, -1
+        problem, side = self.found.problem, -1
         if others is not None:
-            columns = len(self.found.columns)
-            parts, side = partition(others.observations, others.weights, columns), 1
-        standard = np.empty(len(parts.observed.value))
+            own, side = others.observations, 1
+            problem = replace(problem, observations=own, weights=others.weights)
+        standard = np.empty(len(problem.observations.value))
 
         def one(part: Part) -> None:
             (Q, e), own = self.whitened(part), part.observations
@@ -320,8 +311,8 @@ class JointFit:
                 e = sparse.linalg.spsolve(part.weights.whiten.tocsc(), e)
             standard[part.rows] = e
 
-        list(each(parts, one))
-        return standard.reshape(-1, parts.observed.size)
+        list(problem.each(one))
+        return standard.reshape(-1, problem.observations.size)
 
 
 # The course: fit, noise and faulty readings in turn, then what else may change.
@@ -379,10 +370,10 @@ class _Search:
 
     def chosen(self, noise: NoiseFit | None, good: BoolArray) -> Part:
         """The good readings, weighted by the noise, or as they are without one."""
-        part = part_of(self.observed, self.every.problem.weights, np.flatnonzero(good))
+        part = self.every.problem.part(np.flatnonzero(good))
         if noise is not None:
             part = replace(part, weights=weights_of(noise, self.readings.take(good)))
-        return part if not good.all() else replace(part, observations=self.observed)
+        return part
 
     def joint(
         self, problem: Problem, x: Array, reduction: Reduction, scales: Scales | None = None, *,
@@ -420,8 +411,7 @@ class _Search:
         return JointFit(found, reduction, scales, self._rows(problem, found.x).only(kept))
 
     def _rows(self, problem: Problem, x: Array) -> LinearRows:
-        factor = evaluate(self.model, problem.parts, x, problem.free).r_factor
-        return self.functions.rows(factor, x)
+        return self.functions.rows(problem.evaluate(x, problem.free).r_factor, x)
 
     def crossed(self, fit: JointFit, scales: Scales) -> tuple[Array, Array]:
         """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
@@ -431,8 +421,7 @@ class _Search:
         columns, x = np.append(fit.reduction.kept, f.columns[posterior.own]), found.x.copy()
         x[f.columns] = f.nominal
         x[columns] += posterior.step  # of functions from nominal
-        model, parts, half = found.problem.model, found.problem.parts, posterior.half
-        return held_out_by_parts(model, parts, found.x, columns, half, x - found.x)
+        return held_out_by_parts(found.problem, found.x, columns, posterior.half, x - found.x)
 
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
         noise: NoiseFit | None = None

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.least_squares import Fit, PriorRows, Problem, fit, moved, root_of
+from elastocal.identification.least_squares import Fit, PriorRows, fit, moved, root_of
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -23,17 +23,7 @@ from elastocal.identification.residuals import (
     rms_3d,
 )
 from elastocal.identification.start import check_enough
-from elastocal.identification.weighted_problem import (
-    Part,
-    RFactor,
-    each,
-    least_norm,
-    merge,
-    regressor,
-    residual_at,
-    residual_of,
-    sample,
-)
+from elastocal.identification.weighted_problem import Part, Problem, RFactor, least_norm, merge
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -230,9 +220,7 @@ def looked_at(found: Fit) -> tuple[Array, Array]:
     """Residual (rows,) of each configuration under a fit to the others, under a drift of each block
     in time, as far off as readings of another day are; and leverage (rows,) in the fit."""
     problem, observed, weights = found.problem, found.problem.observations, found.problem.weights
-    held, leverage = held_out_by_parts(
-        problem.model, problem.parts, found.x, found.columns, found.r_factor.half
-    )
+    held, leverage = held_out_by_parts(problem, found.x, found.columns, found.r_factor.half)
     if weights.together is not None:
         held = held_out_residual(
             found.B, found.residual, weights, observed.configuration, observed.size
@@ -272,9 +260,7 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
         start = moved(found.x, wider.kept, own.step(sizes[wider.kept]))
-        linear = held_out_by_parts(
-            problem.model, problem.parts, found.x, wider.kept, own.half, start - found.x
-        )
+        linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)
         if not predicts(linear[0]):
             continue
         try:
@@ -373,7 +359,7 @@ def settle(
         problem = replace(problem, x0=base.x)
         nominal = base.residual
     else:
-        nominal = residual_at(model, problem.parts, problem.x0)
+        nominal = problem.residual(problem.x0)
     progress("first fit, tied weakly to the start")
     few = _sampled(problem)
     found = _tied_from(few, sizes, problem.x0, _misfit(few), CHOOSING)
@@ -415,11 +401,11 @@ def sizes_and_check(problem: Problem) -> Array:
         return np.where(placed, PLACED, model.sizes(np.zeros((1, len(known)))))
 
     def of_part(part: Part) -> tuple[Array, RFactor | None]:
-        at = regressor(model, part, problem.x0, every)
+        at = problem.regressor(part, problem.x0, every)
         r_factor = RFactor.of(at.B[:, np.searchsorted(every, free)], at.residual) if few else None
         return np.abs(at.B).max(axis=0, initial=0.0), r_factor
 
-    largest, factors = zip(*each(problem.parts, of_part), strict=True)
+    largest, factors = zip(*problem.each(of_part), strict=True)
     moved = np.zeros((len(largest), len(model.parameters)))
     moved[:, every] = np.stack(largest)
     sizes = model.sizes(moved)
@@ -447,22 +433,19 @@ def bent(solution: Solution, covariance: Array) -> Array:
     problem, found, chosen = solution.problem, solution.fit, solution.reduction
     kept, dropped = chosen.kept, chosen.dropped
     none = np.zeros(len(kept))
-    known = np.isfinite(covariance).all()
-    if problem.large or not known or not np.array_equal(found.columns, kept):
+    if problem.large or not np.isfinite(covariance).all():
         return none
     size = solution.sizes[kept]
     typical = np.where(is_placed(problem.model), 0.0, solution.sizes)[dropped]
     root = size[:, None] * root_of(covariance / np.outer(size, size))
     # Of many readings some tell it as well: it is no smaller where there are more of them.
-    n = len(problem.observations.lead)
-    parts = problem.parts
-    looked = parts.part((0, n)) if n <= BENT_SAMPLE else sample(parts, BENT_SAMPLE)
+    looked = problem.sample(BENT_SAMPLE)
     residual, B = found.residual[looked.rows], found.B[looked.rows] * size
     rng, steps = np.random.default_rng(0), np.zeros((BENDS, len(found.x)))
     steps[:, dropped] = delta = typical * rng.standard_normal((BENDS, len(dropped)))
     steps[:, kept] = rng.standard_normal((BENDS, len(kept))) @ root.T - delta @ chosen.mixing.T
     there, opposite = np.split(
-        residual_of(problem.model, looked, found.x + np.concatenate([steps, -steps])), 2
+        problem.residual_of(looked, found.x + np.concatenate([steps, -steps])), 2
     )
     moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
@@ -492,12 +475,12 @@ def _sampled(problem: Problem) -> Problem:
     n = len(problem.observations.lead)
     if n <= MANY:
         return problem
-    part = sample(problem.parts, min(SAMPLE, n // 4))
+    part = problem.sample(min(SAMPLE, n // 4))
     return replace(problem, observations=part.observations, weights=part.weights)
 
 
 def _misfit(problem: Problem) -> float:
-    residual = problem.weights.apply(residual_at(problem.model, problem.parts, problem.x0))
+    residual = problem.weights.apply(problem.residual(problem.x0))
     return max(float(np.sqrt(np.mean(residual**2))), 1e-12)
 
 

@@ -1,4 +1,4 @@
-"""The weighted problem: Σ and W with WᵀW = Σ⁻¹; B and e in parts, reduced to their R factor."""
+"""The weighted problem: Σ and W with WᵀW = Σ⁻¹; B and e, reduced to their R factor in parts."""
 
 from __future__ import annotations
 
@@ -213,119 +213,6 @@ def whitener(covariance: sparse.csr_array) -> sparse.csr_array:
     return sparse.csr_array(triplets, shape=covariance.shape)
 
 
-# A table in parts: small enough to work on, cut where nothing is correlated.
-
-Span = tuple[int, int]
-
-# Numbers in B (rows × parameters): from LARGE on a fit works in parts of at most PART.  16 MB a
-# part keeps the evaluation of B at full speed, and the copies that QR makes small.
-LARGE = 2**21
-PART = 2**21
-OF_A_MARKER = 30  # observations of each marker at least, where there are as many, in a sample
-
-
-def is_large(observed: Observations, n_parameters: int) -> bool:
-    """Whether B of all parameters is too large to be formed at once."""
-    return len(observed.value) * n_parameters > LARGE
-
-
-@dataclass(frozen=True)
-class Part:
-    """The observations `index` (n,) of a table, whitened by `weights` on their own.
-
-    `rows` (n·size,) are their rows among those of all observations.
-    """
-
-    index: IntArray
-    rows: IntArray
-    observations: Observations
-    weights: Weights
-
-
-@dataclass(frozen=True)
-class Partition:
-    """All observations in `spans` of `order` (N,).
-
-    Those of one configuration share a span, and with them what shares an unloaded reading.
-    """
-
-    observed: Observations
-    weights: Weights
-    order: IntArray
-    spans: tuple[Span, ...]
-
-    def part(self, span: Span) -> Part:
-        """The observations of a span, in the table's order."""
-        if len(self.spans) == 1:
-            n, rows = len(self.observed.lead), len(self.observed.value)
-            return Part(np.arange(n), np.arange(rows), self.observed, self.weights)
-        return part_of(self.observed, self.weights, np.sort(self.order[slice(*span)]))
-
-
-def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
-    """Observations `index` (n,), ascending, with the weights of these alone: exact where what is
-    correlated is in `index` together."""
-    rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
-    if observed.kind == "deflection":
-        chosen = np.zeros(len(observed.lead), dtype=bool)
-        chosen[index] = True
-        own = subset(observed, chosen)
-    else:
-        value = observed.value[_run(rows)]
-        table = observed.table.take(_run(observed.lead[index]))
-        every = sparse.eye_array(len(index), format="csr")
-        own = Observations(observed.kind, value, every, np.arange(len(index)), table)
-    inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
-    mine = replace(weights, whiten=inside)
-    if weights.common is not None and weights.together is not None:
-        mine = replace(mine, common=weights.common[rows], together=weights.together[index])
-    return Part(index, rows, own, mine)
-
-
-def _run(index: IntArray) -> IntArray | slice:
-    """`index` (n,) as a slice where it counts up by one: arrays are then views and not copies."""
-    if len(index) and index[-1] - index[0] == len(index) - 1 and (np.diff(index) == 1).all():
-        return slice(int(index[0]), int(index[-1]) + 1)
-    return index
-
-
-def sample(parts: Partition, n: int, seed: int = 0) -> Part:
-    """About n observations at random, some of every marker, correlated ones together."""
-    observed = parts.observed
-    order = np.random.default_rng(seed).permutation(len(observed.lead))
-    if observed.kind == "deflection":  # each brings the others of its configuration with it
-        n = -(-n * observed.n_configurations // len(order))
-    marker = observed.table.marker[observed.lead[order]]
-    some = [order[marker == code][:OF_A_MARKER] for code in np.unique(marker)]
-    chosen = np.unique(np.concatenate([order[:n], *some]))
-    if observed.kind == "deflection":
-        own = observed.configuration
-        chosen = np.flatnonzero(np.isin(own, own[chosen]))
-    if parts.weights.kind == "covariance":  # anything may be correlated
-        chosen = np.arange(len(order))
-    return part_of(observed, parts.weights, chosen)
-
-
-def partition(observed: Observations, weights: Weights, n_parameters: int) -> Partition:
-    """Cut the observations so that B of `n_parameters` has at most PART numbers in each part.
-
-    A table that is not large stays in one part, and so does one whose covariance was given, where
-    anything may be correlated.
-    """
-    n = len(observed.lead)
-    if not is_large(observed, n_parameters) or weights.kind == "covariance":
-        return Partition(observed, weights, np.arange(n), ((0, n),))
-    order = np.argsort(observed.configuration, kind="stable")
-    ends = np.append(np.flatnonzero(np.diff(observed.configuration[order])) + 1, n)
-    spans, start, limit = list[Span](), 0, max(PART // (observed.size * n_parameters), 1)
-    while start < n:  # as many configurations as keep within the limit, at least one
-        k = np.searchsorted(ends, start, side="right")
-        last = max(int(np.searchsorted(ends, start + limit, side="right")) - 1, int(k))
-        spans.append((start, int(ends[last])))
-        start = spans[-1][1]
-    return Partition(observed, weights, order, tuple(spans))
-
-
 # A least-squares problem of any length as its R factor: what is left of B and e after QR.
 #
 #     [B e] = Q [R z; 0 ρ],   |e − B x|² = |z − R x|² + ρ²
@@ -435,13 +322,31 @@ def _factor(rows: Array) -> Array:
     return R if len(R) == k else np.vstack([R, np.zeros((k - len(R), k))])
 
 
-# Passes over a table in parts: B is formed, used and dropped, one part at a time.
+# A problem, worked on in parts of its table: B of a part is formed, used and dropped.
 
 Result = TypeVar("Result")
 
+# Numbers in B (rows × parameters): from LARGE on a fit works in parts of at most PART.  16 MB a
+# part keeps the evaluation of B at full speed, and the copies that QR makes small.
+LARGE = 2**21
+PART = 2**21
+OF_A_MARKER = 30  # observations of each marker at least, where there are as many, in a sample
 # Two parts at a time: one is evaluated while the other is factorised (measured: a third one only
 # waits for the interpreter, and each costs the memory of a part).
 AT_ONCE = 2
+
+
+@dataclass(frozen=True)
+class Part:
+    """The observations `index` (n,) of a table, whitened by `weights` on their own.
+
+    `rows` (n·size,) are their rows among those of all observations.
+    """
+
+    index: IntArray
+    rows: IntArray
+    observations: Observations
+    weights: Weights
 
 
 @dataclass(frozen=True)
@@ -452,55 +357,131 @@ class Evaluation:
     r_factor: RFactor
 
 
-def evaluate(model: Model, parts: Partition, x: Array, columns: NDArray[np.integer]) -> Evaluation:
-    """B of the `columns` at x and the residual, whitened and reduced to their R factor.
+@dataclass(frozen=True)
+class Problem:
+    """Fit parameters among those that are `free` to the observations, the others held at x0
+    (parameters,)."""
 
-    Raises ElastocalError where a reading has no static equilibrium at x.
-    """
-    residual = np.empty(len(parts.observed.value))
+    model: Model
+    observations: Observations
+    weights: Weights
+    x0: Array
+    free: NDArray[np.int64]
 
-    def reduced(part: Part) -> RFactor:
-        at = regressor(model, part, x, columns)
-        residual[part.rows] = at.residual
-        return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
+    @property
+    def large(self) -> bool:
+        """Whether B of all parameters is too large to be formed at once."""
+        return len(self.observations.value) * int((~self.model.shrunk).sum()) > LARGE
 
-    return Evaluation(residual, merge(each(parts, reduced)))
+    @cached_property
+    def parts(self) -> tuple[IntArray, ...]:
+        """The observations (n,) of each part, whose B has at most PART numbers.
+
+        Those of one configuration share a part, and with them what shares an unloaded reading.  A
+        table that is not large is one part, and so is one whose covariance was given, where
+        anything may be correlated.
+        """
+        observed, n = self.observations, len(self.observations.lead)
+        columns = max(int((~self.model.shrunk).sum()), len(self.free))
+        if len(observed.value) * columns <= LARGE or self.weights.kind == "covariance":
+            return (np.arange(n),)
+        order = np.argsort(observed.configuration, kind="stable")
+        ends = np.append(np.flatnonzero(np.diff(observed.configuration[order])) + 1, n)
+        parts, start, limit = list[IntArray](), 0, max(PART // (observed.size * columns), 1)
+        while start < n:  # as many configurations as keep within the limit, at least one
+            k = np.searchsorted(ends, start, side="right")
+            last = max(int(np.searchsorted(ends, start + limit, side="right")) - 1, int(k))
+            parts.append(np.sort(order[start : ends[last]]))
+            start = int(ends[last])
+        return tuple(parts)
+
+    def part(self, index: IntArray) -> Part:
+        """Observations `index` (n,), ascending, with the weights of these alone: exact where what
+        is correlated is in `index` together."""
+        observed, weights = self.observations, self.weights
+        rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
+        if len(index) == len(observed.lead):
+            return Part(index, rows, observed, weights)
+        if observed.kind == "deflection":
+            own = subset(observed, np.isin(np.arange(len(observed.lead)), index))
+        else:
+            value = observed.value[_run(rows)]
+            table = observed.table.take(_run(observed.lead[index]))
+            every = sparse.eye_array(len(index), format="csr")
+            own = Observations(observed.kind, value, every, np.arange(len(index)), table)
+        inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
+        mine = replace(weights, whiten=inside)
+        if weights.common is not None and weights.together is not None:
+            mine = replace(mine, common=weights.common[rows], together=weights.together[index])
+        return Part(index, rows, own, mine)
+
+    def sample(self, n: int) -> Part:
+        """About n observations at random, some of every marker, correlated ones together."""
+        observed = self.observations
+        order = np.random.default_rng(0).permutation(len(observed.lead))
+        if self.weights.kind == "covariance":  # anything may be correlated
+            return self.part(np.arange(len(order)))
+        if observed.kind == "deflection":  # each brings the others of its configuration with it
+            n = -(-n * observed.n_configurations // len(order))
+        marker = observed.table.marker[observed.lead[order]]
+        some = [order[marker == code][:OF_A_MARKER] for code in np.unique(marker)]
+        chosen = np.unique(np.concatenate([order[:n], *some]))
+        if observed.kind == "deflection":
+            own = observed.configuration
+            chosen = np.flatnonzero(np.isin(own, own[chosen]))
+        return self.part(chosen)
+
+    def each(self, work: Callable[[Part], Result]) -> Iterator[Result]:
+        """`work` on every part, AT_ONCE at a time; results in the order of the parts.
+
+        What the results add up to so does not depend on which part is done first.  The first one is
+        done alone: it builds what the others share (the model's compiled functions).
+        """
+        first, *others = self.parts
+        yield work(self.part(first))
+        if not others:
+            return
+        pool = ThreadPoolExecutor(AT_ONCE)
+        try:
+            yield from pool.map(lambda index: work(self.part(index)), others)
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def evaluate(self, x: Array, columns: NDArray[np.integer]) -> Evaluation:
+        """B of the `columns` at x and the residual, whitened and reduced to their R factor.
+
+        Raises ElastocalError where a reading has no static equilibrium at x.
+        """
+        residual = np.empty(len(self.observations.value))
+
+        def reduced(part: Part) -> RFactor:
+            at = self.regressor(part, x, columns)
+            residual[part.rows] = at.residual
+            return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
+
+        return Evaluation(residual, merge(self.each(reduced)))
+
+    def residual(self, x: Array) -> Array:
+        """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
+        residual = np.empty(len(self.observations.value))
+
+        def predicted(part: Part) -> None:
+            residual[part.rows] = self.residual_of(part, x)
+
+        list(self.each(predicted))
+        return residual
+
+    def residual_of(self, part: Part, x: Array) -> Array:
+        """The same of a part, or (k, rows) at several x."""
+        observed = part.observations
+        return np.asarray(observed.value - self.model.predict(observed.table, x, observed))
+
+    def regressor(self, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
+        return self.model.regressor(part.observations.table, x, columns, part.observations)
 
 
-def residual_at(model: Model, parts: Partition, x: Array) -> Array:
-    """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
-    residual = np.empty(len(parts.observed.value))
-
-    def predicted(part: Part) -> None:
-        residual[part.rows] = residual_of(model, part, x)
-
-    list(each(parts, predicted))
-    return residual
-
-
-def residual_of(model: Model, part: Part, x: Array) -> Array:
-    """Observed minus predicted (rows,) of a part at x, or (k, rows) at several; NaN in readings
-    without equilibrium."""
-    observed = part.observations
-    return np.asarray(observed.value - model.predict(observed.table, x, observed))
-
-
-def regressor(model: Model, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
-    return model.regressor(part.observations.table, x, columns, part.observations)
-
-
-def each(parts: Partition, work: Callable[[Part], Result]) -> Iterator[Result]:
-    """`work` on every part, AT_ONCE at a time; results in the order of the parts.
-
-    What the results add up to so does not depend on which part is done first.  The first one is
-    done alone: it builds what the others share (the model's compiled functions).
-    """
-    first, *others = parts.spans
-    yield work(parts.part(first))
-    if not others:
-        return
-    pool = ThreadPoolExecutor(AT_ONCE)
-    try:
-        yield from pool.map(lambda span: work(parts.part(span)), others)
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+def _run(index: IntArray) -> IntArray | slice:
+    """`index` (n,) as a slice where it counts up by one: arrays are then views and not copies."""
+    if len(index) and index[-1] - index[0] == len(index) - 1 and (np.diff(index) == 1).all():
+        return slice(int(index[0]), int(index[-1]) + 1)
+    return index
