@@ -38,10 +38,12 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import corrects
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
-from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
 from elastocal.diagnosis.stated_floor import (
+    NEW_POSES,
+    Shrinkage,
     SupportedFloor,
     each_left_out,
+    rms_with_interval,
     squared_lengths,
     supported_floor,
 )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -13,14 +14,42 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
+from elastocal.diagnosis.hypotheses import (
+    CHANGE_TIMES,
+    UNSIZED_SCALES,
+    Hypothesis,
+    RegressorDirection,
+    cell_with,
+    recorded,
+)
+from elastocal.diagnosis.model_set import Item, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, project
-from elastocal.diagnosis.unknown import Generic
-from elastocal.measurements import Measurements
-from elastocal.model.effects.base import DrivenEffect, Effect, Stage, index, turning_joints
+from elastocal.diagnosis.unknown import Generic, wrenches
+from elastocal.identification.start import as_placed
+from elastocal.measurements import Measurements, with_moves
+from elastocal.model.effects.base import (
+    BaseMotion,
+    DrivenEffect,
+    Effect,
+    JointMotion,
+    LinkFrame,
+    SmoothFunction,
+    Stage,
+    index,
+    turning_joints,
+)
 from elastocal.model.effects.compliances import LoadedEffect
-from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
-from elastocal.model.effects.smooth import JointCurve, ResidualField, Waves
+from elastocal.model.effects.gears import BY_ORDER
+from elastocal.model.effects.smooth import (
+    ApproachResponse,
+    JointCurve,
+    JointResponse,
+    LoadResponse,
+    ResidualField,
+    ResidualStep,
+    TorqueResponse,
+    Waves,
+)
 from elastocal.units import Array
 
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.
@@ -124,227 +153,6 @@ def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Componen
     return field_component(dataset, c.effect, c.where, "time", share)
 
 
-# What is looked for beside those: families of lines of a joint's error, and smooth fields.
-#
-# A wheel that turns N times per turn of the joint makes lines at N and its multiples: sought
-# together they show where none of them would by itself.  The evidence of 2m columns at N, 2N, …,
-# mN is that of any group; N runs over a grid as fine as the highest of them needs, and each point
-# costs its share of the prior.
-
-MULTIPLES = (1, 2, 3)  # lines of a family, up to so many times the lowest order
-LOWEST, HIGHEST = 2.5, 250.0  # orders
-STEP = 1.5  # of the highest order of a family, in units of 1/range(q)
-# Up to so many poses lines are sought by families, and before curves; in more, single lines show.
-FEW_POSES = 300
-LINE = 5e-5  # rad, a typical line
-LINE_SCALES = np.array([0.3, 1.0, 3.0, 10.0])
-
-
-@dataclass(frozen=True)
-class LineFamily:
-    """Lines of the joint `where` at `order` and its multiples: `gain` in nats less the search,
-    `sd` how well these data know the order, `search` what finding it cost, the joint's `scatter`
-    beside them, of a visit and as a multiple of it that of a configuration, and the components
-    that they are `instead_of`."""
-
-    where: str
-    order: float
-    multiples: int
-    gain: float
-    sd: float
-    search: float
-    scatter: tuple[float, float] = (0.0, 0.0)
-    instead_of: tuple[Component, ...] = ()
-    component: Component | None = None
-
-
-def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
-    """The most conspicuous family of lines of every joint beside the sum, the best first.
-
-    What is not found yet counts as scatter of its joint, or as its curve: so a family is tried
-    beside these, and in their place.
-    """
-    sums = beside(dataset, found, found.noise)
-    out, now = [], sums.at.marginal
-    for h in dataset.hypotheses:
-        if not isinstance(h.effect, GearRipple):
-            continue
-        i = index(h.where)
-        if np.ptp(dataset.table.q[:, i]) < MOVED:
-            continue
-        own = [c for c in found.components if c.where == h.where]
-        lines = sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
-        if lines > MOST_FOUND:
-            continue
-        tried = [_best(sums, h, 0.0, scatter_of(found.noise, i), ())]
-        curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
-        now_scatter = [scatter_of(found.noise, i)] if curves else []
-        for scatter in less_scatter(found.noise, i) or now_scatter:
-            grams = beside(dataset, found, with_scatter(found.noise, i, scatter), curves)
-            tried.append(_best(grams, h, grams.at.marginal - now, scatter, curves))
-        best = max(tried, key=lambda family: family.gain)
-        if best.gain > HOPELESS:
-            out.append(replace(best, component=family_component(dataset, best)))
-    return sorted(out, key=lambda family: -family.gain)
-
-
-# A family that is this far (nats) from paying for its search beside the sum as it is may still pay
-# once noise, sizes and the other orders have followed.
-HOPELESS = -3.0
-
-
-def with_scatter(noise: NoiseValues, i: int, scatter: tuple[float, float]) -> NoiseValues:
-    joint, shared = noise.joint.copy(), noise.shared.copy()
-    joint[i], shared[i] = scatter
-    return replace(noise, joint=joint, shared=shared)
-
-
-def scatter_of(noise: NoiseValues, i: int) -> tuple[float, float]:
-    return float(noise.joint[i]), float(noise.shared[i])
-
-
-def less_scatter(noise: NoiseValues, i: int) -> list[tuple[float, float]]:
-    """Scatter that joint i (0-based) may have once its lines are known: half of it, as usual from
-    pose to pose, and as usual from visit to visit as well."""
-    s, c = scatter_of(noise, i)
-    s_usual, c_usual = scatter_of(NoiseValues.usual(len(noise.joint)), i)
-    s_least, c_least = min(s, s_usual), min(c, c_usual)
-    half = (s, c / 2) if c > 1 else (s / 2, c)
-    tried = {(max(half[0], s_least), max(half[1], c_least)), (s, c_least), (s_least, c_least)}
-    return sorted(tried - {(s, c)}, reverse=True)
-
-
-MOST_FOUND = MOST_LINES - 3
-
-
-def _best(
-    grams: Grams, h: Hypothesis, gain: float, scatter: tuple[float, float],
-    curves: tuple[Component, ...],
-) -> LineFamily:  # fmt: skip
-    """The best family of a joint, of any number of multiples; `gain` is that of what it is in the
-    place of."""
-    tried = MULTIPLES[:1] if len(grams.dataset.blocks.member) > FEW_POSES else MULTIPLES
-    families = [_best_family(grams, h, m) for m in tried]
-    best = max(families, key=lambda family: family.gain)
-    return replace(best, gain=best.gain + gain, scatter=scatter, instead_of=curves)
-
-
-def _best_family(grams: Grams, h: Hypothesis, m: int) -> LineFamily:
-    q = grams.dataset.table.q[:, index(h.where)]
-    step = STEP / max(float(np.ptp(q)), 1e-3) / m
-    orders = np.arange(LOWEST, HIGHEST / m, step)
-    # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.
-    log_prior = -np.log(orders) - np.log((1 / orders).sum() * len(MULTIPLES))
-    each = family_evidence(grams, h, orders, m) + log_prior
-    k = int(np.argmax(each))
-    search = -float(log_prior[k])
-    order, sd, evidence = refined_order(grams, h, float(orders[k]), m, step)
-    return LineFamily(h.where, order, m, evidence - search, sd, search)
-
-
-def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | None:
-    """The components of a sum with the orders of all lines where they fit best together; None
-    where they are there already.
-
-    Gauss–Newton in the orders N of all families at once, sizes and noise as they are: with
-    amplitudes a_k, b_k at their posterior mean, a family's column is
-    Σ_k k (q − q₀)(a_k cos kNq − b_k sin kNq), which is that of the amplitudes' shifts.  The
-    posterior says how well each order is known.
-    """
-    families = [k for k, c in enumerate(found.components) if isinstance(c.effect, GearSpectrum)]
-    if not families:
-        return None
-    now, moved = found, False
-    # Of each pair of amplitudes, sine and cosine, the columns and then those of their shifts.
-    quads = [np.r_[found.spans[k]].reshape(-1, 4) for k in families]
-    lines, shifts = ([quad[:, some].ravel() for quad in quads] for some in ([0, 1], [2, 3]))
-    kept = np.ones(found.data.X.shape[2], dtype=bool)
-    kept[np.concatenate(shifts)] = False
-    places = [found.components[k].where for k in families]
-    most = STEP / np.array([max(float(np.ptp(dataset.table.q[:, index(w)])), 1e-3) for w in places])
-    best = -np.inf
-    for _ in range(SHARPENINGS):
-        X = now.data.X
-        alone = replace(now.data, X=X[:, :, kept], precision=now.data.precision[kept])
-        at = project(alone, now.noise)
-        if at.marginal < best + SHARP:
-            break
-        best, moved, found = at.marginal, now is not found or moved, now
-        amplitude = np.zeros(len(kept))
-        amplitude[kept] = at.beta
-        sd = [dict(now.components[k].settings)["order_sd_1"] for k in families]
-        turned = [
-            X[:, :, shift] @ amplitude[line] / d
-            for line, shift, d in zip(lines, shifts, sd, strict=True)
-        ]
-        at = project(alone.with_columns(np.stack(turned, axis=2), 1 / most**2), now.noise)
-        steps = np.clip(at.beta[-len(families) :], -most, most)
-        spread = np.linalg.norm(at.beta_deviation[:, -len(families) :], axis=0)
-        components = list(now.components)
-        for k, step, known in zip(families, steps, spread, strict=True):
-            c = components[k]
-            m = c.width // 4
-            order = min(max(dict(c.settings)["order_1"] + float(step), LOWEST), HIGHEST / m)
-            family = LineFamily(c.where, order, m, 0.0, float(known), c.search)
-            components[k] = replace(family_component(dataset, family), given=c.given)
-        now = replace(now, components=tuple(components))
-    return list(found.components) if moved else None
-
-
-SHARPENINGS, SHARP = 6, 0.05  # nats that another step must gain
-
-
-def refined_order(
-    grams: Grams, h: Hypothesis, order: float, m: int, width: float, scales: Array = LINE_SCALES
-) -> tuple[float, float, float]:
-    """Lowest order of a family, its standard deviation and log evidence, sought within `width` of
-    `order`: the curvature of the evidence says how well it is known."""
-    for narrowed in width / 4.0 ** np.arange(3):
-        trial = np.clip(order + np.linspace(-narrowed, narrowed, 17), LOWEST, HIGHEST / m)
-        order = float(trial[int(np.argmax(family_evidence(grams, h, trial, m, scales)))])
-    trial = np.linspace(-width, width, 33)
-    each = family_evidence(grams, h, order + trial, m, scales)
-    evidence = float(each[16])
-    # The parabola through the highest five points, or all that are nearly as high.
-    near = np.abs(trial) <= max(np.abs(trial[each > evidence - 2.0]).min(initial=0.0), trial[18])
-    near |= (each > evidence - 2.0) & (np.abs(trial) < width / 2)
-    curvature = -2 * np.polyfit(trial[near], each[near], 2)[0]
-    sd = float(1 / np.sqrt(max(curvature, 1.0 / width**2)))
-    return order, sd, evidence
-
-
-def family_evidence(
-    grams: Grams, h: Hypothesis, orders: Array, m: int, scales: Array = LINE_SCALES
-) -> Array:
-    """Log evidence (G,) of the families of m lines at `orders` (G,)."""
-    dataset = grams.dataset
-    sums = grams.entry(h.entry_key(dataset.base.model))
-    out = []
-    for piece in sums.pieces(len(orders), 2 * m):
-        some = orders[piece, None]
-        # The amplitudes of multiples fall with their number, in the mean.
-        D = [dataset.direction(h, some * k) / k for k in range(1, m + 1)]
-        out.append(sums.driven(np.concatenate(D, axis=4)).evidence(scales))
-    return np.concatenate(out)
-
-
-def family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
-    effect, where = GearSpectrum(), family.where
-    q = dataset.table.q[:, index(where)]
-    settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
-    for k in range(1, family.multiples + 1):
-        settings |= {f"order_{k}": k * family.order, f"order_sd_{k}": k * family.sd}
-    cell = cell_with(dataset.base.model.cell, where, settings)
-    parameters = effect.parameters(where, dataset.base.model.chain, cell)
-    typical = [p.typical or 0.0 for p in parameters]
-    columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
-    kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
-    return Component(
-        "angle", effect, where, columns, LINE, settings=kept, search=family.search,
-        fellows=len(turning_joints(dataset.base.model.chain)),
-    )  # fmt: skip
-
-
 # Smooth fields.
 
 FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
@@ -361,11 +169,17 @@ def beside(
     return Grams(dataset, data, project(data, noise))
 
 
-def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[str, float]:
+def _field(
+    dataset: DiagnosisData, effect: ResidualField, where: str, name: str, length: float
+) -> tuple[SmoothFunction, dict[str, float]]:
+    """A field's function of what it follows, and its settings."""
     x = _followed(dataset.table, name)
     keys = ("size", "length", "low", "high")
     values = (1.0, length * float(np.ptp(x)), float(x.min()), float(x.max()))
-    return {f"field_{name}_{key}": value for key, value in zip(keys, values, strict=True)}
+    settings = {f"field_{name}_{key}": value for key, value in zip(keys, values, strict=True)}
+    cell = cell_with(dataset.base.model.cell, where, settings)
+    (function,) = effect.functions(where, dataset.base.model.chain, cell)
+    return function, settings
 
 
 def field_block(
@@ -373,8 +187,7 @@ def field_block(
 ) -> Generic:
     """A field as a block, for a search: its direction at every visit, the same waves in each
     component of the motion."""
-    cell = cell_with(dataset.base.model.cell, where, _field_settings(dataset, name, length))
-    (function,) = effect.functions(where, dataset.base.model.chain, cell)
+    function, _ = _field(dataset, effect, where, name, length)
     waves = Waves.of(function)
     sd = np.sqrt(waves.variances(function.size, function.length))
     F = waves.at(_followed(dataset.visit_table, name)) * sd * MOTION
@@ -395,14 +208,152 @@ def field_component(
     dataset: DiagnosisData, effect: ResidualField, where: str, name: str,
     shortest: float = FIELD_LENGTHS[0],
 ) -> Component:  # fmt: skip
-    settings = _field_settings(dataset, name, shortest)
+    function, settings = _field(dataset, effect, where, name, shortest)
     span = settings[f"field_{name}_high"] - settings[f"field_{name}_low"]
-    cell = cell_with(dataset.base.model.cell, where, settings)
-    (function,) = effect.functions(where, dataset.base.model.chain, cell)
     columns = driven_columns(dataset, effect, where, settings) * MOTION
     low, high = (math.log(share * span) for share in (shortest, FIELD_LENGTHS[1]))
     ranges = {k: v for k, v in settings.items() if k.endswith(("low", "high"))}
     return Component(
         "time" if name == "time" else "pose", effect, where, columns, MOTION, name,
         Waves.of(function), (low, high), effect.entry_at(where).size, tuple(ranges.items()),
+    )  # fmt: skip
+
+
+# What corrects the arm beside a sum and names no cause: fields, steps, and responses to loads.
+# Each is scored at its place beside the whole sum by its evidence, sizes integrated out; those that
+# stand out join the sum as components and stay where they pay (`component_search`).
+
+
+def without_a_name(
+    dataset: DiagnosisData, found: FittedSum, most: int, without: Container[str] = ()
+) -> list[Component]:
+    """What corrects the arm beside the sum and names no cause, the most conspicuous first: smooth
+    fields, steps in time, what a joint makes of its torque or last motion, base and links of the
+    load; none of the effects `without` which to do."""
+    sums, model = beside(dataset, found, found.noise), dataset.base.model
+    chain, cell = model.chain, model.cell
+    respond = partial(_response, dataset.columns.torques())
+    wrench_at = {where: wrench for where, _, *wrench in wrenches(dataset)}
+    tried: tuple[tuple[Effect, Search], ...] = (
+        (ResidualStep(), _step), (TorqueResponse(), respond), (ApproachResponse(), respond),
+        (LoadResponse(), partial(_yielding, wrench_at)),
+    )  # fmt: skip
+    taken = {(p.effect, p.where) for p in model.parameters}
+    taken |= {(c.effect.name, c.where) for c in found.components}
+    field, every = ResidualField(), list[Conspicuous]()
+    for where in field.places(chain, cell):
+        # Of one place at a time: what a large table's entries sum up to would fill the memory.
+        grams = Grams(dataset, sums.data, sums.at)
+        if field.name not in without:
+            every += _fields(found, field, grams, where)
+        for effect, search in tried:
+            free = effect.name not in without and (effect.name, where) not in taken
+            if not free or where not in effect.places(chain, cell):
+                continue
+            if (it := search(effect, grams, where)) is not None:
+                block, settings, cost = it
+                evidence = float(grams.of(block).evidence(UNSIZED_SCALES)[0]) - cost
+                maker = partial(_as_component, dataset, effect, block, settings, cost)
+                every.append((evidence, where, block.covariate, maker))
+    shown = sorted((c for c in every if c[0] > CONSPICUOUS), key=lambda c: -c[0])
+    chosen = list(dict.fromkeys((where, of) for _, where, of, _ in shown))[:most]
+    return [component() for _, where, of, component in shown if (where, of) in chosen]
+
+
+CONSPICUOUS = 3.0  # nats of evidence, its size integrated out
+Conspicuous = tuple[float, str, str, Callable[[], Component]]  # nats, place, what it follows
+# A block, the constants of its effect, and what finding them cost in nats.
+Tried = tuple[Generic, dict[str, float], float]
+Search = Callable[[Any, Grams, str], Tried | None]
+
+
+def _fields(
+    found: FittedSum, effect: ResidualField, grams: Grams, where: str
+) -> Iterator[Conspicuous]:
+    dataset = grams.dataset
+    follow = ["time"] if recorded(dataset.table, "time") else []
+    if not where.startswith("marker"):
+        turning = turning_joints(dataset.base.model.chain)
+        follow += [w for w in turning if np.ptp(dataset.table.q[:, index(w)]) > MOVED]
+    known = {(c.where, c.follows) for c in found.components}
+    for name in follow:
+        if where != name and (where, name) not in known:
+            coarse = field_block(dataset, effect, where, name, FIELD_LENGTHS[0] * 2)
+            maker = partial(field_component, dataset, effect, where, name)
+            yield float(grams.of(coarse).evidence()[0]), where, name, maker
+
+
+def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
+    """At the moment at which it explains most."""
+    dataset = grams.dataset
+    moments, time = dataset.moments, dataset.visit_table.time
+    if time is None or not len(moments):
+        return None
+    entry = effect.entry_at(where)
+    moved, key = np.eye(entry.size) * MOTION, (entry.name, (where,))
+    sums, visits = grams.entry(key), time.reshape(dataset.present.shape)
+
+    def directions(tried: Array) -> Array:
+        later = (visits[:, :, None] >= tried) & dataset.present[:, :, None]
+        return later[:, :, None, :, None] * moved[:, None, :]
+
+    def best(tried: Array) -> float:
+        each = sums.each(len(tried), entry.size, lambda some: directions(tried[some]))
+        return float(tried[np.argmax(each.evidence(UNSIZED_SCALES))])
+
+    apart = math.ceil(len(moments) / CHANGE_TIMES)
+    k = int(np.searchsorted(moments, best(moments[apart // 2 :: apart])))
+    moment = best(moments[max(k - apart, 0) : k + apart + 1])
+    D = directions(np.array([moment]))[:, :, :, 0]
+    block = Generic("", "time", where, effect.stage, key, D)
+    return block, {effect.constants[0].key: moment}, math.log(len(moments))
+
+
+def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) -> Tried | None:
+    """Of a joint by its `torque` (n_rows, joints) or by its last motion."""
+    dataset, i = grams.dataset, index(where)
+    table, cell = dataset.table, dataset.base.model.cell
+    if not all(recorded(table, need) for need in effect.needed(cell)):
+        return None
+    tau, came = torque[:, i], table.approach
+    if cell.model.approach == BY_ORDER:
+        came = with_moves(table).direction
+    largest = float(np.abs(tau).max(initial=0.0)) or 1.0
+    F = effect.at_rows(tau / largest, np.ones_like(tau) if came is None else came[:, i])
+    if np.ptp(F, axis=0).max() == 0:
+        return None
+    D = dataset.blocks.of_visits(F[dataset.lead])[:, :, None, :] * MOTION
+    block = Generic("", effect.name, where, effect.stage, (JointMotion.name, (where,)), D)
+    return block, {f"{effect.name}_Nm": largest}, 0.0
+
+
+def _yielding(
+    wrench_at: Mapping[str, Sequence[Array]], effect: LoadResponse, grams: Grams, where: str
+) -> Tried | None:
+    """Base or link by force and moment of the load, about the axes of the springs there."""
+    base = grams.dataset.base
+    if where not in wrench_at:
+        return None
+    wrench = wrench_at[where]
+    turned = as_placed(base.model, base.x).model.nominal.base_rotation
+    R = np.eye(3) if where != "base" or turned is None else turned
+    largest = [float(np.abs(part).max()) or 1.0 for part in wrench]
+    D = np.zeros((*wrench[0].shape[:2], 6, 6))
+    for own, part, most in zip((slice(3), slice(3, 6)), wrench, largest, strict=True):
+        D[:, :, own, own] = R * (part @ R)[:, :, None, :] / most * MOTION
+    settings = zip((s.key for s in effect.constants[1:]), largest, strict=True)
+    entry = BaseMotion() if where == "base" else LinkFrame()
+    block = Generic("", effect.name, where, effect.stage, (entry.name, (where,)), D)
+    return block, dict(settings), 0.0
+
+
+def _as_component(
+    dataset: DiagnosisData, effect: Effect, block: Generic, settings: dict[str, float],
+    search: float,
+) -> Component:  # fmt: skip
+    model = dataset.base.model
+    return Component(
+        family_of(effect, model.cell), effect, block.where,
+        packed_columns(dataset, Item(block, np.zeros(0), 0.0)), settings=tuple(settings.items()),
+        search=search, fellows=len(effect.places(model.chain, model.cell)),
     )  # fmt: skip

@@ -13,15 +13,12 @@ from scipy.special import expit
 
 from elastocal.diagnosis.baseline import from_centre, prior_deviations
 from elastocal.diagnosis.component_families import (
-    FEW_POSES,
     catalogue_components,
     drifts,
     family_of,
     joint_curves,
-    line_families,
-    sharpened,
     shorter,
-    with_scatter,
+    without_a_name,
 )
 from elastocal.diagnosis.components import (
     SOME,
@@ -35,12 +32,19 @@ from elastocal.diagnosis.components import (
     posed,
     presence_cost,
 )
-from elastocal.diagnosis.corrections import without_a_name
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together, possible
-from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
+from elastocal.diagnosis.lines import (
+    FEW_POSES,
+    families_of,
+    line_families,
+    order_posterior,
+    ripples,
+    sharpened,
+    with_scatter,
+)
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,

@@ -40,8 +40,7 @@ from elastocal.diagnosis.hypotheses import (
 from elastocal.diagnosis.model_set import with_likelier_backlash_model
 from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
-from elastocal.diagnosis.shrinkage import first_steps
-from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor
+from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, first_steps, noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
     FewAnswer,
@@ -266,8 +265,8 @@ def _diagnosed(
     tests = structure_tests(found.first)
     if not whole and (settled := search.settled(found)) is not found:
         found, few = settled, FewAnswer.of(dataset, settled, rng)
-    answer = whole or replace(few, corrections=fields)
-    answers = _pieces(answer, dataset, found.nothing.noise, tests)
+    answer = whole or few
+    answers = _pieces(answer, dataset, found.nothing.noise, tests, fields)
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
@@ -277,7 +276,7 @@ def _diagnosed(
         nothing = min(nothing, FALSE_SMOOTH)
     return Diagnosis(
         **answers,
-        candidates=candidates(dataset, found, few.judged),
+        candidates=candidates(dataset, few),
         structure=tests,
         probability_nothing=nothing,
         p_value=p,
@@ -343,9 +342,11 @@ def _sum_of_all(
 
 
 def _pieces(
-    answer: SumAnswer, before: DiagnosisData, noise: NoiseValues, tests: tuple[StructureTest, ...]
-) -> dict[str, Any]:
-    """What an answer fills of a diagnosis; `before` and its `noise` without further effects."""
+    answer: SumAnswer, before: DiagnosisData, noise: NoiseValues, tests: tuple[StructureTest, ...],
+    corrections: tuple[FoundEffect, ...],
+) -> dict[str, Any]:  # fmt: skip
+    """What an answer fills of a diagnosis; `before` and its `noise` without further effects, and
+    what corrects the arm where it has no name of its own for it."""
     first = first_steps(before, noise, answer.rng)
     steps = answer.budget(first)
     named = [step for step in steps if not step.step.startswith("unknown")]
@@ -371,7 +372,7 @@ def _pieces(
         "components": answer.components,
         "groups": answer.groups,
         # Beside few causes that explain it all, corrections without a name are not needed.
-        "fields": answer.fields if gap.open or unknown or answer.groups else (),
+        "fields": (corrections or answer.fields) if gap.open or unknown or answer.groups else (),
         "slight": answer.slight,
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -49,11 +49,6 @@ class Spectrum:
     lam: Array
     beta: Array
     flips: Array
-
-    @classmethod
-    def joined(cls, pieces: list[Spectrum]) -> Spectrum:
-        lam, beta, flips = zip(*((s.lam, s.beta, s.flips) for s in pieces), strict=True)
-        return cls(np.concatenate(lam), np.concatenate(beta), np.concatenate(flips, axis=1))
 
     @property
     def distance(self) -> Array:
@@ -289,11 +284,17 @@ class EntrySums:
         moved = vectors.T @ (H @ b)
         return float(b @ b + (moved**2 / np.maximum(left, ROUNDING)).sum())
 
-    def pieces(self, n: int, width: int) -> Iterator[slice]:
-        """Spans of n settings or blocks whose directions, of `width` columns each, are HELD
-        numbers."""
-        each = max(1, HELD // (self.b.size * width))
-        return (slice(k, k + each) for k in range(0, n, each))
+    def each(
+        self, n: int, width: int, directions: Callable[[slice], Array], threads: int = 1
+    ) -> Spectrum:
+        """Spectrum of n groups, for so many of which at a time `directions` are asked as are HELD
+        numbers, of `width` columns each."""
+        step = max(1, HELD // (self.b.size * width))
+        D = (directions(slice(k, k + step)) for k in range(0, n, step))
+        lam, beta, flips = zip(
+            *((s.lam, s.beta, s.flips) for s in ahead(self.driven, D, threads)), strict=True
+        )
+        return Spectrum(np.concatenate(lam), np.concatenate(beta), np.concatenate(flips, axis=1))
 
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
@@ -367,18 +368,14 @@ class Grams:
         """A block, or a hypothesis at every one of the `settings` (G, …), by default those of the
         search."""
         if isinstance(h, Generic):
-            if h.columns is not None:
-                return self._direct(h.columns)
-            assert h.entry is not None and h.direction is not None
-            return self.entry(h.entry).driven(h.direction[:, :, :, None, :])
+            return self._of_blocks([h])
         if not h.driven:
             return self._direct(self.dataset.packed(h, np.zeros(0)))
-        if settings is None:
-            settings = self.dataset.grids[h.key].values
-        sums = self.entry(h.entry_key(self.dataset.base.model))
-        pieces = sums.pieces(len(settings), len(h.parameters))
-        directions = (self.dataset.direction(h, settings[piece]) for piece in pieces)
-        return Spectrum.joined(list(ahead(sums.driven, directions, self.data.threads)))
+        tried = self.dataset.grids[h.key].values if settings is None else settings
+        sums, dataset = self.entry(h.entry_key(self.dataset.base.model)), self.dataset
+        return sums.each(
+            len(tried), h.width, lambda some: dataset.direction(h, tried[some]), self.data.threads
+        )
 
     def of_each(
         self, whats: Sequence[Hypothesis | Generic]
@@ -396,13 +393,15 @@ class Grams:
 
     def _of_blocks(self, blocks: Sequence[Generic]) -> Spectrum:
         """Of blocks that move one entry by as many functions, or of one block."""
-        if len(blocks) == 1 or blocks[0].entry is None:
-            return self.of(blocks[0])
-        sums = self.entry(blocks[0].entry)
+        entry, columns = blocks[0].entry, blocks[0].columns
+        if entry is None:
+            assert columns is not None
+            return self._direct(columns)
         functions = [b.direction for b in blocks if b.direction is not None]
-        pieces = sums.pieces(len(blocks), blocks[0].width)
-        directions = (np.stack(functions[piece], axis=3) for piece in pieces)
-        return Spectrum.joined(list(ahead(sums.driven, directions, self.data.threads)))
+        return self.entry(entry).each(
+            len(blocks), blocks[0].width, lambda some: np.stack(functions[some], axis=3),
+            self.data.threads,
+        )  # fmt: skip
 
     def _direct(self, columns: Array) -> Spectrum:
         return direct(self.data.masked(columns), self.at, self.flips)

@@ -27,11 +27,10 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import LARGEST_SET, SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, distances, fit_extended, settings_of
+from elastocal.diagnosis.model_set import Item, distances, fit_extended, settings_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.reading_faults import OutlierScreening
-from elastocal.diagnosis.shrinkage import Shrinkage
-from elastocal.diagnosis.stated_floor import each_left_out
+from elastocal.diagnosis.stated_floor import Shrinkage, each_left_out
 from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
@@ -46,54 +45,19 @@ SET = 0.95  # probability that the named set holds, as far as so many can
 TOO_NEAR = 2.0
 TOO_NEAR_PROBABILITY = 0.89
 
-
-@dataclass(frozen=True)
-class Answer:
-    """`probability` of each item of the chosen set, and `rivals`: per item the other effects that
-    it may be instead, likeliest first, with their probabilities."""
-
-    verdict: Verdict
-    probability: tuple[float, ...]
-    rivals: tuple[tuple[tuple[Item, float], ...], ...]
-
-    @property
-    def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
-        return tuple(
-            tuple(EffectAt(*item.key) for item, _ in rivals)
-            for rivals in self.rivals
-            if len(rivals) > 1
-        )
+# An item and what it may be instead, the likeliest first, with their probabilities.
+Rivals = tuple[tuple[Item, float], ...]
 
 
-def judge(found: SelectedEffects) -> Answer:
-    """The verdict on what the search found."""
-    if not found.chosen.items:
-        return Answer("nothing_significant", (), ())
-    probability, rivals = [], []
-    for k, item in enumerate(found.chosen.items):
-        p, others = _of_item(found, k, item)
-        probability.append(p)
-        rivals.append(others)
-    if found.chosen.unknown:
-        verdict: Verdict = "unknown_effect"
-    elif all(len(r) == 1 for r in rivals):
-        verdict = "explained"
-    else:
-        verdict = "ambiguous"
-    return Answer(verdict, tuple(probability), tuple(rivals))
-
-
-def _of_item(
-    found: SelectedEffects, k: int, item: Item
-) -> tuple[float, tuple[tuple[Item, float], ...]]:
-    """Probability of item k, and it with those that it may be instead."""
-    slot = found.slots[k]
+def rivals_of(found: SelectedEffects, k: int) -> Rivals:
+    """Item k of what the search found and the other effects that it may be."""
+    slot, item = found.slots[k], found.chosen.items[k]
     each, nothing = slot.probabilities()
     # That there is something has been decided; now it is only what.
     each = each / (1 - nothing)
     own = next(i for i, other in enumerate(slot.items) if other.same_as(item))
     if not item.known:
-        return float(each[own]), ((item, float(each[own])),)
+        return ((item, float(each[own])),)
     near = distances(found.dataset, found.chosen, k, TOO_NEAR)[1]
     taken = {id(other.what) for other in found.chosen.items}
     same = [
@@ -124,10 +88,10 @@ def _of_item(
                 break
             chosen.append(int(i))
     chosen = [own, *sorted(chosen[1:], key=lambda i: -p[i])]
-    return float(p[own]), tuple((slot.items[i], float(p[i])) for i in chosen)
+    return tuple((slot.items[i], float(p[i])) for i in chosen)
 
 
-# Where the gap lies: stage, place, and what the residual depends on, whatever the effect.
+# What the residual depends on, whatever the effect.
 
 
 def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
@@ -146,27 +110,6 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
 
 
-def location(found: SelectedEffects, tests: Sequence[StructureTest]) -> Location | None:
-    """Probabilities of stage and place, from all that could stand in the place of the unknown
-    effect, or of the first one found."""
-    items = found.chosen.items
-    if not items:
-        return None
-    own = next((k for k, item in enumerate(items) if not item.known), 0)
-    slot = found.slots[own]
-    each, _ = slot.probabilities()
-    stages: dict[str, float] = defaultdict(float)
-    places: dict[str, float] = defaultdict(float)
-    for item, p in zip(slot.items, each / max(float(each.sum()), 1e-300), strict=True):
-        stages[item.what.stage] += float(p)
-        places[item.what.where] += float(p)
-    what = items[own].what
-    by_stage, by_place = (
-        {key: p for key, p in each.items() if p > 1e-6} for each in (stages, places)
-    )
-    return Location.of(what.stage, what.where, by_stage, by_place, tests)
-
-
 # The shape of a dependence that has no name: the motion as a function of the covariate.
 
 MOST_CURVES = 3
@@ -175,52 +118,36 @@ TURNS = ((" rx", "rad"), (" ry", "rad"), (" rz", "rad"))
 COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # name and unit
 
 
-def curves_of(dataset: DiagnosisData, chosen: ModelSet) -> tuple[Curve, ...]:
-    """Curves of the unknown blocks that depend on one number, the largest components first."""
-    at = chosen.at
-    out: list[Curve] = []
-    for item, span in zip(chosen.items, chosen.spans, strict=True):
-        block = item.what
-        if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
-            continue
-        assert block.direction is not None
-        x, direction = block.source.values[dataset.present], block.direction[dataset.present]
-        motion = direction @ at.beta[span]  # (visits, d)
-        deviation = np.linalg.norm(direction @ at.beta_deviation.T[span], axis=2)
-        _, order = np.unique(x, return_index=True)
-        largest = np.argsort(-(motion.std(axis=0) / deviation.mean(axis=0)))
-        for k in largest[:MOST_CURVES]:
-            name, unit = COMPONENTS[motion.shape[1]][k]
-            y = motion[order, k]
-            xyd = (tuple(v.tolist()) for v in (x[order], y - y.mean(), deviation[order, k]))
-            entry = f"{block.where}{name}"
-            out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
-    return tuple(out)
-
-
 @dataclass(frozen=True)
 class FewAnswer(SumAnswer):
-    """The pieces of a diagnosis that the few causes fill which the forward search `selected`;
-    `corrections` without a name are those of the sum of all that may act."""
+    """The pieces of a diagnosis that the few causes fill which the forward search `selected`."""
 
     selected: SelectedEffects
-    judged: Answer
-    corrections: tuple[FoundEffect, ...] = ()
 
     @classmethod
     def of(
         cls, before: DiagnosisData, selected: SelectedEffects, rng: np.random.Generator
     ) -> FewAnswer:
-        found, judged = sum_of(selected.dataset, selected.chosen), judge(selected)
-        return cls(before, selected.dataset, found, (), rng, selected, judged)
+        found = sum_of(selected.dataset, selected.chosen)
+        return cls(before, selected.dataset, found, (), rng, selected)
+
+    @cached_property
+    def rivals(self) -> tuple[Rivals, ...]:
+        """Of each item of the chosen set."""
+        return tuple(rivals_of(self.selected, k) for k in range(len(self.selected.chosen.items)))
 
     @property
     def verdict(self) -> Verdict:
-        return self.judged.verdict
+        if not self.selected.chosen.items:
+            return "nothing_significant"
+        if self.selected.chosen.unknown:
+            return "unknown_effect"
+        return "ambiguous" if self.indistinguishable else "explained"
 
     @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
-        return self.judged.indistinguishable
+        several = (rivals for rivals in self.rivals if len(rivals) > 1)
+        return tuple(tuple(EffectAt(*item.key) for item, _ in rivals) for rivals in several)
 
     @property
     def _named(self) -> list[int]:
@@ -228,13 +155,9 @@ class FewAnswer(SumAnswer):
 
     @property
     def effects(self) -> tuple[FoundEffect, ...]:
-        items, p = self.selected.chosen.items, self.judged.probability
-        found = tuple(self._found_effect(*items[k].key, [k], p[k]) for k in self._named)
+        own = ((k, *self.rivals[k][0]) for k in self._named)
+        found = tuple(self._found_effect(*item.key, [k], p) for k, item, p in own)
         return beside_unknown(found) if self.selected.chosen.unknown else found
-
-    @property
-    def fields(self) -> tuple[FoundEffect, ...]:
-        return self.corrections
 
     @cached_property
     def _fitted(self) -> Projection:
@@ -298,7 +221,7 @@ class FewAnswer(SumAnswer):
             name = f"{c.where}.{p.key}"
             yield FittedParameter(name, self._refitted[name] + float(more), p.unit, float(s))
 
-    components = groups = slight = ()
+    components = groups = slight = fields = ()
 
     @property
     def unexplained(self) -> float:
@@ -315,10 +238,46 @@ class FewAnswer(SumAnswer):
         return max(shares)
 
     def location(self, tests: Sequence[StructureTest]) -> Location | None:
-        return location(self.selected, tests)
+        """Probabilities of stage and place, from all that could stand in the place of the unknown
+        effect, or of the first one found."""
+        items = self.selected.chosen.items
+        if not items:
+            return None
+        own = next((k for k, item in enumerate(items) if not item.known), 0)
+        slot = self.selected.slots[own]
+        each, _ = slot.probabilities()
+        stages: dict[str, float] = defaultdict(float)
+        places: dict[str, float] = defaultdict(float)
+        for item, p in zip(slot.items, each / max(float(each.sum()), 1e-300), strict=True):
+            stages[item.what.stage] += float(p)
+            places[item.what.where] += float(p)
+        what = items[own].what
+        by_stage, by_place = (
+            {key: p for key, p in each.items() if p > 1e-6} for each in (stages, places)
+        )
+        return Location.of(what.stage, what.where, by_stage, by_place, tests)
 
     def curves(self) -> tuple[Curve, ...]:
-        return curves_of(self.dataset, self.selected.chosen)
+        """Of the unknown blocks that depend on one number, the largest components first."""
+        chosen, present = self.selected.chosen, self.dataset.present
+        at, out = chosen.at, list[Curve]()
+        for item, span in zip(chosen.items, chosen.spans, strict=True):
+            block = item.what
+            if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
+                continue
+            assert block.direction is not None
+            x, direction = block.source.values[present], block.direction[present]
+            motion = direction @ at.beta[span]  # (visits, d)
+            deviation = np.linalg.norm(direction @ at.beta_deviation.T[span], axis=2)
+            _, order = np.unique(x, return_index=True)
+            largest = np.argsort(-(motion.std(axis=0) / deviation.mean(axis=0)))
+            for k in largest[:MOST_CURVES]:
+                name, unit = COMPONENTS[motion.shape[1]][k]
+                y = motion[order, k]
+                xyd = (tuple(v.tolist()) for v in (x[order], y - y.mean(), deviation[order, k]))
+                entry = f"{block.where}{name}"
+                out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
+        return tuple(out)
 
     def _named_steps(self) -> Iterator[tuple[str, list[int]]]:
         return ((self.selected.chosen.items[k].what.label, [k]) for k in self._named)
@@ -338,16 +297,15 @@ SUSPECT_SHARE = 0.05
 OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the reader is told
 
 
-def candidates(
-    dataset: DiagnosisData, found: SelectedEffects, answer: Answer
-) -> tuple[Candidate, ...]:
+def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
     """Every hypothesis with its probability: in the slot where it is likeliest."""
+    found = few.selected
     best: dict[tuple[str, str], Candidate] = {}
     distance = {
         h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
     }
     for k, slot in enumerate(found.slots):
-        rivals = answer.rivals[k] if k < len(answer.rivals) else ()
+        rivals = few.rivals[k] if k < len(few.rivals) else ()
         named = {id(item.what): p for item, p in rivals if item.known}
         each, _ = slot.probabilities()
         for item, p, score in zip(slot.items, each, slot.scores, strict=True):
@@ -402,8 +360,15 @@ def warnings(
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
             "other to be accidents; they were kept: look at them with `elastocal identify` first"
         )
-    if text := _undecided_backlash(found):
-        out.append(text)
+    named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
+             and i.what.name == Backlash.name]  # fmt: skip
+    if named and found.dataset.other_backlash > OPEN_BACKLASH:
+        places = " and ".join(named)
+        out.append(
+            f"hardly any reading shows whether the play of {places} follows the load alone or also "
+            "the last motion, so the error left at new poses is uncertain: measure poses in which "
+            f"the load hardly turns {places}, approached from both sides"
+        )
     if dataset.table.time is None:
         out.append(
             "without times no drift can be seen, and a jump only by the order of the rows: "
@@ -427,16 +392,3 @@ def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> boo
         subset(base.observed, good), residual, base.stated[good], len(base.x)
     )  # fmt: skip
     return single is None or single.above
-
-
-def _undecided_backlash(found: SelectedEffects) -> str:
-    named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
-             and i.what.name == Backlash.name]  # fmt: skip
-    if not named or found.dataset.other_backlash <= OPEN_BACKLASH:
-        return ""
-    places = " and ".join(named)
-    return (
-        f"hardly any reading shows whether the play of {places} follows the load alone or also the "
-        "last motion, so the error left at new poses is uncertain: measure poses in which the "
-        f"load hardly turns {places}, approached from both sides"
-    )
