@@ -16,7 +16,7 @@ from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
 from elastocal.model.chain import Chain
-from elastocal.model.rigid import nominal_flange, nominal_flanges
+from elastocal.model.rigid import nominal_flanges, nominal_frames
 from elastocal.model.urdf import read_urdf
 
 
@@ -67,7 +67,7 @@ def gravity_torques(chain: Chain, gravity: np.ndarray):
     V = ca.SX(0)
     for i, body in enumerate(chain.masses):
         upto = Chain("part", chain.joints[: i + 1], np.eye(4))
-        T = nominal_flange(upto, q[: i + 1])
+        T = nominal_frames(upto, q[: i + 1], ca.SX.eye(4))[-1]
         V -= body.mass * ca.dot(ca.DM(gravity), T[:3, :3] @ ca.DM(body.com) + T[:3, 3])
     return ca.Function("tau", [q], [ca.gradient(V, q)])
 

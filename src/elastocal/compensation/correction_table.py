@@ -114,6 +114,7 @@ def correction_table(
     Beside singular postures and limits, where q_c is far from the nominal command or beyond
     reach, it is the tool's error there with its sign changed (FIRST_ORDER).
     """
+    from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
     arm = lasting(arm)[0]
@@ -132,7 +133,11 @@ def correction_table(
             some = some[np.argsort(some[:, 0])]
             near = result.nominal[0]
         check = compensate(arm, _targets(grid, some, force), point, near, seed)
-        before, between = _with_table(tool, check, _interpolated(grid, points, correction, some))
+        wide = [k for k, axis in enumerate(grid.axes) if len(axis) > 1]
+        values = correction[np.lexsort(points.T[::-1])]
+        values = values.reshape(*(len(grid.axes[k]) for k in wide), 6)
+        follow = RegularGridInterpolator([grid.axes[k] for k in wide], values)
+        before, between = _with_table(tool, check, follow(some[:, wide]))
     told: tuple[str, ...] = ()
     if status.count(EXACT) < len(status) / 2:
         told = (_mostly_inexact(arm, grid, status, point, force, seed),)
@@ -242,18 +247,6 @@ def _with_table(
         off = _between(_achieved(tool, check, joints), aimed)[known]
         errors.append(np.column_stack([np.linalg.norm(off[:, k : k + 3], axis=1) for k in (0, 3)]))
     return errors[0], errors[1]
-
-
-def _interpolated(grid: CorrectionGrid, points: Array, correction: Array, where: Array) -> Array:
-    from scipy.interpolate import RegularGridInterpolator
-
-    order = np.lexsort(points.T[::-1])
-    shape = tuple(len(axis) for axis in grid.axes)
-    values = correction[order].reshape(*shape, 6)
-    wide = [k for k, size in enumerate(shape) if size > 1]
-    values = values.reshape(*(shape[k] for k in wide), 6)
-    follow = RegularGridInterpolator([grid.axes[k] for k in wide], values)
-    return np.asarray(follow(where[:, wide]))
 
 
 # As the command line states and writes them.

@@ -134,12 +134,12 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     for name in stated:
         # Values that no physical spring or body has stay out, with the reason.
         args = full.values, full.model.chain, full.model.cell
-        reason = CATALOGUE[name].unphysical(*args) if elastic and name in full.effects else ""
+        reason = CATALOGUE[name].unphysical(*args) if elastic else ""
         if format in CATALOGUE[name].formats and not reason:
             kept.append(name)
         else:
             without = arm_with(calibrated, set(stated) - {name})
-            omissions.append(Omission(name, reason or "", without))
+            omissions.append(Omission(name, reason, without))
     for name, needs in unstated.items():
         if needs:
             missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
@@ -653,8 +653,7 @@ def _fitted(
     curves = _Curves(rows, kept.conditions.visits.q) if correct else None
     asked = np.array(sorted({*fit, *turns}), dtype=np.int64)
     size = curves.count if curves else 0
-    lower = [model.parameters[k].lower for k in fit]
-    least = np.array([*(-np.inf if low is None else low for low in lower), *[-np.inf] * size])
+    least = np.array([*(model.parameters[k].lower for k in fit), *[-np.inf] * size])
     u = np.concatenate([x[fit], np.zeros(size)])
     first, sizes, correction = u.copy(), np.zeros(0), start
     for _ in range(STEPS):

@@ -18,7 +18,7 @@ from elastocal.export.exportable import ExportNumbers, nothing, numbers, placed_
 from elastocal.export.rigid_files import PREFIX, tool_frames
 from elastocal.files import read_bytes
 from elastocal.model.arm import Spring
-from elastocal.model.chain import Chain, Joint, LinkMass
+from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, transform
@@ -73,8 +73,12 @@ def calibrated_mjcf(
     actuators = ET.Element("actuator")
     body = _body(world, "base", pieces.T_tracker_base if base_frame else np.eye(4))
     _passive(body, pieces.springs_at("base"))
+    names = [joint.name for joint in chain.joints]
+    taken = any(re.match("spring_|load_[xyz]$", name) for name in names)
+    if taken or len(set(names)) < len(names):  # those that stand for others
+        names = [f"joint{i}" for i in range(1, chain.n_joints + 1)]
     before: dict[Spring, float] = {}
-    for i, (joint, name) in enumerate(zip(chain.joints, motor_names(chain), strict=True)):
+    for i, (joint, name) in enumerate(zip(chain.joints, names, strict=True)):
         offset, T = pieces.offset_motion(i), pieces.placement(i)
         if before:  # on a body of their own: MuJoCo takes six joints at most in one
             body, T = _body(body, f"link{i}_end", T), np.eye(4)
@@ -105,7 +109,16 @@ def calibrated_mjcf(
             )  # fmt: skip
     flange = _body(body, "flange", pieces.links[-1])
     _passive(flange, before)
-    _sites_and_load(flange, actuators, pieces)
+    placed = {"flange": np.eye(4), "load_point": pose_at(pieces.load_point)}
+    placed |= {f"marker_{name}": T for name, T in pieces.markers.items()}
+    for name, T in placed.items():
+        ET.SubElement(flange, "site", placed_body(name, T))
+    # Forces along the tracker's axes, which keep their direction while the arm moves.
+    for axis, unit in zip("xyz", np.eye(3, 6), strict=True):
+        ET.SubElement(
+            actuators, "motor", name=f"load_{axis}", site="load_point", refsite="tracker_axes",
+            gear=numbers(pieces.load_scale * unit),
+        )  # fmt: skip
     root.append(actuators)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
@@ -146,14 +159,6 @@ def _armature(stiffness: float) -> str:
     return repr(max(ARMATURE, ARMATURE_PER_STIFFNESS * stiffness))
 
 
-def motor_names(chain: Chain) -> list[str]:
-    """The names of joints and their actuators: the file's, but for those that stand for others."""
-    names = [joint.name for joint in chain.joints]
-    taken = any(re.match("spring_|load_[xyz]$", name) for name in names)
-    good = len(set(names)) == len(names) and not taken
-    return names if good else [f"joint{i}" for i in range(1, chain.n_joints + 1)]
-
-
 def _motor(
     body: ET.Element, actuators: ET.Element, joint: Joint, name: str, compliance: float
 ) -> None:
@@ -167,20 +172,6 @@ def _motor(
     if math.isfinite(joint.lower) and math.isfinite(joint.upper):
         drive |= {"ctrllimited": "true", "ctrlrange": numbers([joint.lower, joint.upper])}
     ET.SubElement(actuators, "position", drive)
-
-
-def _sites_and_load(flange: ET.Element, actuators: ET.Element, pieces: ExportNumbers) -> None:
-    """Flange, load point and markers; forces in N along the tracker's axes, which keep their
-    direction while the arm moves."""
-    placed = {"flange": np.eye(4), "load_point": pose_at(pieces.load_point)}
-    placed |= {f"marker_{name}": T for name, T in pieces.markers.items()}
-    for name, T in placed.items():
-        ET.SubElement(flange, "site", placed_body(name, T))
-    for axis, unit in zip("xyz", np.eye(3, 6), strict=True):
-        ET.SubElement(
-            actuators, "motor", name=f"load_{axis}", site="load_point", refsite="tracker_axes",
-            gear=numbers(pieces.load_scale * unit),
-        )  # fmt: skip
 
 
 def _compensate(

@@ -229,10 +229,12 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
 def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str]]:
     names, q = points.texts.get("configuration"), points.q
     if names is None:
-        known = Labels.of(map(tuple, q.tolist()))
-        _, first = np.unique(known.codes, return_index=True)
-        codes = joining.groups_alike(q[first], spread)
-        return [str(code + 1) for code in codes[known.codes]], []
+        known, codes, firsts = Labels.of(map(tuple, q.tolist())), list[int](), list[Array]()
+        for row in q[np.unique(known.codes, return_index=True)[1]]:
+            near = (np.abs(np.reshape(firsts, (-1, q.shape[1])) - row) <= spread).all(axis=1)
+            codes.append(int(np.argmax(near)) if near.any() else len(firsts))
+            firsts += [] if near.any() else [row]
+        return [str(codes[code] + 1) for code in known.codes], []
     known = Labels.of(names)
     low = np.full((len(known.names), q.shape[1]), np.inf)
     high = -low

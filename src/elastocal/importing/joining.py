@@ -319,18 +319,6 @@ def _over(q: Array, still: Array) -> NDArray[np.bool_]:
     return np.asarray((spread > still).any(axis=1))
 
 
-def groups_alike(q: Array, tolerance: Array) -> NDArray[np.int64]:
-    """(m,) codes by first appearance: rows of q (m, n) within `tolerance` (n,) of a group's first
-    row are of that group."""
-    codes, firsts = np.empty(len(q), dtype=np.int64), list[Array]()
-    for i, row in enumerate(q):
-        near = (np.abs(np.reshape(firsts, (-1, q.shape[1])) - row) <= tolerance).all(axis=1)
-        codes[i] = np.argmax(near) if near.any() else len(firsts)
-        if not near.any():
-            firsts.append(row)
-    return codes
-
-
 SHOWN = 8
 
 

@@ -137,7 +137,12 @@ def plausible(chain: Chain, source: object) -> Chain:
     """The chain of the file `source`, with limits that stand for none taken out and notes of what
     is doubtful."""
     _check_lengths(chain, source)
-    _check_masses(chain, source)
+    for i, body in enumerate(chain.masses, start=1):
+        for found, most, told in (
+            (body.mass, MAX_MASS, "kg is too heavy"),
+            (float(np.linalg.norm(body.com)), MAX_LENGTH, "m to the centre of mass is too far"),
+        ):
+            require(found <= most, f"{source}: {found:g} {told} for link {i}; correct it")
     joints = tuple(_limited(joint, f"{source}: joint '{joint.name}'") for joint in chain.joints)
     chain = replace(chain, joints=joints)
     return replace(chain, notes=(*chain.notes, *_doubts(chain)))
@@ -216,16 +221,6 @@ def _check_lengths(chain: Chain, source: object) -> None:
         f"{source}: the links are {whole * 1e3:.3g} mm long together, which no arm is; if its "
         "lengths are metres, state them so (DH table: d_m, a_m)",
     )
-
-
-def _check_masses(chain: Chain, source: object) -> None:
-    for i, body in enumerate(chain.masses, start=1):
-        offset = float(np.linalg.norm(body.com))
-        for found, most, told in (
-            (body.mass, MAX_MASS, "kg is too heavy"),
-            (offset, MAX_LENGTH, "m to the centre of mass is too far"),
-        ):
-            require(found <= most, f"{source}: {found:g} {told} for link {i}; correct it")
 
 
 def _limited(joint: Joint, where: str) -> Joint:

@@ -99,20 +99,26 @@ def read_dh(
             f"{path}: {len(moving)} rows below the header, one per joint; "
             f"{MIN_JOINTS} to {MAX_JOINTS} joints are supported"
         )
-    waiting = iter(_joint_names(table, moving))
-    joints, after, passed = [], [], np.eye(4)
+    names = [table.text(i, "joint") or f"joint{k}" for k, i in enumerate(moving, start=1)]
+    for i, name in zip(moving, names, strict=True):
+        if names.count(name) > 1:
+            raise InputError(f"{table.where(i, 'joint')}: '{name}' appears twice; rename one")
+    joints, after, passed = list[Joint](), list[Array](), np.eye(4)
     for i in range(len(table.row)):
-        T_before, T_after = _link(table, i, convention)
+        theta0, alpha, beta = (
+            _plausible(table, i, "angle", k) for k in ("theta0", "alpha", "beta")
+        )
+        d, a = (_plausible(table, i, "length", k) for k in ("d", "a"))
+        beta = 0.0 if math.isnan(beta) else beta
+        T_before, T_after = link(theta0, d, a, alpha, beta, convention)
         if i not in moving:
             passed = passed @ T_before @ T_after
             continue
         kind = _kind(table, i)
-        lower, upper = _limits(table, i, kind)
-        axis = _sign(table, i) * np.array(Z)
-        joints.append(Joint(next(waiting), kind, passed @ T_before, axis, lower, upper))
+        limits, axis = _limits(table, i, kind), _sign(table, i) * np.array(Z)
+        joints.append(Joint(names[len(joints)], kind, passed @ T_before, axis, *limits))
         passed = T_after
         after.append(T_after)
-    names = [joint.name for joint in joints]
     masses = () if masses_path is None else _masses(Path(masses_path), names, after)
     chain = Chain(path.stem, tuple(joints), passed, masses)
     return _closer(table, chain) if extent(chain) > MAX_LENGTH else chain
@@ -136,12 +142,6 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
         return check_columns(str(path), found, named, [(n,) for n in needed], f"a {what} needs")
 
     return read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
-
-
-def _link(table: RawTable, i: int, convention: str) -> tuple[Array, Array]:
-    theta0, alpha, beta = (_plausible(table, i, "angle", k) for k in ("theta0", "alpha", "beta"))
-    d, a = (_plausible(table, i, "length", k) for k in ("d", "a"))
-    return link(theta0, d, a, alpha, 0.0 if math.isnan(beta) else beta, convention)
 
 
 def link(
@@ -278,46 +278,33 @@ def _limits(table: RawTable, i: int, kind: JointKind) -> tuple[float, float]:
     return (-np.inf if math.isnan(lower) else lower, np.inf if math.isnan(upper) else upper)
 
 
-def _joint_names(table: RawTable, rows: Sequence[int]) -> list[str]:
-    names = [table.text(i, "joint") or f"joint{k}" for k, i in enumerate(rows, start=1)]
-    for i, name in zip(rows, names, strict=True):
-        if names.count(name) > 1:
-            raise InputError(f"{table.where(i, 'joint')}: '{name}' appears twice; rename one")
-    return names
-
-
 def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[LinkMass, ...]:
     """Masses by link, centres of mass taken from DH frame i to joint frame i."""
     table = _read(path, MASS_FAMILIES, ("link", "mass", "com"), "table of link masses")
+    numbered = [f"link{i}" for i in range(1, len(names) + 1)]
+    known = {f"{what}{i + 1}": i for what in ("link", "joint", "") for i in range(len(names))}
+    known |= {name: i for i, name in enumerate(names)}
     found: dict[int, LinkMass] = {}
     for k in range(len(table.row)):
-        i = _link_index(table, k, names)
+        text, i = table.text(k, "link"), known.get(table.text(k, "link"))
+        if i is None:
+            raise InputError(
+                f"{table.where(k, 'link')}: unknown link '{text}'"
+                f"{did_you_mean(text, (*numbered, *names))}; valid: {listed(numbered)} or the "
+                "joints' names"
+            )
         if i in found:
-            raise InputError(f"{table.where(k, 'link')}: '{table.text(k, 'link')}' appears twice")
+            raise InputError(f"{table.where(k, 'link')}: '{text}' appears twice")
         mass = dh_number(table, k, "mass", "mass")
         com = [dh_number(table, k, "com", f"com_{axis}") for axis in "xyz"]
         if mass < 0:
             raise InputError(f"{table.where(k, 'mass_kg')}: {mass:g} is negative; give 0 or more")
         found[i] = LinkMass(mass, (after[i] @ np.array([*com, 1.0]))[:3])
-    missing = [f"link{i + 1}" for i in range(len(names)) if i not in found]
-    if missing:
+    if missing := [link for i, link in enumerate(numbered) if i not in found]:
         raise InputError(
             f"{path}: no row for {listed(missing)}; give every link, with mass_kg 0 if it has none"
         )
     return tuple(found[i] for i in range(len(names)))
-
-
-def _link_index(table: RawTable, row: int, names: Sequence[str]) -> int:
-    text, numbers = table.text(row, "link"), range(1, len(names) + 1)
-    known = {f"{what}{i}": i - 1 for what in ("link", "joint", "") for i in numbers}
-    known |= {name: i for i, name in enumerate(names)}
-    if text in known:
-        return known[text]
-    numbered = [f"link{i}" for i in numbers]
-    raise InputError(
-        f"{table.where(row, 'link')}: unknown link '{text}'"
-        f"{did_you_mean(text, (*numbered, *names))}; valid: {listed(numbered)} or the joints' names"
-    )
 
 
 # Factory calibration of Universal Robots, in the two forms that users have.

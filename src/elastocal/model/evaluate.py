@@ -22,16 +22,6 @@ from elastocal.text import did_you_mean
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
 
 
-def _abs(x: Any) -> Any:
-    # On complex numbers the analytic continuation, so that complex steps stay derivatives.
-    return x * np.where(np.real(x) < 0, -1.0, 1.0) if np.iscomplexobj(x) else np.abs(x)
-
-
-def _if_else_zero(condition: Any, value: Any) -> Any:
-    # np.where and not a product: the branch not taken may be infinite or NaN.
-    return np.where(np.not_equal(condition, 0), value, 0.0)
-
-
 def _as_number(compare: Callable) -> Callable:
     return lambda *given: compare(*given) * 1.0
 
@@ -42,7 +32,10 @@ UNARY: dict[int, Any] = {
     ca.OP_ASIN: np.arcsin, ca.OP_ACOS: np.arccos, ca.OP_ATAN: np.arctan,
     ca.OP_SINH: np.sinh, ca.OP_COSH: np.cosh, ca.OP_TANH: np.tanh, ca.OP_INV: np.reciprocal,
     ca.OP_LOG1P: np.log1p, ca.OP_EXPM1: np.expm1, ca.OP_FLOOR: np.floor, ca.OP_CEIL: np.ceil,
-    ca.OP_ASSIGN: np.positive, ca.OP_FABS: _abs,
+    ca.OP_ASSIGN: np.positive,
+    # On complex numbers the analytic continuation, so that complex steps stay derivatives.
+    ca.OP_FABS: lambda x:
+        x * np.where(np.real(x) < 0, -1.0, 1.0) if np.iscomplexobj(x) else np.abs(x),
     ca.OP_SIGN: lambda x: np.sign(np.real(x)),
     ca.OP_TWICE: lambda x: 2.0 * x,
     ca.OP_NOT: _as_number(np.logical_not),
@@ -54,7 +47,9 @@ BINARY: dict[int, Any] = {
     ca.OP_LT: _as_number(np.less), ca.OP_LE: _as_number(np.less_equal),
     ca.OP_EQ: _as_number(np.equal), ca.OP_NE: _as_number(np.not_equal),
     ca.OP_AND: _as_number(np.logical_and), ca.OP_OR: _as_number(np.logical_or),
-    ca.OP_IF_ELSE_ZERO: _if_else_zero, ca.OP_COPYSIGN: np.copysign,
+    ca.OP_COPYSIGN: np.copysign,
+    # Not a product: the branch not taken may be infinite or NaN.
+    ca.OP_IF_ELSE_ZERO: lambda condition, x: np.where(np.not_equal(condition, 0), x, 0.0),
 }  # fmt: skip
 # CasADi's instructions, carried out on numpy arrays.
 #

@@ -106,8 +106,8 @@ class Reaching(BoundedSearch):
         super().__init__(lower, upper)
         self.goal = np.clip(position, -FARTHEST, FARTHEST)
         q = ca.SX.sym("q", chain.n_joints)
-        T = rigid.constant(np.eye(4) if T_data_base is None else T_data_base)
-        T = T @ rigid.nominal_flange(chain, q)
+        base = rigid.constant(np.eye(4) if T_data_base is None else T_data_base)
+        T = rigid.nominal_frames(chain, q, base)[-1]
         value = rigid.point(T, np.zeros(3) if point is None else point)
         self.oriented = rotation is not None
         if rotation is not None:

@@ -117,15 +117,11 @@ def nominal_frames(chain: Chain, q: ca.SX, base: ca.SX) -> list[ca.SX]:
     return [*frames[1:], frames[-1] @ constant(chain.flange_placement)]
 
 
-def nominal_flange(chain: Chain, q: ca.SX) -> ca.SX:
-    """T_base_flange (4, 4) of the nominal chain at joint values q (n,)."""
-    return nominal_frames(chain, q, ca.SX.eye(4))[-1]
-
-
 def nominal_flanges(chain: Chain, q: Array) -> Array:
     """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
     symbol = ca.SX.sym("q", chain.n_joints)
-    return np.asarray(BatchFunction([symbol], [nominal_flange(chain, symbol)])(q)[0])
+    flange = nominal_frames(chain, symbol, ca.SX.eye(4))[-1]
+    return np.asarray(BatchFunction([symbol], [flange])(q)[0])
 
 
 def reach_of(chain: Chain) -> float:

@@ -256,7 +256,29 @@ class Tree:
                 f"'{base}': {listed(link for link in self._below(base) if link != base)}"
             )
         for joint in joints:
-            _check_on_path(joint, f"{self.path}: joint '{joint.name}'")
+            where = f"{self.path}: joint '{joint.name}'"
+            bounded = joint.moves and joint.kind != "continuous"
+            lower, upper = joint.limit or (-math.inf, math.inf)
+            require(
+                joint.moves or joint.kind == "fixed",
+                f"{where} is {joint.kind} and lies between base and flange; only "
+                f"{', '.join(MOVING)} and fixed joints can, choose a base below it",
+            )
+            require(
+                joint.follows is None or not joint.moves,
+                f"{where} mimics '{joint.follows}' and lies between base and flange; coupled "
+                "joints are not supported there, remove <mimic> or choose another flange",
+            )
+            require(
+                joint.limit is not None or not bounded,
+                f'{where} is {joint.kind} without <limit>; add <limit lower="…" upper="…" '
+                'effort="0" velocity="0"/> or make it continuous',
+            )
+            require(
+                lower < upper or not bounded,
+                f"{where}: limits lower={lower:g}, upper={upper:g} leave no room to move; "
+                "lower must be below upper (a URDF takes 0 for one left out)",
+            )
         moving = self._moving(base, flange)
         names = listed(j.name or f"joint{k}" for k, j in enumerate(moving, start=1)) or "none"
         require(
@@ -304,31 +326,6 @@ class Tree:
             masses = tuple(LinkMass(float(m), s / m if m > 0 else np.zeros(3)) for m, s in both)
         end = T @ self.link_of(flange)[1]
         return Chain(self.name, tuple(joints), end, masses if mass.any() else ())
-
-
-def _check_on_path(joint: FileJoint, where: str) -> None:
-    require(
-        joint.moves or joint.kind == "fixed",
-        f"{where} is {joint.kind} and lies between base and flange; only {', '.join(MOVING)} and "
-        "fixed joints can, choose a base below it",
-    )
-    bounded = joint.moves and joint.kind != "continuous"
-    lower, upper = joint.limit or (-math.inf, math.inf)
-    require(
-        joint.follows is None or not joint.moves,
-        f"{where} mimics '{joint.follows}' and lies between base and flange; coupled joints "
-        "are not supported there, remove <mimic> or choose another flange",
-    )
-    require(
-        joint.limit is not None or not bounded,
-        f'{where} is {joint.kind} without <limit>; add <limit lower="…" upper="…" '
-        'effort="0" velocity="0"/> or make it continuous',
-    )
-    require(
-        lower < upper or not bounded,
-        f"{where}: limits lower={lower:g}, upper={upper:g} leave no room to move; "
-        "lower must be below upper (a URDF takes 0 for one left out)",
-    )
 
 
 # URDF

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar
 
 import casadi as ca
@@ -134,6 +133,7 @@ class GearRipple(GearHarmonic):
 
 
 MOST_LINES = 40
+WHOLE = 1e-9
 
 
 class GearSpectrum(DrivenEffect):
@@ -184,7 +184,9 @@ class GearSpectrum(DrivenEffect):
         whole = self.stated(place, chain, cell)[self.sized_by]
         lines, specs = self.lines(place, chain, cell), []
         for k, (order, sd) in lines.items():
-            size = whole / _multiple_of([other for other, _ in lines.values()], order)
+            # As many times the lowest line's order that it is a multiple of.
+            ratios = (order / other for other, _ in lines.values())
+            size = whole / max(round(r) for r in ratios if abs(r - round(r)) < WHOLE)
             parts = [("sin", size), ("cos", size)]
             parts += [("sin_shift", size * sd), ("cos_shift", size * sd)] if sd > 0 else []
             specs += [
@@ -201,15 +203,6 @@ class GearSpectrum(DrivenEffect):
                 turned = p[f"line_{k}_sin_shift"] * cosine - p[f"line_{k}_cos_shift"] * sine
                 u += (q - p["spectrum_centre_rad"]) * turned
         return u
-
-
-def _multiple_of(orders: Sequence[float], order: float) -> int:
-    """How many times the lowest of `orders` that it is a multiple of an order is."""
-    ratios = (order / other for other in orders)
-    return max((round(r) for r in ratios if abs(r - round(r)) < WHOLE), default=1)
-
-
-WHOLE = 1e-9
 
 
 class WristCoupling(DrivenEffect):
