@@ -14,7 +14,7 @@ from scipy import linalg
 from scipy.special import expit, softmax
 
 from elastocal.diagnosis.component_draws import drawn
-from elastocal.diagnosis.component_search import Rivals, exchanged, size_of_fellows
+from elastocal.diagnosis.component_search import exchanged, imitators, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
     FittedSum,
@@ -40,12 +40,12 @@ from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.stated_floor import (
     NEW_POSES,
-    Shrinkage,
     SupportedFloor,
     each_left_out,
     rms_with_interval,
     squared_lengths,
     supported_floor,
+    with_intervals,
 )
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.effects.base import Stage, index
@@ -333,11 +333,10 @@ class SumAnswer:
             if (c.family, c.where) == (family, where)
         ]  # fmt: skip
         everything = [*members, *hidden]
-        rms = np.sqrt(self.squares(everything))
-        low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
+        rms, _, rms_ci95 = with_intervals(np.sqrt(self.squares(everything)))
         return ComponentShare(
             family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
-            *self._share_with_ends(everything), float(np.median(rms)), (low95, high95),
+            *self._share_with_ends(everything), rms, rms_ci95,
             self._matters(members), any(c.named for c in chosen),
         )  # fmt: skip
 
@@ -354,8 +353,11 @@ class SumAnswer:
         chosen = [self.found.components[k] for k in members]
         places = tuple(sorted({c.where for c in chosen}))
         effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        share, fall = self._share_with_ends(self._of_kind(name)), self._reduction(members)
-        return EffectGroup(name, places, effects, *share, fall.reduction, fall.ci90)
+        share, (fall, ci90, _) = (
+            self._share_with_ends(self._of_kind(name)),
+            self._reduction(members),
+        )
+        return EffectGroup(name, places, effects, *share, fall, ci90)
 
     def _of_kind(self, name: str) -> list[int]:
         every = (*self.found.components, *self.hidden)
@@ -363,9 +365,7 @@ class SumAnswer:
 
     def _share_with_ends(self, members: Sequence[int]) -> tuple[float, Interval]:
         """Median and 90 % interval of a share."""
-        share = self.shares(members)
-        low, high = np.quantile(share, [0.05, 0.95]).tolist()
-        return float(np.median(share)), (low, high)
+        return with_intervals(self.shares(members))[:2]
 
     def _by(self, key: Callable[[Component], Any]) -> dict[Any, list[int]]:
         """The components' numbers by what `key` says of each; without those that it denies."""
@@ -389,7 +389,7 @@ class SumAnswer:
         uncertain = np.linalg.inv(self.at.P) - V
         return np.asarray(np.diagonal(uncertain, axis1=1, axis2=2)[self._rows])
 
-    def _reduction(self, members: Sequence[int]) -> Shrinkage:
+    def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls by these components.
 
         Before, the error is all that is not in the model; after, what is left of it beside the
@@ -404,7 +404,7 @@ class SumAnswer:
         part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
         # Draws about the mean already hold the error at the poses measured; at others it is more.
         after = after + min(part, 1.0) * float(self._uncertain.sum()) / self._readings
-        return Shrinkage.of(1 - np.sqrt(after / np.maximum(before, 1e-300)))
+        return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
     # Names.
 
@@ -412,7 +412,7 @@ class SumAnswer:
     def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
         """Of each named component that has a hypothesis the probability of what it may be: by the
         evidence, and by what is there already of each kind."""
-        out, sums = {}, Rivals(self.dataset, self.found)
+        out = {}
         places = Counter(h.effect.name for h in self.dataset.hypotheses)
         present = Counter(c.effect.name for c in self.found.components if c.hypothesis is not None)
 
@@ -421,10 +421,13 @@ class SumAnswer:
             return presence_cost(places[name], others) - presence_cost(places[name], others + 1)
 
         angular = {(c.effect.name, c.where) for c in self.found.components if _of_gear(c)}
-        for k, c in enumerate(self.found.components):
-            if c.hypothesis is None or c.settings:
-                continue
-            own, others = sums.of(k)
+        named = [
+            k for k, c in enumerate(self.found.components)
+            if c.hypothesis is not None and not c.settings
+        ]  # fmt: skip
+        for k, own, others in imitators(self.dataset, self.found, named):
+            c = self.found.components[k]
+            assert c.hypothesis is not None
             if _of_gear(c):
                 # Which harmonic of one joint's error it is decides nothing.
                 others = {

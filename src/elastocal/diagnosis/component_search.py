@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -97,7 +97,8 @@ def search_components(
         known = (replace(c, given=weighed and isinstance(c.effect, LinkWeights))
                  for c in catalogue_components(full))  # fmt: skip
         moving = () if ResidualField.name in without else drifts(full)
-        every = [*moving, *known, *_searched(full, chosen)]
+        searched = (i for i in chosen.items if i.known and len(i.settings))
+        every = [*moving, *known, *(_component(full, item) for item in searched)]
         curves = [] if JointCurve.name in without else list(joint_curves(full))
         others = _first(every)
         tried = [*curves, *others]  # one object, by which a sum knows what completed it
@@ -522,20 +523,17 @@ def evidence_beside(
     return Beside(found, [c.columns for c in components]).evidence(scales, scalings)
 
 
-class Rivals:
-    """What else could stand in a component's place."""
-
-    def __init__(self, dataset: DiagnosisData, found: FittedSum) -> None:
-        taken = {id(c.hypothesis) for c in found.components}
-        others = [h for h in dataset.hypotheses if not h.settings and id(h) not in taken]
-        self.keys = [h.key for h in others]
-        self.beside = Beside(found, [dataset.packed(h, np.zeros(0)) for h in others])
-        self.own = found.spans
-
-    def of(self, k: int) -> tuple[float, dict[tuple[str, str], float]]:
-        """Log evidence of component k over none in its place, and of every other hypothesis."""
-        own, *others = self.beside.evidence_instead(self.own[k])
-        return own, dict(zip(self.keys, others, strict=True))
+def imitators(
+    dataset: DiagnosisData, found: FittedSum, some: Sequence[int]
+) -> Iterator[tuple[int, float, dict[tuple[str, str], float]]]:
+    """Of some of the components the number, the log evidence over none in its place, and that of
+    every other hypothesis there."""
+    taken = {id(c.hypothesis) for c in found.components}
+    others = [h for h in dataset.hypotheses if not h.settings and id(h) not in taken]
+    beside = Beside(found, [dataset.packed(h, np.zeros(0)) for h in others])
+    for k in some:
+        own, *each = beside.evidence_instead(found.spans[k])
+        yield k, own, {h.key: evidence for h, evidence in zip(others, each, strict=True)}
 
 
 SWAPS = 4
@@ -547,12 +545,13 @@ def with_likelier_names(
     """The sum with another effect in the place of a single one, where that is more probable."""
     by_key = {c.hypothesis.key: c for c in components if c.hypothesis is not None}
     for _ in range(SWAPS):
-        rivals, better = Rivals(dataset, found), found
-        for k, c in enumerate(found.components):
-            if c.hypothesis is None or c.settings or c.given:
-                continue
-            rest = [*found.components[:k], *found.components[k + 1 :]]
-            own, others = rivals.of(k)
+        better = found
+        single = [
+            k for k, c in enumerate(found.components)
+            if c.hypothesis is not None and not (c.settings or c.given)
+        ]  # fmt: skip
+        for k, own, others in imitators(dataset, found, single):
+            c, rest = found.components[k], [*found.components[:k], *found.components[k + 1 :]]
             odds = {
                 key: evidence + log_odds(rest, by_key[key])
                 for key, evidence in others.items() if key in by_key
@@ -642,11 +641,6 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
         kept += possible(base.model, base.observed.table, CATALOGUE.keys() - {GearRipple.name})[0]
     more = judged_together(base.model, base.observed.table, without)
     return replace(dataset, hypotheses=(*kept, *more))
-
-
-def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
-    """What the forward search found at settings of its own."""
-    return [_component(dataset, item) for item in chosen.items if item.known and len(item.settings)]
 
 
 def _component(dataset: DiagnosisData, item: Item) -> Component:

@@ -39,7 +39,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.model_set import with_likelier_backlash_model
 from elastocal.diagnosis.noise_floor import NoiseValues
-from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
+from elastocal.diagnosis.reading_faults import screen_outliers
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, first_steps, noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
@@ -257,7 +257,7 @@ def _diagnosed(
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
-    dataset, search, found, screened = _searched(dataset, options, progress)
+    dataset, search, found, suspects = _searched(dataset, options, progress)
     rng = np.random.default_rng(options.seed)
     few = FewAnswer.of(dataset, found, rng)
     whole, nats, fields = _sum_of_all(few, options, progress)
@@ -284,7 +284,7 @@ def _diagnosed(
         warnings=(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
-            *warnings(dataset, found, screened, answer.found.noise),
+            *warnings(dataset, found, suspects, answer.found.noise),
         ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
@@ -379,9 +379,9 @@ def _pieces(
 
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, ForwardSelection, SelectedEffects, OutlierScreening]:
-    """What is missing, and the data without the faulty readings, which are sought twice: beside a
-    large effect nothing looks faulty, or the wrong readings do."""
+) -> tuple[DiagnosisData, ForwardSelection, SelectedEffects, BoolArray]:
+    """What is missing, the data without the faulty readings, which are sought twice, since beside
+    a large effect nothing looks faulty, or the wrong readings do, and suspects (N,) that stay."""
 
     def search_without(faulty: BoolArray) -> tuple[ForwardSelection, SelectedEffects]:
         good = dataset.without(faulty)
@@ -390,16 +390,16 @@ def _searched(
         return search, search.run()
 
     progress("noise floor")
-    screened = screen_outliers(dataset, dataset.data)
+    faulty, suspects = screen_outliers(dataset, dataset.data)
     progress("searching for what is missing")
-    search, found = search_without(screened.faulty)
+    search, found = search_without(faulty)
     if found.chosen.items:
-        before = screened.faulty
-        screened = screen_outliers(found.dataset, found.chosen.data.without(np.zeros_like(before)))
-        if (screened.faulty != before).any():
+        before, every = faulty, found.chosen.data.without(np.zeros_like(faulty))
+        faulty, suspects = screen_outliers(found.dataset, every)
+        if (faulty != before).any():
             progress("searching again without outliers")
-            search, found = search_without(screened.faulty)
-    return dataset.without(screened.faulty), search, found, screened
+            search, found = search_without(faulty)
+    return dataset.without(faulty), search, found, suspects
 
 
 def _check_enough(table: Measurements) -> None:

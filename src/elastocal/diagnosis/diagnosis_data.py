@@ -88,11 +88,6 @@ class DiagnosisData:
         return numbered(self.table.marker[self.lead], self.base.observed.load)
 
     @cached_property
-    def repeated(self) -> IntArray:
-        """The pose, marker and load of each observation (N,), numbered."""
-        return self.base.observed.place
-
-    @cached_property
     def visit_table(self) -> Measurements:
         """One row for each visit (C·v), the first of its readings."""
         return self.table.take(self.lead[np.maximum(self.blocks.example, 0)].ravel())

@@ -327,7 +327,7 @@ class ForwardSelection:
         slot, base = self._options(current, scanned), current.score
         best: ModelSet | None = None
         scores, close = slot.scores.copy(), self._close(slot, behind)
-        there = {k for k in close if any(slot.items[k].same_as(o) for o in current.items)}
+        there = {k for k in close if any(slot.items[k].what is o.what for o in current.items)}
         scores[list(there)] = -np.inf
         added = [k for k in close if k not in there]
         fits = self._with_each(current, [slot.items[k] for k in added])
@@ -389,9 +389,8 @@ class ForwardSelection:
                     current, changed = others, True
                     del slots[k]
                     continue
-                if best.score > current.score + 1e-6 and not best.items[-1].same_as(
-                    current.items[k]
-                ):
+                other = best.items[-1].what is not current.items[k].what
+                if other and best.score > current.score + 1e-6:
                     items = list(best.items)
                     items.insert(k, items.pop())
                     current = fit_set(self.dataset, tuple(items), best.noise)

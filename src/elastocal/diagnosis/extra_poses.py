@@ -4,35 +4,221 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 from itertools import count, islice
+from typing import Any
 
 import numpy as np
 
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
-from elastocal.diagnosis.discrimination import (
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.hypotheses import with_keys, with_recorded_drivers
+from elastocal.diagnosis.noise_floor import NoiseValues
+from elastocal.diagnosis.rivals import (
     APART_AT_LAST,
     Discrimination,
-    VisitPool,
-    discriminations_of,
-    draw_pool,
+    RivalSet,
+    Suspects,
+    as_diagnosed,
+    check_open,
     judged,
     pairs_of,
-    time_step,
     together,
-    visit_pool_of,
+    with_neighbours,
 )
-from elastocal.diagnosis.hypotheses import with_keys, with_recorded_drivers
-from elastocal.diagnosis.rivals import RivalSet, Suspects, check_open, with_neighbours
 from elastocal.errors import InsufficientDataError, option, require
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, visits, with_moves
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.planning.candidates import draw
 from elastocal.planning.execution import nearest_first
+from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import travel_times
+from elastocal.simulation import simulate
 from elastocal.text import counted
-from elastocal.units import Progress
+from elastocal.units import Array, BoolArray, Progress
+
+# What may be measured next: poses in all load states, from either side, at once or later.
+
+CANDIDATES, FEWEST_POSES = 256, 64
+NEWTON = 1.0  # forces are told apart to this
+RARE = 0.1  # share of the visits below which a load state is not asked for again
+
+
+@dataclass(frozen=True)
+class VisitPool:
+    """N candidates, each one pose with its side of approach and moment, in all load states.
+
+    `q` (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces`
+    (L, 3) N.  `table` holds their rows: candidate by candidate, load by load, marker by marker,
+    with the readings that the fitted model expects; those `hidden` (rows,) the tracker cannot make.
+    """
+
+    q: Array
+    approach: Array | None
+    time: Array | None
+    forces: Array
+    table: Measurements
+    hidden: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+def draw_pool(
+    model: Model, x: Array, table: Measurements, *, sides: bool, waits: bool, most: int, seed: int
+) -> VisitPool:
+    """Candidates that the cell's rules allow, after the campaign of `table`.
+
+    Some CANDIDATES, or `most` where memory is short, of FEWEST_POSES poses at least.  With
+    `sides` every pose comes twice, each joint from either side; with `waits` twice too: at once
+    and after as long as the campaign took.  Both only where the table has such a column.
+
+    Raises InsufficientDataError where no pose is feasible.
+    """
+    sides, waits = sides and table.approach is not None, waits and table.time is not None
+    rng = np.random.default_rng(seed)
+    forces = load_forces(table)
+    n = max(min(CANDIDATES, most) // (1 + sides) // (1 + waits), FEWEST_POSES)
+    cell, chain = model.cell, model.chain
+    if cell.model.compliance_levels and not cell.design.levels:
+        # A joint whose compliance is known at its levels only can be nowhere else.
+        spec = replace(cell.design, levels=cell.model.compliance_levels)
+        cell = replace(cell, design=spec)
+    q = draw(Feasibility(cell, chain), forces, n, seed).q
+    approach = time = None
+    if table.approach is not None:
+        approach = rng.choice([-1.0, 1.0], q.shape)
+        if sides:
+            q, approach = np.concatenate([q, q]), np.concatenate([approach, -approach])
+    if table.time is not None:
+        begin, step = table.time.max() + time_step(table), np.ptp(table.time)
+        time = np.full(len(q), begin)
+        if waits:
+            q, time = np.concatenate([q, q]), np.concatenate([time, time + step])
+            approach = None if approach is None else np.tile(approach, (2, 1))
+    return visit_pool_of(model, x, table, q, approach, time, forces)
+
+
+def visit_pool_of(
+    model: Model, x: Array, table: Measurements, q: Array, approach: Array | None,
+    time: Array | None, forces: Array,
+) -> VisitPool:  # fmt: skip
+    """The pool of these candidates, read as the model at `x` would be."""
+    n, L, M = len(q), len(forces), len(table.marker_names)
+    candidate = np.repeat(np.arange(n), L * M)
+    known = len(table.configuration_labels)
+    rows = replace(
+        table.take(np.zeros(len(candidate), dtype=np.int64)),
+        row=np.zeros(len(candidate), dtype=np.int64),  # no line of any file
+        q=q[candidate],
+        configuration=known + candidate,
+        configuration_labels=table.configuration_labels + tuple(f"candidate {i}" for i in range(n)),
+        repeat=np.zeros(len(candidate), dtype=np.int64),
+        marker=np.tile(np.arange(M), n * L),
+        force=forces[np.tile(np.repeat(np.arange(L), M), n)],
+        approach=None if approach is None else approach[candidate],
+        time=None if time is None else time[candidate],
+    )
+    if table.temperature is not None:
+        rows = replace(rows, temperature=np.full(len(rows), np.median(table.temperature)))
+    if table.move is not None:
+        rows = with_moves(rows)  # from one candidate to the next, as good as any order
+    read = simulate(model, rows, x, 0, noise=False)
+    return VisitPool(q, approach, time, forces, read, _hidden(model, q, forces, table.marker_names))
+
+
+def _hidden(model: Model, q: Array, forces: Array, markers: tuple[str, ...]) -> BoolArray:
+    """(N·L·M,): the tracker does not see the marker of pose q (N, n) under that of `forces` (L, 3),
+    or for deflections under another of them."""
+    seen, stated = Feasibility(model.cell, model.chain).seen, list(model.cell.tool.markers)
+    if seen is None:
+        return np.zeros(len(q) * len(forces) * len(markers), dtype=bool)
+    own = [stated.index(name) for name in markers]
+    hidden = np.stack([~seen(q, force)[:, own] for force in forces], axis=1)
+    if model.observe == "deflection":
+        hidden |= hidden.any(axis=1, keepdims=True)
+    return hidden.ravel()
+
+
+def load_forces(table: Measurements) -> Array:
+    """The table's usual load states (L, 3) N; the mean load where every visit has its own."""
+    _, first = np.unique(visits(table), return_index=True)
+    force = table.force[first]
+    _, group, count = np.unique(
+        np.round(force / NEWTON), axis=0, return_inverse=True, return_counts=True
+    )
+    usual = np.flatnonzero(count >= RARE * len(force))
+    loaded, group = np.any(force != 0, axis=1), group.ravel()
+    if not len(usual) or (loaded.any() and not loaded[np.isin(group, usual)].any()):
+        return np.array([force[part].mean(axis=0) for part in (~loaded, loaded) if part.any()])
+    means = [force[group == k].mean(axis=0) for k in usual]
+    return np.array(sorted(means, key=lambda f: float(np.linalg.norm(f))))
+
+
+def time_step(table: Measurements) -> float:
+    assert table.time is not None
+    moments = np.unique(table.time)
+    return float(np.median(np.diff(moments))) if len(moments) > 1 else 0.0
+
+
+def joined(first: Measurements, second: Measurements) -> Measurements:
+    """Both tables' rows; the second's labels hold for both, its columns are the first's.
+
+    How the arm came to each visit follows from the order of them all.
+    """
+    first, known = replace(first, move=None, direction=None), first.move is not None
+    arrays: dict[str, Any] = {
+        f.name: np.concatenate([value, getattr(second, f.name)])
+        if isinstance(value, np.ndarray) else value
+        for f in fields(first)
+        if isinstance(value := getattr(first, f.name), np.ndarray) or value is None
+    }  # fmt: skip
+    table = replace(second, source=first.source, **arrays)
+    return with_moves(table) if known else table
+
+
+def with_pool(
+    base: Baseline, pool: VisitPool, suspects: Suspects
+) -> tuple[DiagnosisData, DiagnosisData, NoiseValues]:
+    """Columns of the data so far and of the pool at the fit, of the data alone, and the noise that
+    the diagnosis found; faulty readings and those of markers that are not seen left out.
+
+    Candidates are read as precisely as the same marker was on average.
+    """
+    table = base.observed.table
+    observed = observe(joined(table, pool.table), base.model.observe)
+    n, size, stated = len(base.observed.lead), observed.size, base.covariance
+    marker = table.marker[base.observed.lead]
+    usual = np.zeros((len(table.marker_names), size, size))
+    usual[:] = stated.mean(axis=0)
+    for k in np.unique(marker):
+        usual[k] = stated[marker == k].mean(axis=0)
+    later = observed.table.marker[observed.lead[n:]]
+    both = replace(
+        base, observed=observed, stated=np.concatenate([stated, usual[later]]),
+        residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
+    )  # fmt: skip
+    dataset, noise = as_diagnosed(diagnosis_data_of(both, suspects.hypotheses), suspects.diagnosis)
+    hidden = np.concatenate([np.zeros(len(table), dtype=bool), pool.hidden])[observed.lead]
+    dataset = dataset.without(dataset.data.faulty | hidden)
+    blocks, measured = dataset.blocks, len(np.unique(table.configuration[base.observed.lead]))
+    planned = np.isin(np.arange(blocks.n), blocks.member[measured:])
+    return dataset, dataset.without(planned | dataset.data.faulty), noise
+
+
+def discriminations_of(
+    base: Baseline, pool: VisitPool, suspects: Suspects, seed: int
+) -> list[Discrimination]:
+    dataset, so_far, noise = with_pool(base, pool, suspects)
+    sets = [*suspects.sets, *([suspects.unknown_set(so_far, noise)] if suspects.unknown else [])]
+    return [
+        Discrimination.of(dataset, so_far, noise, len(pool), s, np.random.default_rng(seed))
+        for s in sets
+    ]
+
 
 # The fewest candidates that tell the rivals apart: greedy addition, then exchange.
 #

@@ -100,10 +100,6 @@ class Hypothesis:
         return self.name, self.where
 
     @property
-    def choice(self) -> EffectChoice:
-        return EffectChoice(*self.key)
-
-    @property
     def driven(self) -> bool:
         return isinstance(self.effect, DrivenEffect)
 
@@ -202,17 +198,16 @@ def recorded(table: Measurements, need: str) -> bool:
     if need == "load":
         return bool(np.any(table.force != 0))
     if need == "station":
-        return table.position is not None and not among(table.position[:, :2])
+        if table.position is None:
+            return False
+        # Who stands nearer to the middle of the points than the farthest of these stands where the
+        # arm reaches.
+        points = table.position[:, :2]
+        middle = points.mean(axis=0)
+        farthest = np.linalg.norm(points - middle, axis=1).max()
+        return bool(np.linalg.norm(middle) >= farthest)
     values = getattr(table, need)
     return values is not None and bool(np.any(values != values[:1]))
-
-
-def among(points: Array) -> bool:
-    """Whether the origin is nearer to the middle of points (n, 2) than the farthest of these: who
-    stands there stands where the arm reaches."""
-    middle = points.mean(axis=0)
-    farthest = np.linalg.norm(points - middle, axis=1).max()
-    return bool(np.linalg.norm(middle) < farthest)
 
 
 # What the table records decides how some effects are driven.
@@ -388,15 +383,9 @@ MOST_STEPS = 40  # of the refinement
 SAME = 0.05  # of χ²: a difference that is none
 
 
-@dataclass(frozen=True)
-class Tangent:
-    """Columns (n_rows, size, k) of an effect about a start that it proposes, at the amplitude that
-    the residual asks for; its parameters `at` (k,) there, and what is `left` of the residual's sum
-    of squares."""
-
-    at: Array
-    columns: Array
-    left: float
+# Of an effect about a start that it proposes, at the amplitude that the residual asks for: its
+# parameters (k,), their columns (n_rows, size, k), and what is left of the residual's squares.
+Tangent = tuple[Array, Array, float]
 
 
 def with_tangents(
@@ -418,11 +407,11 @@ def with_tangents(
             continue
         search = StartSearch.of(full, h, base, x, B)
         if search.screened is None:
-            best = min(search.tangents(), key=lambda tangent: tangent.left)
+            best = min(search.tangents(), key=lambda tangent: tangent[2])
         else:
             best, shares[h.key] = next(search.tangents()), search.screened[1]
         x = x.copy()
-        B[:, :, own], x[own] = best.columns, best.at
+        x[own], B[:, :, own], _ = best
     return B, x, shares
 
 
@@ -467,11 +456,6 @@ class StartSearch:
         X = np.vstack([X, np.eye(X.shape[1])])
         return cls(full, h, base, x, part, rows, whitening, X, r)
 
-    def seen(self, columns: Array) -> Array:
-        """Columns (rows, size, k) of the part's table as (equations, k)."""
-        C = (self.whitening @ self.part.apply(columns)).reshape(-1, columns.shape[2])
-        return np.vstack([C, np.zeros((self.X.shape[1], C.shape[1]))])
-
     @cached_property
     def starts(self) -> tuple[dict[str, float], ...]:
         model = self.base.model
@@ -490,7 +474,7 @@ class StartSearch:
         columns = self.full.regressor(table, at, np.array(own), observed).B
         columns = columns.reshape(len(table), observed.size, -1)
         columns[:, :, 0] = column
-        return Tangent(at[own], columns, float(left[0]))
+        return at[own], columns, float(left[0])
 
     def _amplitude(self, start: Mapping[str, float], table: Measurements) -> tuple[Array, Array]:
         """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
@@ -595,7 +579,8 @@ class StartSearch:
     def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
         """Of each of the columns (rows, size, k) by itself what it leaves of the residual's sum
         of squares (k,), its amplitude (k,), and itself of unit length beside the span (rows, k)."""
-        C = self.seen(columns)
+        C = (self.whitening @ self.part.apply(columns)).reshape(-1, columns.shape[2])
+        C = np.vstack([C, np.zeros((self.X.shape[1], C.shape[1]))])
         C -= self._span @ (self._span.T @ C)
         size = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
         C /= size
@@ -717,7 +702,7 @@ def _with_all(
     chain, cell = model.chain, model.cell
     spec = replace(
         cell.model,
-        effects=(*cell.model.effects, *(h.choice for h in direct)),
+        effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
         observe="position" if cell.model.observe == "deflection" else cell.model.observe,
         deflection_model="linear",
     )

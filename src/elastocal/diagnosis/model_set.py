@@ -54,17 +54,6 @@ class Item:
         """(effect, place); a block without a name is an unknown effect at its place."""
         return self.what.key
 
-    @property
-    def scales(self) -> Array:
-        return self.what.scales
-
-    @property
-    def width(self) -> int:
-        return self.what.width
-
-    def same_as(self, other: Item) -> bool:
-        return self.what is other.what
-
 
 @dataclass(frozen=True)
 class ModelSet:
@@ -99,7 +88,7 @@ class ModelSet:
 
     @property
     def spans(self) -> tuple[slice, ...]:
-        return spans_of([item.width for item in self.items], self.data.X.shape[2])
+        return spans_of([item.what.width for item in self.items], self.data.X.shape[2])
 
     def without(self, k: int) -> tuple[Item, ...]:
         return self.items[:k] + self.items[k + 1 :]
@@ -167,21 +156,15 @@ def _fitted(
 
 def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ...]) -> Array:
     """Of the coefficients of the data's columns and of the items'."""
-    own = [np.full(item.width, 1 / s**2) for item, s in zip(items, scales, strict=True)]
+    own = [np.full(item.what.width, 1 / s**2) for item, s in zip(items, scales, strict=True)]
     return np.concatenate([data.precision, *own])
 
 
 def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
-    spans = spans_of([item.width for item in items], len(at.beta))
-    bounded = [
-        span.start + k
-        for item, span in zip(items, spans, strict=True)
-        if isinstance(item.what, Hypothesis)
-        for k in np.flatnonzero(item.what.bounded).tolist()
-    ]
-    if not bounded:
-        return 0.0
-    return within_bounds((at.beta / np.linalg.norm(at.beta_deviation, axis=0))[bounded])
+    spans = spans_of([item.what.width for item in items], len(at.beta))
+    z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
+    own = zip((item.what for item in items), spans, strict=True)
+    return sum(within_bounds(z[s][h.bounded]) for h, s in own if isinstance(h, Hypothesis))
 
 
 def within_bounds(z: Array) -> float:
@@ -207,7 +190,7 @@ def _mixed_scales(
         return scales, weighted.marginal(data.precision)
     spent = 0.0
     for k, item in enumerate(items):
-        trials = [(*scales[:k], float(s), *scales[k + 1 :]) for s in item.scales]
+        trials = [(*scales[:k], float(s), *scales[k + 1 :]) for s in item.what.scales]
         each = np.array([weighted.marginal(_precision(data, items, t)) for t in trials])
         scales, top = trials[int(np.argmax(each))], float(each.max())
         spent += float(logsumexp(each)) - np.log(len(each)) - top
@@ -241,7 +224,7 @@ def _refined(
     grid = dataset.grids[what.key]
 
     def evidence(tried: Array) -> Array:
-        return grams.of(what, tried).evidence(item.scales)
+        return grams.of(what, tried).evidence(what.scales)
 
     settings, searched = item.settings, False
     widths = grid.step[grid.nearest(settings)]
@@ -398,7 +381,8 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
-    other = replace(dataset.base, model=under_other_backlash_model(model))
+    # From both to the load alone.
+    other = replace(dataset.base, model=with_keys(model, play_side=BY_LOAD))
     columns = replace(dataset.columns, base=other, rows=dataset.columns.rows.copy())
     for h, own in zip(play, columns_alone(other, play), strict=True):
         columns.rows[:, :, columns.places[h.key]] = own
@@ -408,11 +392,6 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     if there.score <= here.score + ALIKE:
         return replace(dataset, other_backlash=doubt(here, there))
     return replace(under_other, other_backlash=doubt(there, here))
-
-
-def under_other_backlash_model(model: Model) -> Model:
-    by_load = model.cell.model.play_side == BY_LOAD
-    return with_keys(model, play_side=BY_BOTH if by_load else BY_LOAD)
 
 
 def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:

@@ -21,7 +21,7 @@ from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
-from elastocal.diagnosis.discrimination import load_forces
+from elastocal.diagnosis.extra_poses import load_forces
 from elastocal.errors import InsufficientDataError, option
 from elastocal.errors import require as check
 from elastocal.identification.identify import identify

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import special
 from scipy.spatial import cKDTree
@@ -37,17 +35,9 @@ APART = 1e6  # deviations of a joint, between those that are no neighbours
 SEEN = 0.02  # share of an error's square below which the flange's own motion hides it
 
 
-@dataclass(frozen=True)
-class OutlierScreening:
-    """`faulty` (N,) readings, and `suspects` (N,) that were kept: too many, or too near each other
-    to be accidents of measuring."""
-
-    faulty: BoolArray
-    suspects: BoolArray
-
-
-def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening:
-    """The faulty ones among the readings of `data`, those of `dataset` with what was found beside.
+def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray, BoolArray]:
+    """The faulty ones (N,) among the readings of `data`, those of `dataset` with what was found
+    beside, and suspects (N,) that were kept: too many, or too near each other to be accidents.
 
     The noise is the usual one and not the fitted one, which faulty readings swell; the median of
     all sets its scale and their spread its tail, so that an effect still missing from the model
@@ -65,7 +55,7 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
         conspicuous |= suspect
         suspect &= ~in_a_run(dataset, suspect)
         now = suspect.copy()
-        for group in (blocks.visit, dataset.repeated):
+        for group in (blocks.visit, dataset.base.observed.place):
             worst = np.zeros(int(group.max()) + 1)
             np.maximum.at(worst, group, np.where(suspect, excess, 0.0))
             now &= excess == worst[group]
@@ -79,7 +69,7 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
         faulty[k] = excess_of(dataset, data.without(others))[k] > 1
     if faulty.mean() > MOST or not accidental(dataset, faulty):
         faulty[:] = False
-    return OutlierScreening(faulty, conspicuous & ~faulty)
+    return faulty, conspicuous & ~faulty
 
 
 def excess_of(dataset: DiagnosisData, data: NoisyData) -> Array:
@@ -102,7 +92,7 @@ def excess_of(dataset: DiagnosisData, data: NoisyData) -> Array:
     last = f"link{dataset.base.model.chain.n_joints}"
     moved = root @ blocks.unpack(dataset.entry(("link_frame", (last,))))[used]
     told = np.full(len(used), np.nan)
-    for group, shared in ((blocks.visit, moved), (dataset.repeated, root)):
+    for group, shared in ((blocks.visit, moved), (dataset.base.observed.place, root)):
         found, would, dof = _beside(group[used], shared, e, root @ error[..., None])
         for k in np.unique(dof[dof > 0]):
             mine = dof == k
@@ -123,7 +113,7 @@ def _unlike_neighbours(dataset: DiagnosisData, used: IntArray, error: Array, P: 
     the nearest poses, of the same marker and load, as if that were exact."""
     q = dataset.table.q[dataset.lead[used]]
     place = np.column_stack([q / np.maximum(q.std(axis=0), 1e-12), APART * dataset.kind[used]])
-    first = np.unique(dataset.repeated[used], return_index=True)[1]
+    first = np.unique(dataset.base.observed.place[used], return_index=True)[1]
     if len(first) <= NEIGHBOURS:
         return np.full(len(used), np.inf)
     distance, near = cKDTree(place[first]).query(place, k=NEIGHBOURS + 1)

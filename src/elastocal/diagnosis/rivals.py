@@ -1,35 +1,39 @@
-"""Who the rivals are: sets that a verdict cannot tell apart, and what may imitate them."""
+"""Who the rivals are, what may imitate them, and how far apart any visits would put them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, islice, permutations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import softmax
+from scipy import linalg, special
+from scipy.sparse.csgraph import connected_components
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.evidence import Grams, evidence_of
 from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
 from elastocal.diagnosis.model_set import (
+    PLAUSIBLE,
     Item,
     distances,
     fit_set,
     packed_columns,
     settings_to_try,
+    spans_of,
     with_items,
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.unknown import UNKNOWN_EFFECT, generic_blocks
-from elastocal.diagnosis.verdict import TOO_NEAR
+from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 # The noise that a diagnosis found, and the readings that it left out, in the campaign's terms.
 
@@ -167,7 +171,7 @@ class Suspects:
         grams = Grams(dataset, dataset.data, project(dataset.data, noise))
         evidence = np.array([float(grams.of(block).evidence()[0]) for block in blocks])
         best = np.argsort(-evidence, kind="stable")[:BLOCKS]
-        share = self.diagnosis.probability_unknown * softmax(evidence[best])
+        share = self.diagnosis.probability_unknown * special.softmax(evidence[best])
         keys = self._likeliest()
         return RivalSet.of(
             [*(items[k] for k in best), *(self.items[key] for key in keys)],
@@ -251,7 +255,7 @@ def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
         return []
     of = dataset.columns
     starts = StartSearch.of(of.full, what, of.base, of.x, of.rows).tangents()
-    return [dataset.pack(t.columns) * dataset.sizes_in(what, t.columns) for t in starts]
+    return [dataset.pack(C) * dataset.sizes_in(what, C) for _, C, _ in starts]
 
 
 # The settings with which one rival may imitate the others: its order, its time.
@@ -271,7 +275,7 @@ def alternatives(
 
     A signal is a rival's at its estimate; in `dataset` only the data so far count.
     """
-    widest = tuple(float(item.scales.max()) for item in rivals.beside)
+    widest = tuple(float(item.what.scales.max()) for item in rivals.beside)
     data = with_items(dataset, rivals.beside, widest)
     grams = []
     for item in rivals.rivals:
@@ -285,7 +289,7 @@ def alternatives(
 def _of_rival(
     dataset: DiagnosisData, rivals: tuple[Item, ...], b: int, grams: list[Grams]
 ) -> tuple[Item, ...]:
-    what, size = rivals[b].what, float(rivals[b].scales.max())
+    what, size = rivals[b].what, float(rivals[b].what.scales.max())
     others = [a for a in range(len(rivals)) if a != b]
     if not isinstance(what, Hypothesis) or not what.settings or not others:
         return ()
@@ -297,3 +301,242 @@ def _of_rival(
     evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]
     chosen = list(dict.fromkeys([*short.argmin(axis=1), *evenly]))[:SETTINGS]
     return tuple(replace(rivals[b], settings=tried[k]) for k in chosen)
+
+
+def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
+    """Schur complement of the nuisance in gram (w, w), and its inverse Gram (p, p)."""
+    factor = linalg.cho_factor(gram[:nuisance, :nuisance])
+    inverse = linalg.cho_solve(factor, np.eye(nuisance))
+    cross = gram[:nuisance, nuisance:]
+    return gram[nuisance:, nuisance:] - cross.T @ inverse @ cross, inverse
+
+
+# How far apart rivals are, and how probably the right one is named, after any set of visits.
+#
+# With W's nuisance columns X (prior precision Λ) and rival b's columns C_b (as large as the verdict
+# lets a rival be, s_b) eliminated, the signal C_a γ of rival a keeps the squared length
+#
+#     d²_ab(γ) = min_{β, η} |C_a γ − X β − C_b η|²_V⁻¹ + |β|²_Λ + |η|²/s_b² = γᵀ D_ab γ,
+#     D_ab = S_aa − S_ab (S_bb + I/s_b²)⁻¹ S_ba,
+#
+# with S the Schur complement of the nuisance in the Gram matrix and the smallest over the starts
+# from which b is sought: the T-criterion (Atkinson and Fedorov 1975), and twice the
+# Kullback-Leibler distance (López-Fidalgo et al. 2007).  γ is what the data so far leave of it:
+# draws from its posterior.  If a is at work, further visits that raise d² by δ² move the log odds
+# of a over b from where they stand, L_ab, by N(δ²/2, δ²), so that b wins with probability
+# Φ(−(L_ab + δ²/2)/δ).
+
+DRAWS = 32  # of each sign
+
+
+@dataclass(frozen=True)
+class Discrimination:
+    """One set of rivals to be told apart, with everything that judges a choice of candidates.
+
+    With whitened columns W, `known` (w, w) is WᵀV⁻¹W of the data so far with the nuisance's prior
+    precision, `pool` (N, m, w) V^−½W of each candidate.  The `nuisance` first columns are those of
+    the fitted parameters and of the effects beside the rivals.  Counted from there come each
+    rival's own, at `groups`, and at `alternatives` those with which it may imitate others instead:
+    at other settings or about other starts, each by itself.  `draws`: γ (draws, k) of each rival;
+    `before` (rivals, rivals, draws) d² in the data so far; `classes` (rivals,): those with the same
+    number are not asked to be told apart.
+    """
+
+    rivals: RivalSet
+    known: Array
+    pool: Array
+    nuisance: int
+    groups: tuple[slice, ...]
+    alternatives: tuple[tuple[slice, ...], ...]
+    draws: tuple[Array, ...]
+    before: Array
+    classes: IntArray
+
+    @classmethod
+    def of(
+        cls, dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, candidates: int,
+        rivals: RivalSet, rng: np.random.Generator,
+    ) -> Discrimination:  # fmt: skip
+        """Columns of the rivals whitened by V, the covariance of each configuration; of those of
+        the dataset the last are `candidates`."""
+        data, measured = dataset.data, len(dataset.data.X) - candidates
+        searched = alternatives(so_far, noise, rivals)
+        # What is beside counts by the widest size of its prior.
+        beside = [
+            packed_columns(dataset, item) * float(item.what.scales.max()) for item in rivals.beside
+        ]
+        others = [
+            [*(packed_columns(dataset, i) for i in items), *columns_of_starts(dataset, rival)]
+            for rival, items in zip(rivals.rivals, searched, strict=True)
+        ]
+        own = [packed_columns(dataset, rival) for rival in rivals.rivals]
+        own += chain.from_iterable(others)
+        fitted, n = data.X.shape[2], len(rivals.rivals)
+        nuisance = fitted + sum(C.shape[2] for C in beside)
+        W = np.concatenate([data.X, *beside, *own, data.r[:, :, None]], axis=2)
+        L = np.linalg.cholesky(data.V(noise))
+        white = np.linalg.solve(L, data.masked(W))
+        known = white[:measured].reshape(-1, W.shape[2])
+        gram = known.T @ known
+        gram[np.diag_indices(nuisance)] += np.append(data.precision, np.ones(nuisance - fitted))
+        widths = [C.shape[2] for C in own]
+        spans = spans_of(widths, sum(widths))
+        groups, rest = spans[:n], iter(spans[n:])
+        by = tuple(tuple(islice(rest, len(each))) or (groups[b],) for b, each in enumerate(others))
+        S = eliminated(gram, nuisance)[0]
+        draws = _posterior_draws(rivals, groups, S, rng)
+        start = cls(
+            rivals, gram[:-1, :-1], white[measured:, :, :-1], nuisance, groups, by,
+            draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n),
+        )  # fmt: skip
+        return replace(start, before=start._squared(S[None, :-1, :-1])[0])
+
+    @property
+    def open(self) -> bool:
+        return bool(np.any(self.classes != self.classes[0]))
+
+    def gram(self, chosen: Sequence[int]) -> Array:
+        """Gram matrix (w, w) of the data so far and the chosen candidates."""
+        H = self.pool[list(chosen)].reshape(-1, len(self.known))
+        return self.known + H.T @ H
+
+    def squared(self, gram: Array) -> Array:
+        """d² (rivals, rivals, draws) of every ordered pair; zero of a rival with itself."""
+        return self._squared(eliminated(gram, self.nuisance)[0][None])[0]
+
+    def squared_with_each(self, gram: Array) -> Array:
+        """d² (N, rivals, rivals, draws) with each candidate added to the visits behind `gram`.
+
+        A candidate's few rows H = [H_X, H_R] change S by EᵀK⁻¹E with E = H_R − H_X M⁻¹ M_XR and
+        K = I + H_X M⁻¹ H_Xᵀ (Woodbury), which spares an elimination for each.
+        """
+        p = self.nuisance
+        S, inverse = eliminated(gram, p)
+        H = self.pool
+        through = H[:, :, :p] @ inverse
+        E = H[:, :, p:] - through @ gram[:p, p:]
+        K = np.eye(H.shape[1]) + through @ H[:, :, :p].transpose(0, 2, 1)
+        return self._squared(S + E.transpose(0, 2, 1) @ np.linalg.solve(K, E))
+
+    def _squared(self, S: Array) -> Array:
+        n = len(self.draws)
+        out = np.zeros((len(S), n, n, 2 * DRAWS))
+        for a, b in permutations(range(n), 2):
+            of_a, g = self.groups[a], self.draws[a]
+            size = PLAUSIBLE * self.rivals.rivals[b].what.scales.max()
+            nearest = np.full((len(S), len(g)), np.inf)
+            for of_b in self.alternatives[b]:
+                tie = np.eye(of_b.stop - of_b.start) / size**2
+                taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
+                D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
+                nearest = np.minimum(nearest, ((g @ D) * g).sum(axis=2))
+            out[:, a, b] = np.maximum(nearest, 0.0)
+        return out
+
+    def gained(self, squared: Array) -> Array:
+        """δ² (…, rivals, rivals, draws)."""
+        return np.maximum(squared - self.before, 0.0)
+
+    def error_bound(self, squared: Array) -> Array:
+        """(…,) Σ_ab √(p_a p_b) E exp(−δ²_ab/8): Chernoff's bound of the pairs' errors, whose
+        largest term is that of the closest pair, and which is smooth where Φ is flat."""
+        p = self.rivals.probability
+        other = self.classes[:, None] != self.classes[None, :]
+        weight = np.sqrt(p[:, None] * p[None, :]) * other
+        bound = np.exp(-self.gained(squared) / 8).mean(axis=-1)
+        return np.asarray((weight * bound).sum(axis=(-2, -1)))
+
+    def probability(self, squared: Array) -> Array:
+        """(…,) probability of naming the right class, averaged over the right one and its size.
+
+        By the union bound over its rival classes, each as dangerous as its strongest
+        member; not below what naming the likeliest so far gives, which nobody has to give up.
+        While a pair is as near as the verdict calls alike, no odds name one of the two with more
+        than TOO_NEAR_PROBABILITY.
+        """
+        p = self.rivals.probability
+        odds = np.log(np.bincount(self.classes, p)[self.classes])
+        L = (odds[:, None] - odds[None, :])[..., None]
+        delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
+        beaten = special.ndtr(-(L + delta**2 / 2) / delta)
+        beaten = np.where(
+            squared < TOO_NEAR**2, np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY), beaten
+        )
+        lost = np.zeros(beaten.shape[:-2] + beaten.shape[-1:])
+        for k in np.unique(self.classes):
+            strongest = beaten[..., self.classes == k, :].max(axis=-2)
+            lost += strongest * (self.classes != k)[:, None]
+        named = (np.maximum(1 - lost, 0.0).mean(axis=-1) * p).sum(axis=-1)
+        return np.maximum(named, self.so_far)
+
+    @property
+    def so_far(self) -> float:
+        """Probability that the class of the likeliest rival is right."""
+        p = self.rivals.probability
+        return float(p[self.classes == self.classes[int(np.argmax(p))]].sum())
+
+    def distances(self, squared: Array) -> Array:
+        """d (rivals, rivals) of each unordered pair: the median size's, the nearer way round."""
+        d = np.sqrt(np.median(squared, axis=-1))
+        return np.minimum(d, d.T)
+
+
+def _posterior_draws(
+    rivals: RivalSet, groups: Sequence[slice], S: Array, rng: np.random.Generator
+) -> tuple[Array, ...]:
+    """γ (2·DRAWS, k) of each rival as if it were the one at work, antithetic about its estimate.
+
+    γ | data ~ N(mean, A⁻¹), A = S_aa + I/s², at the scale s of the size prior that explains the
+    data best; S's last row is that of the readings.
+    """
+    out = []
+    for item, of in zip(rivals.rivals, groups, strict=True):
+        lam, U = np.linalg.eigh(S[of, of])
+        lam = np.maximum(lam, 0.0)
+        beta = U.T @ S[of, -1]
+        each = [evidence_of(lam[None], beta[None], np.array([s]))[0] for s in item.what.scales]
+        precision = lam + 1 / item.what.scales[int(np.argmax(each))] ** 2
+        z = rng.normal(size=(DRAWS, len(lam))) / np.sqrt(precision)
+        out.append((beta / precision + np.concatenate([z, -z])) @ U.T)
+    return tuple(out)
+
+
+# Which rivals any poses can tell apart.
+
+# A pair that all candidates together would not tell apart with this probability is inseparable.
+HOPE = 0.9
+APART_AT_LAST = 2 * float(special.ndtri(HOPE))  # the distance that it takes
+
+
+def judged(
+    tasks: Sequence[Discrimination],
+) -> tuple[list[Discrimination], dict[tuple[str, str], float]]:
+    """Each set in classes that the whole pool could tell apart, and the pairs that it could not,
+    with their distance in all of it."""
+    out, hopeless = [], {}
+    for c in tasks:
+        d = c.distances(c.squared(c.gram(range(len(c.pool)))))
+        near = d < APART_AT_LAST
+        classes = connected_components(near, directed=False)[1].astype(np.int64)
+        out.append(replace(c, classes=classes))
+        names = c.rivals.names
+        for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
+            hopeless[names[a], names[b]] = float(d[a, b])
+    return out, hopeless
+
+
+def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
+    for k in np.unique(c.classes):
+        names = [name for name, own in zip(c.rivals.names, c.classes, strict=True) if own == k]
+        if len(names) > 1:
+            yield tuple(names)
+
+
+def pairs_of(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
+    out = []
+    for c in tasks:
+        before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))
+        names = c.rivals.names
+        for a, b in zip(*np.triu_indices(len(names), 1), strict=True):
+            out.append(RivalPair(names[a], names[b], float(before[a, b]), float(after[a, b])))
+    return tuple(out)

@@ -3,9 +3,8 @@ out of the fit."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse, special
@@ -15,6 +14,7 @@ from scipy.spatial import cKDTree
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.diagnosis import (
     FaultyReading,
+    Interval,
     Location,
     NearRepeats,
     NoiseFloor,
@@ -86,7 +86,7 @@ def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int
     """
     good, observed = ~dataset.data.faulty, dataset.base.observed
     values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
-    group = dataset.repeated[good]
+    group = observed.place[good]
     if come_back:
         order = np.argsort(dataset.moment[good], kind="stable")
         moved = np.diff(dataset.table.configuration[dataset.lead[good]][order], prepend=-1) != 0
@@ -430,33 +430,20 @@ def first_steps(
     """
     placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
-    for name, data in _fitted_steps(dataset):
-        left = left_out_residual(project(data, noise.of_instrument()))
-        steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
-    return steps
-
-
-def _fitted_steps(dataset: DiagnosisData) -> Iterator[tuple[str, NoisyData]]:
-    """The model's own effects, stage by stage, those of the later step held at nominal."""
+    # Stage by stage, effects of the later step held at nominal.
     data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
     stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
     for k, name in ((1, "geometry"), (2, "compliance")):
         if (stage == k).any():
             free = stage <= k
-            yield name, replace(data, X=data.X[:, :, free], precision=data.precision[free])
+            part = replace(data, X=data.X[:, :, free], precision=data.precision[free])
+            left = left_out_residual(project(part, noise.of_instrument()))
+            steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
+    return steps
 
 
-class Shrinkage(NamedTuple):
-    """Fraction by which the error at new poses falls: best value, `ci90` and `ci95`."""
-
-    reduction: float
-    ci90: tuple[float, float]
-    ci95: tuple[float, float]
-
-    @classmethod
-    def of(cls, drawn: Array) -> Shrinkage:
-        """The median and the intervals of draws (n,)."""
-        low95, low90, middle, high90, high95 = np.quantile(
-            drawn, [0.025, 0.05, 0.5, 0.95, 0.975]
-        ).tolist()
-        return cls(middle, (low90, high90), (low95, high95))
+def with_intervals(drawn: Array) -> tuple[float, Interval, Interval]:
+    """The median of draws (n,), and the 90 and 95 % intervals."""
+    ends = np.quantile(drawn, [0.025, 0.05, 0.5, 0.95, 0.975])
+    low95, low90, middle, high90, high95 = ends.tolist()
+    return middle, (low90, high90), (low95, high95)

@@ -18,6 +18,7 @@ from elastocal.diagnosis.diagnosis import (
     EffectAt,
     FittedParameter,
     FoundEffect,
+    Interval,
     Location,
     StructureTest,
     Untested,
@@ -29,12 +30,11 @@ from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, distances, fit_extended, settings_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
-from elastocal.diagnosis.reading_faults import OutlierScreening
-from elastocal.diagnosis.stated_floor import Shrinkage, each_left_out
+from elastocal.diagnosis.stated_floor import each_left_out, with_intervals
 from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
-from elastocal.units import Array
+from elastocal.units import Array, BoolArray
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -55,7 +55,7 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
     each, nothing = slot.probabilities()
     # That there is something has been decided; now it is only what.
     each = each / (1 - nothing)
-    own = next(i for i, other in enumerate(slot.items) if other.same_as(item))
+    own = next(i for i, other in enumerate(slot.items) if other.what is item.what)
     if not item.known:
         return ((item, float(each[own])),)
     near = distances(found.dataset, found.chosen, k, TOO_NEAR)[1]
@@ -172,7 +172,7 @@ class FewAnswer(SumAnswer):
         fitted = fit_extended(self.dataset, chosen, [chosen.items[k] for k in self._named])
         return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
 
-    def _reduction(self, members: Sequence[int]) -> Shrinkage:
+    def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls by these components.
 
         A configuration c that is left out of a fit is a new pose for it.  Before, the error there
@@ -183,7 +183,7 @@ class FewAnswer(SumAnswer):
             self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
             for predicted in self._predicted(members)
         )
-        return Shrinkage.of(1 - np.sqrt(after / np.maximum(before, 1e-300)))
+        return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
     @cached_property
     def _true(self) -> Array:
@@ -337,7 +337,7 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
 
 
 def warnings(
-    dataset: DiagnosisData, found: SelectedEffects, screened: OutlierScreening, noise: NoiseValues
+    dataset: DiagnosisData, found: SelectedEffects, suspects: BoolArray, noise: NoiseValues
 ) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
     out, data = [], found.chosen.data
@@ -352,11 +352,11 @@ def warnings(
             f"{faulty:.0%} of the readings disagree with all others and were left out; look for "
             "the cause before trusting the rest"
         )
-    kept = np.flatnonzero(screened.suspects)
-    if len(kept) > SUSPECT_SHARE * len(screened.suspects):
+    kept = np.flatnonzero(suspects)
+    if len(kept) > SUSPECT_SHARE * len(suspects):
         lines = dataset.table.row[dataset.lead[kept]]
         out.append(
-            f"{len(kept)} of {len(screened.suspects)} readings (lines {lines.min()} to "
+            f"{len(kept)} of {len(suspects)} readings (lines {lines.min()} to "
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
             "other to be accidents; they were kept: look at them with `elastocal identify` first"
         )
