@@ -283,8 +283,7 @@ def read_calibrated(
     places = (name.rpartition(".")[0] for name in held)
     markers = (place.removeprefix("marker:") for place in places if place.startswith("marker:"))
     model = Model(cell, tuple(dict.fromkeys(markers)), plugins=plugins or None)
-    _check_same(model, held, cell_path, result_path)
-    _check_robot(model, stated.nominal_flange, cell_path, result_path)
+    _check_same(model, held, stated.nominal_flange, cell_path, result_path)
     determined = tuple(stated.covariance_of)
     n, lacking = len(determined), (stated.predicted_new_poses_um or {}).get("lack_of_fit", 0.0)
     require(
@@ -347,20 +346,6 @@ def nominal_flange_rows(chain: Chain) -> list[list[float]]:
     return [[round(float(v), 9) + 0.0 for v in row] for row in T[:3]]
 
 
-def _check_robot(model: Model, stated: Array | None, cell: str | Path, result: str | Path) -> None:
-    """Results that state no nominal flange, as older ones, are believed."""
-    here = np.array(nominal_flange_rows(model.chain))
-    there = here if stated is None else stated
-    require(there.shape == here.shape, f"{result}: nominal_flange takes 3 rows; {ANEW}")
-    if np.abs(here - there).max() > SAME:
-        off = np.linalg.norm(here[:, 3] - there[:, 3])
-        raise InputError(
-            f"{result} was not identified with {cell}: the nominal robot is another one (with "
-            f"every joint at 0.5 rad the flange is {off * 1e3:.4g} mm away); give the cell that "
-            "identify was run with, or identify anew"
-        )
-
-
 def _read_result(path: Path) -> tuple[list[dict[str, Any]], _Result]:
     remedy = "give the file that identify wrote"
     result = read_json(path, "result of identify", MOST_BYTES, remedy)
@@ -400,19 +385,34 @@ def _left_open(
     return replace(stated, mixing=mixing, typical=typical)
 
 
-def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
+def _check_same(
+    model: Model, held: Mapping[str, float], stated: Array | None, cell: str | Path,
+    result: str | Path,
+) -> None:  # fmt: skip
+    """Results that state no nominal flange, as older ones, are believed."""
     absent = [name for name in model.names if name not in held]
     surplus = [name for name in held if name not in set(model.names)]
-    if absent or surplus:
+    told = [
+        f"{what} {', '.join(names[:4])}{' …' if len(names) > 4 else ''}"
+        for what, names in (("the result lacks", absent), ("the cell has no", surplus))
+        if names
+    ]
+    here = np.array(nominal_flange_rows(model.chain))
+    there = here if stated is None else stated
+    if not told:
+        require(there.shape == here.shape, f"{result}: nominal_flange takes 3 rows; {ANEW}")
+    if not told and np.abs(here - there).max() > SAME:
+        off = np.linalg.norm(here[:, 3] - there[:, 3])
         told = [
-            f"{what} {', '.join(names[:4])}{' …' if len(names) > 4 else ''}"
-            for what, names in (("the result lacks", absent), ("the cell has no", surplus))
-            if names
+            "the nominal robot is another one (with every joint at 0.5 rad the flange is "
+            f"{off * 1e3:.4g} mm away)"
         ]
-        raise InputError(
-            f"{result} was not identified with {cell}: {'; '.join(told)}; "
-            "give the cell that identify was run with"
-        )
+    remedy = "" if absent or surplus else ", or identify anew"
+    require(
+        not told,
+        f"{result} was not identified with {cell}: {'; '.join(told)}; give the cell that identify "
+        f"was run with{remedy}",
+    )
 
 
 # A calibrated arm cut down to some of its effects, what it is compared under, random poses.
@@ -431,10 +431,6 @@ class Conditions:
     temperature: float | None = None
     visits: MeasuredVisits | None = field(default=None, compare=False)  # rounded in files
 
-    def state(self, need: str) -> bool:
-        """Is what an effect needs ("time", "temperature", …) stated here?"""
-        return need not in RECORDED and getattr(self, need, 0.0) is not None
-
 
 def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[str, list[str]]:
     """By effect of the arm itself what it needs and the conditions do not state."""
@@ -442,7 +438,7 @@ def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[st
         name: [
             need
             for need in CATALOGUE[name].needed(calibrated.model.cell)
-            if not conditions.state(need)
+            if need in RECORDED or getattr(conditions, need, 0.0) is None
         ]
         for name in calibrated.effects
         if not CATALOGUE[name].of_the_measurement
@@ -512,15 +508,15 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
     if text is None:
         if cell.tool.load_point.any():
             return ToolPoint(cell.tool.load_point, None, "load point")
-        if len(markers) == 1:
-            return _marker(cell, next(iter(markers)))
-        raise InputError(
+        require(
+            len(markers) == 1,
             f"{cell.path or cell.name}: which point of the tool is to be at the targets? Give "
             f"{option('point')} with a marker ({listed(markers)}) or with x,y,z in m in the flange "
-            "frame, or state [tool] load_point_m"
+            "frame, or state [tool] load_point_m",
         )
+        text = next(iter(markers))
     if text in markers:
-        return _marker(cell, text)
+        return ToolPoint(markers[text], text, f"marker {text}")
     parts = text.split(",")
     if len(parts) == 1:
         raise InputError(
@@ -533,10 +529,6 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
             f"{option('point')}: '{text}' is more than 10 m from the flange; give x,y,z in m"
         )
     return ToolPoint(place, None, f"point {text} m in the flange frame")
-
-
-def _marker(cell: Cell, name: str) -> ToolPoint:
-    return ToolPoint(cell.tool.markers[name], name, f"marker {name}")
 
 
 def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array:

@@ -78,8 +78,9 @@ def read_dh(
     path: str | Path,
     convention: Convention = "standard",
     masses_path: str | Path | None = None,
+    ur_model: str | None = None,
 ) -> Chain:
-    """The chain of a DH table in CSV, one row per joint.
+    """The chain of a DH table in CSV, one row per joint, or of a factory calibration of a UR.
 
     Columns theta0_rad|deg, d_m|mm, a_m|mm, alpha_rad|deg; optional: beta_rad|deg, joint (name),
     type (revolute|prismatic, or fixed|base|tool|flange for a row that no joint moves), sign (1, or
@@ -90,8 +91,21 @@ def read_dh(
 
     Where axes are nearly parallel their common normal lies far away, and d of hundreds of metres
     cancel (factory calibrations): such frames are taken near the arm, see `near_the_arm`.
+
+    Of a `calibration.conf` or a YAML of `ur_calibration`, without limits and masses: `ur_model` is
+    whose nominal table a calibration.conf counts from; None: that of [DH] in the file, or in
+    urcontrol.conf beside it.
     """
     path = Path(path)
+    if (ending := path.suffix.lower()) in UR_ENDINGS:
+        told = f"{path}: takes no [robot] masses; state the arm as a DH table"
+        require(masses_path is None, told)
+        text = read_text(path, "robot's calibration", MOST_BYTES)
+        if ending == ".conf":
+            return _of_deviations(path, text, ur_model)
+        told = f"{path}: ur_model belongs to a calibration.conf; leave it out for YAML"
+        require(ur_model is None, told)
+        return _of_origins(path, text)
     table = read_dh_table(path)
     moving = [i for i in range(len(table.row)) if not _still(table, i)]
     if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
@@ -340,21 +354,6 @@ ALPHA = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 CONTROLLER = "urcontrol.conf"
 # Factory calibrations move the flange by millimetres, another robot's by 40 mm and more.
 FARTHEST = 0.03  # m
-
-
-def read_ur_table(path: Path, ur_model: str | None = None) -> Chain:
-    """The chain of a `calibration.conf` or of a YAML of `ur_calibration`; no limits, no masses.
-
-    `ur_model`: whose nominal table a calibration.conf counts from; None: that of [DH] in the file,
-    or in urcontrol.conf beside it.  Frames are taken near the arm, see `near_the_arm`.
-    """
-    text = read_text(path, "robot's calibration", MOST_BYTES)
-    if path.suffix.lower() == ".conf":
-        return _of_deviations(path, text, ur_model)
-    require(
-        ur_model is None, f"{path}: ur_model belongs to a calibration.conf; leave it out for YAML"
-    )
-    return _of_origins(path, text)
 
 
 def _of_deviations(path: Path, text: str, ur_model: str | None) -> Chain:

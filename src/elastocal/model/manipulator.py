@@ -487,28 +487,22 @@ def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
 
 def load_chain(cell: Cell) -> Chain:
     robot = cell.robot
-    path = robot.mjcf or robot.urdf or robot.dh
-    if path is None:
-        raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
     # Each reader loads what its kind of file needs.
     if robot.mjcf is not None:
         from elastocal.model.mjcf import read_mjcf
 
-        chain = read_mjcf(path, robot.base, robot.flange)
+        chain = read_mjcf(robot.mjcf, robot.base, robot.flange)
     elif robot.urdf is not None:
         from elastocal.model.urdf import read_urdf
 
-        chain = read_urdf(path, robot.base, robot.flange)
-    else:
-        from elastocal.model.dh import UR_ENDINGS, read_dh, read_ur_table
+        chain = read_urdf(robot.urdf, robot.base, robot.flange)
+    elif robot.dh is not None:
+        from elastocal.model.dh import read_dh
 
-        if path.suffix.lower() in UR_ENDINGS:
-            told = f"{path}: takes no [robot] masses; state the arm as a DH table"
-            require(robot.masses is None, told)
-            chain = read_ur_table(path, robot.ur_model)
-        else:
-            chain = read_dh(path, robot.dh_convention, robot.masses)
-    return plausible(chain, robot.masses or path)
+        chain = read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
+    else:
+        raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
+    return plausible(chain, robot.masses or robot.mjcf or robot.urdf or robot.dh)
 
 
 # The shrunk parameters of a model in groups: one for each smooth function, whose size is one.
