@@ -316,6 +316,7 @@ class JointMotion(Entry):
     """q_i ← q_i + u, in rad (m for a prismatic joint)."""
 
     name = "joint_motion"
+    stage: ClassVar[Stage] = "transmission"
     at = "joints"
     units = ("rad",)
 
@@ -327,6 +328,7 @@ class LinkLength(Entry):
     """Lengths of link i ← (1 + u) times themselves: its distal frame moves away from its own."""
 
     name = "link_length"
+    stage: ClassVar[Stage] = "geometry"
     at = "links"
     units = ("1",)
 
@@ -341,6 +343,7 @@ class LinkFrame(Entry):
     """T_link ← T_link · Trans(u₁, u₂, u₃) · exp([u₄, u₅, u₆]×) at the link's distal end."""
 
     name = "link_frame"
+    stage: ClassVar[Stage] = "geometry"
     at = "links"
     units = ("m", "m", "m", "rad", "rad", "rad")
 
@@ -356,6 +359,7 @@ class BaseMotion(Entry):
     """
 
     name = "base_motion"
+    stage: ClassVar[Stage] = "tracker"
     at = "base"
     units = ("m", "m", "m", "rad", "rad", "rad")
 
@@ -369,6 +373,7 @@ class MarkerMotion(Entry):
     """One marker moves by u (3,) in the flange frame."""
 
     name = "marker_motion"
+    stage: ClassVar[Stage] = "tool"
     at = "markers"
     units = ("m", "m", "m")
 
@@ -380,6 +385,7 @@ class LoadPointMotion(Entry):
     """The point where the load hangs moves by u (3,) in the flange frame."""
 
     name = "load_point_motion"
+    stage: ClassVar[Stage] = "load"
     at = "load"
     units = ("m", "m", "m")
 
