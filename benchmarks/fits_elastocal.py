@@ -15,9 +15,9 @@ from bench_tools import Clock
 
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.identification.solve import settle, sizes_and_check
+from elastocal.identification.solve import posed, settle
 from elastocal.identification.start import start_values
-from elastocal.identification.weighted_problem import Problem, Weights
+from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -28,8 +28,8 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
     observed = observe(table, model.observe)
     every = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
-    problem = Problem(model, observed, weights, start_values(model, table), every)
-    found, reduction, _ = settle(problem, sizes_and_check(problem))
+    problem = posed(model, observed, weights, start_values(model, table), every)
+    found, reduction, _ = settle(problem)
     found.cofactor()
     return found.x, len(reduction.kept)
 

@@ -56,7 +56,7 @@ def peak_of_a_pass(model, truth, observed):
     """Largest memory traced in a pass that evaluates and in one that leaves out, in bytes."""
     unit = Weights("none", None, False, "")
     columns, kept = np.arange(len(model.parameters)), np.arange(6)
-    problem = Problem(model, observed, unit, truth, columns)
+    problem = Problem(model, observed, unit, truth, columns, np.ones(len(truth)))
     assert len(problem.parts) > 1
     tracemalloc.start()
     r_factor = problem.evaluate(truth, columns).r_factor.of_columns(kept)

@@ -80,9 +80,9 @@ def fitted(model, y, start, sizes, sigma=None, known=None):
     observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), TABLE)
     whiten = None if sigma is None else sparse.csr_array(np.eye(n) / sigma)
     weights = Weights("test", whiten, sigma is not None, "")
-    problem = Problem(model, observed, weights, start, np.arange(p))
+    problem = Problem(model, observed, weights, start, np.arange(p), sizes)
     steps = {"max_steps": 2000, "tolerance": 1e-13, "known": known}
-    found = fit(problem, problem.free, start, sizes, **steps)
+    found = fit(problem, problem.free, start, **steps)
     variance = found.whitened @ found.whitened / max(n - p, 1)
     return found, np.sqrt(variance * np.diag(found.cofactor()))
 

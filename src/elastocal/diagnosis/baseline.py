@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.least_squares import TOLERANCE
-from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
+from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit
 from elastocal.identification.start import start_values
-from elastocal.identification.weighted_problem import Problem, stated_by_observation, weights_for
+from elastocal.identification.weighted_problem import stated_by_observation, weights_for
 from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -161,14 +161,13 @@ def fit_baseline(
     started = x0 is not None
     if x0 is None:
         x0 = start_values(model, table, seed)
-    problem = Problem(model, observed, weights, x0, free)
-    sizes = sizes_and_check(problem)
+    problem = posed(model, observed, weights, x0, free)
     placed, nominal = free[is_placed(model)], None
     if len(placed) and not started:
-        base = tied_fit(replace(problem, free=placed), sizes, PLACING)
+        base = tied_fit(replace(problem, free=placed), PLACING)
         problem, nominal = replace(problem, x0=base.x), base.residual
     if len(free):
-        found = tied_fit(problem, sizes, TOLERANCE)
+        found = tied_fit(problem, TOLERANCE)
         x, residual = found.x, found.residual
     else:
         x, residual = x0, problem.residual(x0)
@@ -176,7 +175,7 @@ def fit_baseline(
         unknown = np.full_like(residual, np.nan)
         nominal = unknown if started else problem.residual(problem.x0)
     stated = stated_by_observation(observed, model.cell.tracker)
-    return Baseline(model, observed, x, sizes, residual, nominal, stated)
+    return Baseline(model, observed, x, problem.sizes, residual, nominal, stated)
 
 
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough

@@ -339,7 +339,7 @@ def report_faulty(
     readings = linearised(problem.model, observed, clean.fit.x, columns)
     if residual is not None:
         readings = replace(readings, e=residual)
-    width = prior_widths(problem.model, clean.sizes)[columns]
+    width = prior_widths(clean.problem)[columns]
     B, e = readings.B.reshape(len(observed.value), -1) * width, readings.e.ravel()
     shared = noise is not None and (bool((noise.fit.common > 0).any()) or noise.lasting is not None)
     if noise is None:

@@ -63,6 +63,7 @@ from elastocal.identification.solve import (
     bent,
     chosen_again,
     fit_kept,
+    posed,
     residual_sigma,
     solve,
 )
@@ -194,7 +195,7 @@ def _solution(
 ) -> Solution:
     kind = "none" if options.method == "ols" else options.weights
     weights = weights_for(observed, model.cell.tracker, kind, options.covariance)
-    problem = Problem(model, observed, weights, x0, free)
+    problem = posed(model, observed, weights, x0, free)
     solution = solve(problem, progress, try_wider)
     if observed.kind == "pose" and weights.kind == "none" and kind == "auto":
         # Without stated noise, metres and radians get their relative weight from a first fit.
@@ -213,8 +214,8 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     if table.time is None and model.cell.model.clock == "rows":  # after the campaign
         table = replace(table, time=np.full(len(table), NEVER_YET))
     observed = observe(table, model.observe)
-    unit, every = Weights("none", None, False, ""), np.arange(len(model.parameters))
-    error = Problem(model, observed, unit, result.x, every).residual(result.x)
+    unit, x, every = Weights("none", None, False, ""), result.x, np.arange(len(model.parameters))
+    error = Problem(model, observed, unit, x, every, np.ones(len(x))).residual(x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
     errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
@@ -335,8 +336,7 @@ def _estimates(
     method: MethodResult, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     solution, model = method.solution, method.solution.problem.model
-    reduction, x, every_end = solution.reduction, solution.fit.x, method.ci95
-    std, dof = method.spread.std, method.spread.dof
+    reduction, x, dof = solution.reduction, solution.fit.x, method.spread.dof
     bends = bent(solution, method.spread.matrix)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
@@ -348,10 +348,7 @@ def _estimates(
 
     for k, c in enumerate(reduction.kept):
         parameter = model.parameters[c]
-        terms = reduction.terms(k, solution.sizes, std[k])
-        value = float(x[c])
-        ends = every_end[k]
-        spread, ci = reduction.widened(k, solution.sizes, std[k], value, ends, bends[k])
+        value, (terms, spread, ci) = float(x[c]), method.told(k, bends[k])
         for d in terms:
             partners[d].append(parameter.name)
         if terms:
@@ -486,7 +483,7 @@ def refined(
     observed = every.problem.observations
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
-    found = fit_kept(problem, start.sizes, x, start.reduction)
+    found = fit_kept(problem, x, start.reduction)
     return replace(start, fit=found)
 
 
@@ -601,14 +598,9 @@ def hardly_shown(found: MethodResult) -> dict[int, tuple[float, float]]:
     """The 95 % intervals, by parameter, of those fitted that reach beyond a physical bound and
     stand alone."""
     solution, reach = found.solution, {}
-    std, ends = found.spread.std, found.ci95
     for k, c in enumerate(solution.reduction.kept.tolist()):
-        p = solution.problem.model.parameters[c]
-        _, (low, high) = solution.reduction.widened(
-            k, solution.sizes, std[k], float(solution.fit.x[c]), ends[k]
-        )
-        beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
-        if beyond and not p.shrunk and not solution.reduction.terms(k, solution.sizes, std[k]):
+        p, (terms, _, (low, high)) = solution.problem.model.parameters[c], found.told(k)
+        if (low <= p.lower < np.inf or -np.inf < p.upper <= high) and not p.shrunk and not terms:
             reach[c] = (low, high)
     return reach
 
@@ -655,7 +647,7 @@ def _holding(
     x0[list(held)] = list(held.values())
     reduction = solution.reduction.without(lost)
     problem = replace(solution.problem, x0=x0)
-    fit = fit_kept(problem, solution.sizes, solution.fit.x, reduction)
+    fit = fit_kept(problem, solution.fit.x, reduction)
     if not fit.converged:
         return None
     solution = replace(solution, fit=fit, reduction=reduction)
@@ -739,7 +731,7 @@ def _published(course: Course, start: Solution) -> MethodResult:
     if method == "eq14":
         key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
         group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
-    size = start.sizes[fit.columns]
+    size = start.problem.sizes[fit.columns]
     last = published.eq14(fit.B * size, fit.residual, group)[-1]
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)

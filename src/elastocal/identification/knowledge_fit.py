@@ -119,7 +119,7 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     until the objective there is near what is allowed.  An end may also be where poses have no
     equilibrium any more.  Steps that do not settle lead to none.
     """
-    fit, limit, size = found.fit, found.objective + rise, found.fit.sizes[found.fit.columns]
+    fit, limit, size = found.fit, found.objective + rise, found.fit.problem.sizes[found.fit.columns]
     objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
     assert objective.limits is not None
     far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
@@ -176,11 +176,11 @@ def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntAr
     R = problem.evaluate(solution.fit.x, free).r_factor.R
     # An equality is exact: it counts as much as the most that anything else tells.
     A = A[:, free][A[:, free].any(axis=1)]
-    most = np.linalg.norm(np.vstack([R, P[:, free]]) * solution.sizes[free], axis=0).max()
-    A = A * most / np.linalg.norm(A * solution.sizes[free], axis=1)[:, None]
+    most = np.linalg.norm(np.vstack([R, P[:, free]]) * problem.sizes[free], axis=0).max()
+    A = A * most / np.linalg.norm(A * problem.sizes[free], axis=1)[:, None]
     rank = np.where(np.isin(free, kept), 0, np.where(np.isin(free, named), 1, 2))
     rows = np.vstack([R, P[:, free], A])
-    told = free[reduce(rows, solution.sizes[free], (), sigma, WORTH_A_COLUMN, rank).kept]
+    told = free[reduce(rows, problem.sizes[free], (), sigma, WORTH_A_COLUMN, rank).kept]
     unknown = [quoted(names[c]) for c in np.setdiff1d(np.intersect1d(tied, named), [*told, *known])]
     if unknown:
         raise InsufficientDataError(
@@ -284,9 +284,7 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     columns = fitted_columns(solution, whole, sigma)
     known = whole.restricted(columns, fit.x)
     progress("fitting with the prior" if len(P) else "fitting under constraints")
-    found = KnownFit(
-        least_squares(problem, columns, fit.x, solution.sizes, known=known), known, sigma
-    )
+    found = KnownFit(least_squares(problem, columns, fit.x, known=known), known, sigma)
     progress("intervals with the prior" if len(P) else "intervals under constraints")
     told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
     spare = own.dof if own else min(told.values())
@@ -365,6 +363,6 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     both = np.concatenate([columns, dropped])
     R = problem.evaluate(found.fit.x, both).r_factor.R
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
-    share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
+    share = np.abs(mixing) * problem.sizes[dropped] / problem.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0
     return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))

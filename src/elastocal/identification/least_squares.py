@@ -47,7 +47,7 @@ TOLERANCE = 1e-8
 class Fit:
     """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual.
 
-    `columns` (fitted,) index the parameters, `sizes` (parameters,) their typical sizes.
+    `columns` (fitted,) index the parameters.
     """
 
     x: Array
@@ -57,7 +57,6 @@ class Fit:
     reason: str
     problem: Problem = field(repr=False)
     columns: NDArray[np.int64]
-    sizes: Array
 
     @cached_property
     def B(self) -> Array:
@@ -80,7 +79,7 @@ class Fit:
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
-        size = self.sizes[self.columns]
+        size = self.problem.sizes[self.columns]
         inverse = self.r_factor.scaled(size).half
         return (inverse @ inverse.T) * np.outer(size, size)
 
@@ -229,13 +228,11 @@ def moved(x: Array, columns: IntArray, step: Array) -> Array:
 
 
 def fit(
-    problem: Problem, columns: IntArray, x: Array, sizes: Array, *, known: PriorRows | None = None,
+    problem: Problem, columns: IntArray, x: Array, *, known: PriorRows | None = None,
     max_steps: int = 60, tolerance: float = TOLERANCE,
 ) -> Fit:  # fmt: skip
     """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
     other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
-
-    `sizes` (parameters,) scale the variables.
 
     On R factors, with the cost and the gradient of all rows, until a step promises less than
     `tolerance` of the cost.  Every step starts from the residual of the exact model, so that the
@@ -245,7 +242,7 @@ def fit(
     Raises ElastocalError where the start has poses without equilibrium, InputError for constraints
     that contradict each other, InsufficientDataError where they leave something undetermined.
     """
-    size, u = sizes[columns], np.zeros(len(columns))
+    size, u = problem.sizes[columns], np.zeros(len(columns))
     known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
     objective = Objective(problem, columns, x, size, known)
     if objective.limits is not None:  # the nearest that is allowed
@@ -253,7 +250,7 @@ def fit(
     u, at, reason = objective.descend(u, tolerance, max_steps)
     return Fit(
         objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
-        problem, columns, sizes,
+        problem, columns,
     )  # fmt: skip
 
 

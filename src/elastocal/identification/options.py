@@ -174,10 +174,31 @@ class MethodResult:
     standard: Array | None = None
     limits: dict[int, tuple[float, float]] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def ci95(self) -> Array:
         """The 95 % intervals (fitted, 2)."""
         return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
+
+    def told(
+        self, k: int, bent: float = 0.0
+    ) -> tuple[dict[int, float], float, tuple[float, float]]:
+        """Of kept parameter number k the parameters combined with it and their factors, its
+        standard deviation and its interval.
+
+        A dropped parameter d is combined with it where its typical deviation s_d would shift the
+        estimate by more than its standard deviation σ.  The others widen it to
+        √(σ² + Σ_d (m_kd s_d)²), their typical deviations being a prior N(0, s_d²), as does what a
+        combination leaves out by being linear (`bent`).
+        """
+        chosen, std = self.solution.reduction, float(self.spread.std[k])
+        shift = np.abs(chosen.mixing[k]) * self.solution.problem.sizes[chosen.dropped]
+        terms = {int(chosen.dropped[j]): float(chosen.mixing[k, j])
+                 for j in np.flatnonzero(shift > std)}  # fmt: skip
+        left = np.append(shift[shift <= std], bent)
+        wide = float(np.sqrt(1 + ((left / std) ** 2).sum())) if std > 0 else 1.0
+        value = float(self.solution.fit.x[chosen.kept[k]])
+        low, high = (float(value + wide * (end - value)) for end in self.ci95[k])
+        return terms, wide * std, (low, high)
 
 
 # How to identify: method, noise, what is held, what becomes of faulty readings, where it starts.

@@ -23,7 +23,6 @@ from elastocal.identification.options import MethodResult
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import Part, Problem
-from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray, IntArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
@@ -268,7 +267,7 @@ def find_faulty(solution: Solution) -> BoolArray:
     """
     problem, n = solution.problem, len(solution.problem.observations.lead)
     part = problem.sample(SAMPLE) if problem.large else problem.part(np.arange(n))
-    width = prior_widths(problem.model, solution.sizes)[problem.free]
+    width = prior_widths(problem)[problem.free]
     x0, free = problem.x0, problem.free
     placed = is_placed(problem.model)[free]
     x = (x0 if placed.any() else solution.fit.x).copy()
@@ -315,10 +314,10 @@ def find_faulty(solution: Solution) -> BoolArray:
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
 
 
-def prior_widths(model: Model, sizes: Array) -> Array:
+def prior_widths(problem: Problem) -> Array:
     """Deviations (parameters,) of the weak prior about a start: what the readings do not show stays
     there, and is not known any better."""
-    return np.where(is_placed(model), PLACED, WEAK * sizes)
+    return np.where(is_placed(problem.model), PLACED, WEAK * problem.sizes)
 
 
 def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
@@ -708,7 +707,7 @@ def robust_result(
         steps += 1
     fit = replace(
         sound.fit, x=x, residual=at.residual, converged=converged, columns=kept,
-        problem=replace(problem, x0=sound.problem.x0),
+        problem=replace(problem, x0=sound.problem.x0, sizes=sound.problem.sizes),
         reason=sound.fit.reason if converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.

@@ -354,7 +354,7 @@ class _Search:
         self.model, self.observed = every.problem.model, every.problem.observations
         self.functions, self.harmful = functions, list[str]()
         own = np.setdiff1d(sound.problem.free, functions.columns)
-        problem = replace(sound.problem, free=own)
+        problem = replace(sound.problem, free=own, sizes=every.problem.sizes)
         self.sound = replace(
             sound, fit=replace(sound.fit, problem=problem), reduction=sound.reduction.among(own)
         )
@@ -385,7 +385,7 @@ class _Search:
         parameters are fitted is chosen beside them, instead of `reduction`, unless `choosing` is
         False.  Raises ElastocalError where the start has poses without equilibrium.
         """
-        f, own, sizes = self.functions, self.sound.problem, self.every.sizes
+        f, own = self.functions, self.sound.problem
         problem = replace(problem, free=np.append(own.free, f.columns))
         x = reduction.shifted(x, own.x0)
         if scales is not None:
@@ -395,17 +395,17 @@ class _Search:
         scales = free.only(np.searchsorted(own.free, reduction.kept)).scales(scales)
         if choosing:
             before, marginal = reduction.kept, free.posterior(scales).marginal
-            reduction = choose(own, sizes, marginal, scales.sigma, WORTH_A_COLUMN)
+            reduction = choose(own, marginal, scales.sigma, WORTH_A_COLUMN)
             if not np.array_equal(before, reduction.kept):
                 x = reduction.shifted(x, own.x0)
                 free = self._rows(problem, x)
-        reduction = reduction.seen(own.free, free.factor.R, sizes)
+        reduction = reduction.seen(own.free, free.factor.R, own.sizes)
         kept = np.searchsorted(own.free, reduction.kept)
         prior = free.only(kept).posterior(scales)
         columns = np.append(reduction.kept, f.columns[prior.own])
         known = PriorRows(prior.P, prior.P @ self.model.nominal[columns])
         found = least_squares(
-            problem, columns, x, sizes, known=known, max_steps=STEPS,
+            problem, columns, x, known=known, max_steps=STEPS,
             tolerance=SETTLED / len(problem.observations.value),
         )  # fmt: skip
         return JointFit(found, reduction, scales, self._rows(problem, found.x).only(kept))

@@ -23,10 +23,18 @@ from elastocal.identification.residuals import (
     rms_3d,
 )
 from elastocal.identification.start import check_enough
-from elastocal.identification.weighted_problem import Part, Problem, RFactor, least_norm, merge
+from elastocal.identification.weighted_problem import (
+    Part,
+    Problem,
+    RFactor,
+    Weights,
+    least_norm,
+    merge,
+)
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, and what the rest combine with.
@@ -85,32 +93,6 @@ class Reduction:
         own = length[np.searchsorted(free, self.kept)]
         gone = own <= STRUCTURAL * length.max(initial=0.0)
         return self.without(gone, invisible=True) if gone.any() else self
-
-    def terms(self, k: int, sizes: Array, std: float) -> dict[int, float]:
-        """Parameters combined with kept parameter number k, and their factors.
-
-        A dropped parameter counts where its typical deviation would shift the estimate by more
-        than its standard deviation `std`; what shifts it less is in its interval (`widened`).
-        """
-        row = self.mixing[k]
-        return {
-            int(d): float(row[j])
-            for j, d in enumerate(self.dropped)
-            if abs(row[j]) * sizes[d] > std
-        }
-
-    def widened(
-        self, k: int, sizes: Array, std: float, value: float, ci95: Array, bent: float = 0.0
-    ) -> tuple[float, tuple[float, float]]:
-        """Standard deviation and interval of kept parameter number k at `value`, with what the
-        dropped parameters d that are not among `terms` add: √(std² + Σ_d (m_kd s_d)²), their
-        typical deviations s_d being a prior N(0, s_d²); and what a combination leaves out by being
-        linear (`bent`)."""
-        shift = np.abs(self.mixing[k]) * sizes[self.dropped]
-        shift = np.append(shift[shift <= std], bent)
-        wide = float(np.sqrt(1 + ((shift / std) ** 2).sum())) if std > 0 else 1.0
-        low, high = (float(value + wide * (end - value)) for end in ci95)
-        return wide * float(std), (low, high)
 
 
 def reduce(
@@ -176,16 +158,14 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
     return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
 
 
-def choose(
-    problem: Problem, sizes: Array, r_factor: RFactor, sigma: float, threshold: float
-) -> Reduction:
+def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) -> Reduction:
     """A minimal complete set of the free columns, as indices into all parameters.
 
     Raises InsufficientDataError where no column is worth keeping.
     """
     observed, free = problem.observations, problem.free
     parameters = tuple(problem.model.parameters[c] for c in free)
-    local = reduce(r_factor.R, sizes[free], parameters, sigma, threshold)
+    local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
     if not len(local.kept):
         raise InsufficientDataError(
             f"{observed.table.source}: the readings do not depend on any parameter of the model; "
@@ -198,22 +178,20 @@ def choose(
 
 def chosen_again(solution: Solution) -> Reduction:
     """The choice by the weights and at the values that the solution has come to."""
-    problem, found = solution.problem, solution.fit
-    sigma, threshold = residual_sigma(found, len(found.columns)), solution.reduction.threshold
-    return choose(problem, solution.sizes, found.of_free, sigma, threshold)
+    found, threshold = solution.fit, solution.reduction.threshold
+    sigma = residual_sigma(found, len(found.columns))
+    return choose(solution.problem, found.of_free, sigma, threshold)
 
 
-def fit_kept(
-    problem: Problem, sizes: Array, x: Array, chosen: Reduction, max_steps: int = 60
-) -> Fit:
+def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:
     """Fit of the kept parameters, the others held at the start; their share moves over first."""
     start, kept = x.copy(), chosen.kept
     start[chosen.dropped] = problem.x0[chosen.dropped]
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
     for trial in (chosen.shifted(x, problem.x0), start):
         with suppress(ElastocalError):
-            return fit(problem, kept, trial, sizes, max_steps=max_steps)
-    return fit(problem, kept, problem.x0, sizes, max_steps=max_steps)
+            return fit(problem, kept, trial, max_steps=max_steps)
+    return fit(problem, kept, problem.x0, max_steps=max_steps)
 
 
 def looked_at(found: Fit) -> tuple[Array, Array]:
@@ -244,7 +222,7 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
     decides, first on the linearised model, then on the refitted one.
     """
-    problem, sizes, heldout = found.problem, found.sizes, list[Array]()
+    problem, heldout = found.problem, list[Array]()
     observed = problem.observations
 
     def predicts(wide: Array) -> bool:
@@ -255,16 +233,19 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
 
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
-        wider = choose(problem, sizes, found.of_free, sigma, threshold)
+        wider = choose(problem, found.of_free, sigma, threshold)
         own = found.of_free.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
-        start = moved(found.x, wider.kept, own.step(sizes[wider.kept]))
+        # Of least length in typical sizes where several are least squares.
+        size, cond = problem.sizes[wider.kept], own.rows * np.finfo(float).eps
+        step = size * least_norm(own.R * size, own.projected, cond=cond)
+        start = moved(found.x, wider.kept, step)
         linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)
         if not predicts(linear[0]):
             continue
         try:
-            wide = fit_kept(problem, sizes, start, wider, max_steps=30)
+            wide = fit_kept(problem, start, wider, max_steps=30)
             after = looked_at(wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
@@ -311,10 +292,6 @@ class Solution:
         return self.fit.problem
 
     @property
-    def sizes(self) -> Array:
-        return self.fit.sizes
-
-    @property
     def exact(self) -> bool:
         """Whether the readings are computed: what is left is rounding."""
         return rms_3d(self.fit.residual, self.problem.observations.size) < EXACT
@@ -333,8 +310,7 @@ def solve(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    sizes = sizes_and_check(problem)
-    found, reduction, placed = settle(problem, sizes, progress)
+    found, reduction, placed = settle(problem, progress)
     if try_wider:
         progress("comparing with wider sets")
         found, reduction = prefer_wider(found, reduction)
@@ -342,7 +318,7 @@ def solve(
 
 
 def settle(
-    problem: Problem, sizes: Array, progress: Progress = lambda message: None
+    problem: Problem, progress: Progress = lambda message: None
 ) -> tuple[Fit, Reduction, Array]:
     """Place base and markers, choose a minimal complete set of parameters and fit it.
 
@@ -355,32 +331,32 @@ def settle(
     placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
-        base = tied_fit(replace(problem, free=placed), sizes, CHOOSING)
+        base = tied_fit(replace(problem, free=placed), CHOOSING)
         problem = replace(problem, x0=base.x)
         nominal = base.residual
     else:
         nominal = problem.residual(problem.x0)
     progress("first fit, tied weakly to the start")
     few = _sampled(problem)
-    found = _tied_from(few, sizes, problem.x0, _misfit(few), CHOOSING)
+    found = _tied_from(few, problem.x0, _misfit(few), CHOOSING)
     progress("choosing the parameters that the data determine")
     more = np.sqrt(len(problem.observations.value) / len(few.observations.value))
     sigma, kept = residual_sigma(found, 0), None
     r_factor = found.r_factor.scaled(np.full(len(problem.free), more))
     for _ in range(5):
-        reduction = choose(problem, sizes, r_factor, sigma, WORTH_A_COLUMN)
+        reduction = choose(problem, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
             break
         if not exact and is_placed(model)[reduction.dropped].any():
             asked = replace(problem, free=placed, x0=started)
-            problem, exact = replace(problem, x0=tied_fit(asked, sizes, PLACING).x), True
+            problem, exact = replace(problem, x0=tied_fit(asked, PLACING).x), True
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
-        found = fit_kept(problem, sizes, found.x, reduction)
+        found = fit_kept(problem, found.x, reduction)
         sigma, r_factor = residual_sigma(found, len(kept)), found.of_free
-    left = reduction.seen(problem.free, r_factor.R, sizes)
+    left = reduction.seen(problem.free, r_factor.R, problem.sizes)
     if left is not reduction:
-        reduction, found = left, fit_kept(problem, sizes, found.x, left)
+        reduction, found = left, fit_kept(problem, found.x, left)
     return found, reduction, nominal
 
 
@@ -389,19 +365,22 @@ def is_placed(model: Model) -> NDArray[np.bool_]:
     return np.array([effect_of(p.effect).registered for p in model.parameters], dtype=bool)
 
 
-def sizes_and_check(problem: Problem) -> Array:
-    """Typical sizes (parameters,) at the start; refuses where the equations are too few."""
-    model, observed, free = problem.model, problem.observations, problem.free
+def posed(
+    model: Model, observed: Observations, weights: Weights, x0: Array, free: IntArray
+) -> Problem:
+    """The problem with typical sizes at the start; refuses where the equations are too few."""
+    problem = Problem(model, observed, weights, x0, free, np.ones(len(x0)))
     # What is shrunk has its size from its prior.
     every = np.flatnonzero(~model.shrunk | np.isin(np.arange(len(model.shrunk)), free))
     few = len(observed.value) <= len(free)  # more equations than unknowns need no rank
     placed = is_placed(model)
     known = placed | np.array([p.typical is not None for p in model.parameters], dtype=bool)
     if known.all() and not few:  # then sizes need no B
-        return np.where(placed, PLACED, model.sizes(np.zeros((1, len(known)))))
+        sizes = model.sizes(np.zeros((1, len(known))))
+        return replace(problem, sizes=np.where(placed, PLACED, sizes))
 
     def of_part(part: Part) -> tuple[Array, RFactor | None]:
-        at = problem.regressor(part, problem.x0, every)
+        at = problem.regressor(part, x0, every)
         r_factor = RFactor.of(at.B[:, np.searchsorted(every, free)], at.residual) if few else None
         return np.abs(at.B).max(axis=0, initial=0.0), r_factor
 
@@ -412,7 +391,7 @@ def sizes_and_check(problem: Problem) -> Array:
     sizes[placed] = PLACED
     if few:
         check_enough(model, observed, merge(t for t in factors if t is not None).R * sizes[free])
-    return sizes
+    return replace(problem, sizes=sizes)
 
 
 # Draws of what is dropped, and of the errors of what is kept: from eight the result is a third
@@ -435,8 +414,8 @@ def bent(solution: Solution, covariance: Array) -> Array:
     none = np.zeros(len(kept))
     if problem.large or not np.isfinite(covariance).all():
         return none
-    size = solution.sizes[kept]
-    typical = np.where(is_placed(problem.model), 0.0, solution.sizes)[dropped]
+    size = problem.sizes[kept]
+    typical = np.where(is_placed(problem.model), 0.0, problem.sizes)[dropped]
     root = size[:, None] * root_of(covariance / np.outer(size, size))
     # Of many readings some tell it as well: it is no smaller where there are more of them.
     looked = problem.sample(BENT_SAMPLE)
@@ -455,7 +434,7 @@ def bent(solution: Solution, covariance: Array) -> Array:
     return np.asarray(size * np.sqrt((step**2).mean(axis=1)))
 
 
-def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
+def tied_fit(problem: Problem, tolerance: float) -> Fit:
     """Fit of all free parameters with weak ties, scaled by a noise level found on the way.
 
     Many readings start where such a fit to a sample of them ends.
@@ -463,12 +442,12 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
     x = problem.x0
     rough = _sampled(problem)
     if rough is not problem:
-        found = _tied_from(rough, sizes, x, _misfit(rough), tolerance)
+        found = _tied_from(rough, x, _misfit(rough), tolerance)
         try:
-            return _tied_from(problem, sizes, found.x, residual_sigma(found, 0), tolerance)
+            return _tied_from(problem, found.x, residual_sigma(found, 0), tolerance)
         except ElastocalError:
             pass  # the sample has led where other readings have no equilibrium
-    return _tied_from(problem, sizes, x, _misfit(problem), tolerance)
+    return _tied_from(problem, x, _misfit(problem), tolerance)
 
 
 def _sampled(problem: Problem) -> Problem:
@@ -484,13 +463,13 @@ def _misfit(problem: Problem) -> float:
     return max(float(np.sqrt(np.mean(residual**2))), 1e-12)
 
 
-def _tied_from(problem: Problem, sizes: Array, x: Array, sigma: float, tolerance: float) -> Fit:
+def _tied_from(problem: Problem, x: Array, sigma: float, tolerance: float) -> Fit:
     """Tied fits from x until the noise level `sigma` that scales the ties no longer falls."""
-    free = problem.free
+    free, sizes = problem.free, problem.sizes
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
         tie = PriorRows.near(problem.x0[free], width / sigma)
-        found = fit(problem, free, x, sizes, known=tie, max_steps=25, tolerance=tolerance)
+        found = fit(problem, free, x, known=tie, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:
             return found

@@ -280,14 +280,6 @@ class RFactor:
         """R⁻¹ (p, p)."""
         return np.asarray(linalg.solve_triangular(self.R, np.eye(self.columns)))
 
-    def step(self, scale: Array) -> Array:
-        """Minimiser (p,) of |e − B x|², of least length in x/scale where several are.
-
-        `scale` (p,) are typical sizes; the rank is judged with columns multiplied by them.
-        """
-        cond = max(self.rows, self.columns) * np.finfo(float).eps
-        return scale * least_norm(self.R * scale, self.projected, cond=cond)
-
 
 def least_norm(A: Array, b: Array, cond: float | None = None) -> Array:
     """x (k, …) of least norm among those that minimise |A x − b|, by singular values; those below
@@ -360,13 +352,14 @@ class Evaluation:
 @dataclass(frozen=True)
 class Problem:
     """Fit parameters among those that are `free` to the observations, the others held at x0
-    (parameters,)."""
+    (parameters,); `sizes` (parameters,) are typical ones, by which variables are scaled."""
 
     model: Model
     observations: Observations
     weights: Weights
     x0: Array
     free: NDArray[np.int64]
+    sizes: Array
 
     @property
     def large(self) -> bool:
