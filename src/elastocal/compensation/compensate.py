@@ -210,7 +210,7 @@ def _nearest(
         return q[0], bool(good[0])
     q = unwound(chain, q[good], near, task.lower, task.upper)
     q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
-    if chain.n_joints > task.equations:
+    if chain.n_joints > (6 if task.oriented else 3):  # joints leave a choice
         q = task.nearest(q, np.array([place]), near)
     return q[0], True
 

@@ -18,14 +18,6 @@ from numpy.typing import ArrayLike
 from elastocal.above import checked_arguments
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.export import exportable, mjcf_file, rigid_files
-from elastocal.export.exportable import (
-    Cost,
-    ExportNumbers,
-    JointCorrection,
-    Kept,
-    Refit,
-    refitted,
-)
 from elastocal.export.mjcf_file import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
@@ -117,11 +109,11 @@ class Exported:
     """
 
     format: str
-    cost: Cost
+    cost: exportable.Cost
     held: dict[str, float]
     of_the_measurement: tuple[str, ...]
-    refit: Refit | None
-    correction: JointCorrection
+    refit: exportable.Refit | None
+    correction: exportable.JointCorrection
     warnings: tuple[str, ...]
     text: str = ""
     checked: float | None = None
@@ -174,10 +166,12 @@ def export(
     force = np.zeros(3) if force is None else force
     conditions = Conditions(force, wish.time_s, wish.temperature_c, visits)
     kept = exportable.keep(calibrated, elastic=wish.kind == "mjcf", conditions=conditions)
-    refit, correction = None, JointCorrection()
+    refit, correction = None, exportable.JointCorrection()
     if wish.kind in FITTED:
         progress("fitting what the format holds")
-        kept, refit, correction = refitted(kept, wish.poses, wish.seed, wish.correct_joints)
+        kept, refit, correction = exportable.refitted(
+            kept, wish.poses, wish.seed, wish.correct_joints
+        )
     pieces = exportable.evaluate_pieces(kept.exported, conditions)
     progress("what the format cannot hold")
     cost = exportable.cost_of(kept, wish.poses, wish.seed)
@@ -186,14 +180,6 @@ def export(
     each = zip(calibrated.model.parameters, calibrated.entries, strict=True)
     held = {p.name: plain(e.get("held")) for p, e in each
             if not p.shrunk and e.get("identifiable") is not True}  # fmt: skip
-    told = tuple(_warnings(calibrated, kept, cost))
-    done = Exported(wish.kind, cost, held, kept.of_the_measurement, refit, correction, told)
-    format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
-    written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
-    return written
-
-
-def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
     spec, loads = calibrated.model.cell.model, len(cost.forces)
     doubts = (
         (kept.fitted and loads > 1 and not kept.exported.elastic,
@@ -207,7 +193,11 @@ def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
         (cost.unsettled, f"{cost.unsettled} of {cost.poses} random poses have no static "
          "equilibrium under the load and are left out"),
     )  # fmt: skip
-    return [told for so, told in doubts if so]
+    told = tuple(text for so, text in doubts if so)
+    done = Exported(wish.kind, cost, held, kept.of_the_measurement, refit, correction, told)
+    format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
+    written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
+    return written
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
@@ -242,8 +232,8 @@ class _Writing:
 
     calibrated: CalibratedArm
     wish: Wish
-    kept: Kept
-    pieces: ExportNumbers
+    kept: exportable.Kept
+    pieces: exportable.ExportNumbers
     done: Exported
 
     def parameters(self) -> Exported:

@@ -184,7 +184,7 @@ def _nested(tag: str, stated: dict[str, str], lines: Sequence[str]) -> list[str]
 BESIDE = ("include", "model")
 
 
-def moved(path: Path, text: str, folder: Path | None) -> tuple[str, list[str]]:
+def moved(path: Path, text: str, folder: Path) -> tuple[str, list[str]]:
     """The `text` of a file that lies at `path`, to be written into `folder`, and what to know.
 
     A file without names of others, or that stays where it was, is as before to the byte.
@@ -193,14 +193,13 @@ def moved(path: Path, text: str, folder: Path | None) -> tuple[str, list[str]]:
     named = [tag for tag in xml.tags if any(_is_file(tag, key) for key in tag.stated)]
     if not named:
         return text, []
-    home, there = path.parent.resolve(), path.parent if folder is None else folder
-    beside = [tag for tag in named if tag.name in BESIDE]
-    if there.resolve() != home:
-        if beside:
+    home, there = path.parent.resolve(), folder.resolve()
+    if there != home:
+        if any(tag.name in BESIDE for tag in named):
             return text, [f"copy it beside {path.name}: the files that it includes are there"]
         if xml.root.name == "mujoco":
             stated = parsed(path).compiler
-            places = {key: _from(there.resolve(), home / (getattr(stated, key) or ""))
+            places = {key: _from(there, home / (getattr(stated, key) or ""))
                       for key in ("meshdir", "texturedir")}  # fmt: skip
             if compilers := [tag for tag in xml.tags if tag.name == "compiler"]:
                 xml.set(compilers[-1], places)
@@ -209,7 +208,7 @@ def moved(path: Path, text: str, folder: Path | None) -> tuple[str, list[str]]:
         for tag in (tag for tag in named if "filename" in tag.stated):
             place = home / tag.stated["filename"]
             if place.is_file():  # others are found in packages
-                xml.set(tag, {"filename": _from(there.resolve(), place)})
+                xml.set(tag, {"filename": _from(there, place)})
     told = "meshes and other files are named relative to the file: to have it elsewhere, export it"
     return xml.result(), [f"{told} there"]
 

@@ -488,10 +488,14 @@ class Records:
         name = self.names[i]
         return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
 
-    @property
-    def time(self) -> Array | None:
-        """(n,) s on the file's clock."""
-        return self.numbers.get("time")
+    def clock(self, how: str) -> Array:
+        """(n,) s on the file's clock, by which rows are to be joined."""
+        if "time" not in self.numbers:
+            raise InputError(
+                f"{self.source}: no times, by which [join] is to join by {how}; map time_s or "
+                "time_text in [source.columns], or join by order or name"
+            )
+        return self.numbers["time"]
 
     @property
     def q(self) -> Array:

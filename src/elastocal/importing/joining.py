@@ -342,7 +342,7 @@ class Joined:
 def join(points: Records, log: Records, settings: JoinTable) -> Joined:
     """By name where names agree, by time where both have one, else by order, unless stated."""
     named = points.texts.get("configuration")
-    both = points.time is not None and log.time is not None
+    both = "time" in points.numbers and "time" in log.numbers
     obvious = "time" if both else "order"
     how = settings.by or ("name" if named and _keys(named, _names_of(log)) else obvious)
     if how in ("time", "standstill"):
@@ -371,9 +371,10 @@ def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str)
 
     "" where the join is not by clocks, few points would, or two offsets would do as well.
     """
-    if how not in ("time", "standstill") or points.time is None or log.time is None:
+    if how not in ("time", "standstill"):
         return ""
-    at, clock, order = _clocks(points, log, settings, how)
+    at, order = points.clock(how), np.argsort(log.clock(how), kind="stable")
+    clock = log.clock(how)[order] + settings.offset_s
     still = log.spread(settings.still_deg, settings.still_mm)
     first, last, _ = dwells(clock, log.q[order], still, settings.still_s)
     if not len(first) or len(at) * len(first) > MOST_PAIRS:
@@ -513,21 +514,6 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     return Joined("name", row, q[row], None, left_out, spare, remarks)
 
 
-def _clocks(
-    points: Records, log: Records, settings: JoinTable, how: str
-) -> tuple[Array, Array, IntArray]:
-    """Times of the points and, sorted and with the offset, of the log, and the log's rows so."""
-    for pool in (points, log):
-        if pool.time is None:
-            raise InputError(
-                f"{pool.files[0]}: no times, by which [join] is to join by {how}; map time_s or "
-                "time_text in [source.columns], or join by order or name"
-            )
-    assert points.time is not None and log.time is not None
-    order = np.argsort(log.time, kind="stable")
-    return points.time, log.time[order] + settings.offset_s, order
-
-
 def _nearest(at: Array, first: Array, last: Array) -> tuple[IntArray, Array]:
     """Number of the stop, from `first` to `last` (k,) s, one after the other, that is nearest to
     each time `at` (n,), and the time to its nearer end, 0 within it."""
@@ -542,7 +528,8 @@ def _nearest(at: Array, first: Array, last: Array) -> tuple[IntArray, Array]:
 
 
 def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> Joined:
-    at, clock, order = _clocks(points, log, settings, how)
+    at, order = points.clock(how), np.argsort(log.clock(how), kind="stable")
+    clock = log.clock(how)[order] + settings.offset_s
     still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
     q = log.q[order]
     first, last, standing = np.arange(len(q)), np.arange(len(q)), q

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -303,8 +304,33 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
     A joint may be named as in the robot's file wherever jointN may stand.  Where the file calls
     another than the Nth joint jointN, `[robot] joint_names` says which is meant.
     """
-    one = _resolver(cell, chain)
-    loose = _resolver(cell, chain, others=True)
+    by_file = {name: number for number, name in file_names(chain).items()}
+    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
+    clash = clashing(chain) if cell.robot.joint_names is None else []
+    known = by_order | by_file
+    if cell.robot.joint_names == "order":
+        known = by_file | by_order
+    elif clashing(chain):  # by the file: a number that is no name there means nothing
+        same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
+        known = same | by_file
+
+    def one(name: str, where: str, others: bool = False) -> str:
+        """jointN of a name that stands at `where`; with `others` what is no joint stays."""
+        if name in clash:
+            raise InputError(
+                f"{cell.path or cell.name}: {where} names {name}, which in the robot's file is "
+                f"joint number {by_file[name].removeprefix('joint')} of the arm "
+                f'({names_told(chain)}); say which is meant: [robot] joint_names = "file" (names '
+                'of the file) or "order" (jointN is the Nth)'
+            )
+        if name in known or others:
+            return known.get(name, name)
+        raise InputError(
+            f"{cell.path or cell.name}: {where} names {name}, but robot '{chain.name}' has "
+            f"{chain.n_joints} joints{did_you_mean(name, known)}; they are {listed(known)}"
+        )
+
+    loose = partial(one, others=True)
 
     def keys(
         table: Mapping[str, Value], where: str, of: Callable[[str, str], str]
@@ -347,33 +373,3 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
             combination=combination,
         ),
     )
-
-
-def _resolver(cell: Cell, chain: Chain, others: bool = False) -> Callable[[str, str], str]:
-    """Name and where it stands → jointN; with `others` what is no joint stays."""
-    by_file = {name: number for number, name in file_names(chain).items()}
-    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
-    clash = clashing(chain) if cell.robot.joint_names is None else []
-    known = by_order | by_file
-    if cell.robot.joint_names == "order":
-        known = by_file | by_order
-    elif clashing(chain):  # by the file: a number that is no name there means nothing
-        same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
-        known = same | by_file
-
-    def resolve(name: str, where: str) -> str:
-        if name in clash:
-            raise InputError(
-                f"{cell.path or cell.name}: {where} names {name}, which in the robot's file is "
-                f"joint number {by_file[name].removeprefix('joint')} of the arm "
-                f'({names_told(chain)}); say which is meant: [robot] joint_names = "file" (names '
-                'of the file) or "order" (jointN is the Nth)'
-            )
-        if name in known or others:
-            return known.get(name, name)
-        raise InputError(
-            f"{cell.path or cell.name}: {where} names {name}, but robot '{chain.name}' has "
-            f"{chain.n_joints} joints{did_you_mean(name, known)}; they are {listed(known)}"
-        )
-
-    return resolve

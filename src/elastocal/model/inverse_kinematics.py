@@ -123,11 +123,6 @@ class Reaching(BoundedSearch):
         value, J = self._evaluate(q)
         return value[..., 0] - self.goal[target], J
 
-    @property
-    def equations(self) -> int:
-        """Number of independent equations: an arm with more joints has a choice."""
-        return 6 if self.oriented else 3
-
     def errors(self, q: Array, target: IntArray) -> tuple[Array, Array]:
         """Distance in m and angle in rad (R,) from the targets."""
         r = self.residual(q, target)[0]

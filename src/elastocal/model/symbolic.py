@@ -67,20 +67,22 @@ class SymbolicArm:
     ) -> None:
         arm = Arm(chain, cell)
         chosen = [*choose_effects(chain, cell), *extra]
-        parameters: list[Parameter] = []
         symbols: list[ca.SX] = []
-        bound = []
+        bound, known = [], dict[str, Parameter]()
         for effect, place in chosen:
             own = set_constants(effect, place, chain, cell)
             for spec in sized_parameters(effect, place, chain, cell):
                 own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
                 symbols.append(own[spec.key])
                 name = f"{place}.{spec.key}"
-                parameters.append(
-                    Parameter(**vars(spec), name=name, effect=effect.name, where=place)
+                p = Parameter(**vars(spec), name=name, effect=effect.name, where=place)
+                other = known.setdefault(name, p)
+                require(
+                    other is p,
+                    f"{cell.path or cell.name}: the effects {other.effect} and {p.effect} both "
+                    f"have a parameter '{name}'; give the one that you registered a key of its own",
                 )
             bound.append((effect, place, own))
-        _check_names(parameters, cell)
         for effect, place, own in bound:
             effect.shape(arm, place, own)
         arm.assemble()
@@ -90,7 +92,7 @@ class SymbolicArm:
             effect.read(arm, place, own)
         self.arm = arm
         self.backend = backend
-        self.parameters = tuple(parameters)
+        self.parameters = tuple(known.values())
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
         # The reading h of one row (3, 6 or 1 components) in inputs, X and θ.
         kind = cell.model.observe
@@ -281,17 +283,6 @@ class Total:
         return y[..., 0], slope
 
 
-def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:
-    known: dict[str, Parameter] = {}
-    for p in parameters:
-        other = known.setdefault(p.name, p)
-        require(
-            other is p,
-            f"{cell.path or cell.name}: the effects {other.effect} and {p.effect} both have a "
-            f"parameter '{p.name}'; give the one that you registered a key of its own",
-        )
-
-
 # B of one whole configuration as a CasADi expression of its joint angles, for optimisation.
 
 # Fixed-point steps to the equilibrium.  Under 280 kg on a KR 270 they leave 2·10⁻⁴ of a column.
@@ -299,7 +290,7 @@ STEPS = 2
 
 
 def configuration_rows(
-    symbolic: SymbolicArm, template: Measurements, columns: NDArray[np.int64], steps: int = STEPS
+    symbolic: SymbolicArm, template: Measurements, columns: NDArray[np.int64]
 ) -> tuple[ca.Function, ca.Function]:
     """B (rows, columns) = ∂prediction/∂X of the configuration whose rows `template` lists, all its
     markers and load states, as a function of q (n,) and X (parameters,); and its adjoint,
@@ -307,15 +298,15 @@ def configuration_rows(
 
     Rows and their order are those of `Model.regressor` on the template, which gives everything but
     q: markers, forces, the level of a split joint, time.  Deflections are explicit functions of q
-    and X: eq. (3) for a linear model, `steps` fixed-point steps for the equilibrium.  Where poses
+    and X: eq. (3) for a linear model, STEPS fixed-point steps for the equilibrium.  Where poses
     are observed, the rotation is taken as measured without error, as in planning.
     """
     arm, p = symbolic.arm, symbolic.p
     observed = observe(template, arm.cell.model.observe)
-    B = ca.jacobian(symbolic.explicit(symbolic.reading, steps), p)[:, list(columns)]
+    B = ca.jacobian(symbolic.explicit(symbolic.reading, STEPS), p)[:, list(columns)]
     if arm.cell.model.observe == "pose":
         # Substituted after differentiation: the measured rotation is data, not a prediction.
-        predicted = symbolic.explicit(arm.reading["rotation"], steps)
+        predicted = symbolic.explicit(arm.reading["rotation"], STEPS)
         B = ca.substitute(B, arm.inputs["rotation"], rigid.vector_from_rotation(predicted))
     # (inputs …, X) → B of one table row (size, columns)
     row = ca.Function("row", [*arm.inputs.values(), p], [B], {"cse": True})
