@@ -28,7 +28,7 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError, option, require
+from elastocal.errors import InputError, check_known, option, require
 from elastocal.measurements import families
 from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
@@ -165,10 +165,7 @@ class ImportMapping:
 
 
 def preset_text(name: str) -> str:
-    if name not in PRESETS:
-        raise InputError(
-            f"no preset {quoted(name)}{did_you_mean(name, PRESETS)}; there are {listed(PRESETS)}"
-        )
+    check_known(name, PRESETS, f"no preset {quoted(name)}")
     folder = resources.files("elastocal.importing") / "presets"
     return (folder / f"{name}.toml").read_text(encoding="utf-8")
 

@@ -510,7 +510,7 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
             return ToolPoint(cell.tool.load_point, None, "load point")
         require(
             len(markers) == 1,
-            f"{cell.path or cell.name}: which point of the tool is to be at the targets? Give "
+            f"{cell.source}: which point of the tool is to be at the targets? Give "
             f"{option('point')} with a marker ({listed(markers)}) or with x,y,z in m in the flange "
             "frame, or state [tool] load_point_m",
         )

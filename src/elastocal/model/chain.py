@@ -87,8 +87,7 @@ def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
         lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
         if lower[i] >= upper[i]:
             raise InputError(
-                f"{cell.path or cell.name}: [limits] {name} leaves no range inside the robot's "
-                "own limits"
+                f"{cell.source}: [limits] {name} leaves no range inside the robot's own limits"
             )
     return lower, upper
 
@@ -318,7 +317,7 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
         """jointN of a name that stands at `where`; with `others` what is no joint stays."""
         if name in clash:
             raise InputError(
-                f"{cell.path or cell.name}: {where} names {name}, which in the robot's file is "
+                f"{cell.source}: {where} names {name}, which in the robot's file is "
                 f"joint number {by_file[name].removeprefix('joint')} of the arm "
                 f'({names_told(chain)}); say which is meant: [robot] joint_names = "file" (names '
                 'of the file) or "order" (jointN is the Nth)'
@@ -326,7 +325,7 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
         if name in known or others:
             return known.get(name, name)
         raise InputError(
-            f"{cell.path or cell.name}: {where} names {name}, but robot '{chain.name}' has "
+            f"{cell.source}: {where} names {name}, but robot '{chain.name}' has "
             f"{chain.n_joints} joints{did_you_mean(name, known)}; they are {listed(known)}"
         )
 
@@ -338,7 +337,7 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
         found = {of(name, where): value for name, value in table.items()}
         if len(found) < len(table):
             raise InputError(
-                f"{cell.path or cell.name}: {where} names a joint twice, by its name in the "
+                f"{cell.source}: {where} names a joint twice, by its name in the "
                 f"robot's file and by its number ({names_told(chain)}); keep one"
             )
         return found

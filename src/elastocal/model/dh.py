@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from elastocal.errors import InputError, option, require
+from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import read_text
 from elastocal.model import rigid
 from elastocal.model.chain import (
@@ -412,12 +412,8 @@ def _nominal(
 ) -> Array:
     if model is not None:
         by_name = {name.lower(): name for name in NOMINAL}
-        known = by_name.get(model.lower().replace(" ", ""))
-        if known is None:
-            raise InputError(
-                f"{path}: the robot '{model}' is not known{did_you_mean(model, NOMINAL)}; known "
-                f"are {listed(NOMINAL)}"
-            )
+        known = by_name.get(model.lower().replace(" ", ""), model)
+        check_known(known, NOMINAL, f"{path}: the robot '{model}' is not known", "known are")
         return _published(known)
     beside = path.with_name(CONTROLLER)
     if "DH" not in sections and beside.is_file():

@@ -479,7 +479,7 @@ def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
     lost = [choice.name for choice in cell.model.effects if choice.name not in CATALOGUE]
     require(
         not lost,
-        f"{cell.path or cell.name}: the effect {listed(lost)} was registered where the model was "
+        f"{cell.source}: the effect {listed(lost)} was registered where the model was "
         "pickled and does not travel with it; put it in a file that [plugins] of the cell names",
     )
     return Model.assembled(chain, cell, *more)

@@ -79,7 +79,7 @@ class SymbolicArm:
                 other = known.setdefault(name, p)
                 require(
                     other is p,
-                    f"{cell.path or cell.name}: the effects {other.effect} and {p.effect} both "
+                    f"{cell.source}: the effects {other.effect} and {p.effect} both "
                     f"have a parameter '{name}'; give the one that you registered a key of its own",
                 )
             bound.append((effect, place, own))

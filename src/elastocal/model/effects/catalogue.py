@@ -7,19 +7,19 @@ file of the user's own that calls `register`.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
 
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, check_known, require
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
 from elastocal.model.effects import compliances, gears, loads, placements, smooth
 from elastocal.model.effects.base import Effect, check
 from elastocal.plugin_loader import load_installed, load_named, same_class
-from elastocal.text import did_you_mean, listed
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {
@@ -135,8 +135,7 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
         name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
     }
     for choice in cell.model.effects:
-        if choice.name not in CATALOGUE:
-            raise InputError(_unknown("effects", "effect", choice.name, list(CATALOGUE), cell))
+        _check_known("effects", "effect", choice.name, CATALOGUE, cell)
         wanted.setdefault(choice.name, []).append(choice.where)
     chosen = []
     for name, effect in CATALOGUE.items():
@@ -144,12 +143,12 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
         asked = wanted.get(name, [])
         if asked and not places:
             raise InputError(
-                f"{cell.path or cell.name}: [model] effects: {name} has no place on robot "
+                f"{cell.source}: [model] effects: {name} has no place on robot "
                 f"'{chain.name}' with observe = \"{cell.model.observe}\"; leave it out"
             )
         for where in asked:
-            if where is not None and where not in places:
-                raise InputError(_unknown("effects", f"place of {name}", where, list(places), cell))
+            if where is not None:
+                _check_known("effects", f"place of {name}", where, places, cell)
         chosen += [(effect, place) for place in places if None in asked or place in asked]
     return chosen
 
@@ -168,11 +167,9 @@ def check_settings(chain: Chain, cell: Cell) -> None:
                 if keys := keys_of(effect, place, chain, cell):
                     known.setdefault(place, []).extend(keys)
         for place, values in given.items():
-            if place not in known:
-                raise InputError(_unknown(f"nominal.{table}", "place", place, list(known), cell))
-            for key in (key for key in values if key not in known[place]):
-                kind = f"{what} of {place}"
-                raise InputError(_unknown(f"nominal.{table}", kind, key, known[place], cell))
+            _check_known(f"nominal.{table}", "place", place, known, cell)
+            for key in values:
+                _check_known(f"nominal.{table}", f"{what} of {place}", key, known[place], cell)
 
 
 def _keys_of_sizes(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
@@ -204,7 +201,7 @@ def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[
     values = {}
     for setting in effect.settings(place, chain, cell):
         value = given.get(setting.key, setting.default)
-        where = f"{cell.path or cell.name}: [model.nominal.settings.{place}] {setting.key}"
+        where = f"{cell.source}: [model.nominal.settings.{place}] {setting.key}"
         if value is None:
             raise InputError(
                 f"{where} is missing, which {effect.name} at {place} needs; `elastocal diagnose` "
@@ -218,8 +215,6 @@ def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[
     return values
 
 
-def _unknown(key: str, what: str, found: str, valid: list[str], cell: Cell) -> str:
-    return (
-        f"{cell.path or cell.name}: [model] {key}: unknown {what} '{found}'"
-        f"{did_you_mean(found, valid)}; valid: {listed(valid)}"
-    )
+def _check_known(key: str, what: str, found: str, valid: Collection[str], cell: Cell) -> None:
+    told = f"{cell.source}: [model] {key}: unknown {what} '{found}'"
+    check_known(found, valid, told, "valid:")

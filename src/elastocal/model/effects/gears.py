@@ -125,7 +125,7 @@ class GearRipple(GearHarmonic):
         orders = cell.model.gear_ripple_orders
         require(
             len(orders) in (0, 1, chain.n_joints),
-            f"{cell.path or cell.name}: [model] gear_ripple_orders has {len(orders)} values, but "
+            f"{cell.source}: [model] gear_ripple_orders has {len(orders)} values, but "
             f"the arm has {chain.n_joints} joints; give one per joint, or a single one for all",
         )
         default = orders[index(place) % len(orders)] if orders else None
