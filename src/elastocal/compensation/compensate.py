@@ -379,7 +379,13 @@ def compensate(
     rows = tool.rows(replace(targets.table, force=force))
     if targets.position is not None:
         _check_unit(targets, targets.position, chain, T)
-    goals = _goals(targets, chain, T, place, turn)
+        goals = Goals(targets.position, targets.rotation)
+    else:
+        assert targets.q is not None  # read_targets: positions or joints
+        # Fewer than six joints cannot keep the rotation too.
+        goals = Goals(place, turn if chain.n_joints >= 6 else None)
+        goals = goals.through(nominal_flanges(chain, targets.q))
+    goals = goals.through(T) if targets.frame == "base" else goals
     aimed = goals.in_base(T)
     in_base = aimed.position
     flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
@@ -439,17 +445,6 @@ def _check_unit(targets: Targets, position: Array, chain: Chain, T: Array) -> No
                 f"{1e3 * far.max():.4g} mm from the origin of the {targets.frame} frame, and the "
                 f"arm reaches {1e3 * reach:.4g} mm: the numbers seem 1000 times too {told}"
             )
-
-
-def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
-    if targets.position is not None:
-        goals = Goals(targets.position, targets.rotation)
-    else:
-        assert targets.q is not None  # read_targets: positions or joints
-        # Fewer than six joints cannot keep the rotation too.
-        goals = Goals(place, turn if chain.n_joints >= 6 else None)
-        goals = goals.through(nominal_flanges(chain, targets.q))
-    return goals.through(T) if targets.frame == "base" else goals
 
 
 def _is_reached(missed: Array) -> BoolArray:

@@ -10,17 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.compensation.compensate import (
-    LARGE_CORRECTION,
-    Compensation,
-    Goals,
-    Targets,
-    check_status,
-    compensate,
-    spread,
-    table_csv,
-    targets_at,
-)
+from elastocal.compensation import compensate as single
 from elastocal.errors import InputError, option
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint, lasting, numbers
@@ -120,7 +110,7 @@ def correction_table(
     arm = lasting(arm)[0]
     points = grid.points()
     progress(f"{len(points)} grid points")
-    result = compensate(arm, _targets(grid, points, force), point, near, seed, progress)
+    result = single.compensate(arm, _targets(grid, points, force), point, near, seed, progress)
     tool = CalibratedTool(arm, point)
     correction, status = _corrections(tool, result)
     oriented = result.goals.rotation is not None
@@ -132,7 +122,7 @@ def correction_table(
         if not grid.joints:  # as a path, in the posture of the grid
             some = some[np.argsort(some[:, 0])]
             near = result.nominal[0]
-        check = compensate(arm, _targets(grid, some, force), point, near, seed)
+        check = single.compensate(arm, _targets(grid, some, force), point, near, seed)
         wide = [k for k, axis in enumerate(grid.axes) if len(axis) > 1]
         values = correction[np.lexsort(points.T[::-1])]
         values = values.reshape(*(len(grid.axes[k]) for k in wide), 6)
@@ -156,7 +146,7 @@ def _mostly_inexact(
         tool = CalibratedTool(arm, point)
 
         def exact(q: Array) -> BoolArray:
-            tried = compensate(arm, _targets(grid, q, force), point, None, seed)
+            tried = single.compensate(arm, _targets(grid, q, force), point, None, seed)
             return np.array(_corrections(tool, tried)[1]) == EXACT
 
         some = np.flatnonzero([s != EXACT for s in status])
@@ -178,26 +168,31 @@ def _mostly_inexact(
                 f"{told}the posture is singular by the levels of {listed(singular)}; give other "
                 f"levels, for a joint in its middle 2 or more, by {option('grid')}"
             )
+    most = f"{np.degrees(single.LARGE_CORRECTION):.0f}°"
     return (
-        f"{told}{beyond}, or a joint would turn by more than {np.degrees(LARGE_CORRECTION):.0f}°, "
-        f"as beside singular postures; choose other levels by {option('grid')}"
+        f"{told}{beyond}, or a joint would turn by more than {most}, as beside singular postures; "
+        f"choose other levels by {option('grid')}"
     )
 
 
-def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Targets:
+def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> single.Targets:
     turned = None if grid.rotation is None else np.tile(grid.rotation, (len(points), 1, 1))
     place, q = (None, points) if grid.joints else (points, None)
-    return targets_at(option("table"), place, turned, "base", force, q)
+    return single.targets_at(option("table"), place, turned, "base", force, q)
 
 
-def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
+def _corrections(
+    tool: CalibratedTool, result: single.Compensation
+) -> tuple[Array, tuple[str, ...]]:
     aimed = result.goals.in_base(result.T_data_base)
-    nominal = Goals(result.place, result.turned).through(nominal_flanges(tool.chain, result.q))
+    nominal = single.Goals(result.place, result.turned).through(
+        nominal_flanges(tool.chain, result.q)
+    )
     exact = _between(aimed, nominal)
     achieved = _achieved(tool, result, result.nominal)
     first_order = _between(achieved, aimed)
     step = np.abs(result.q - result.nominal).max(axis=1)
-    close = result.reached & (step <= LARGE_CORRECTION)
+    close = result.reached & (step <= single.LARGE_CORRECTION)
     # A nominal command that misses its own target is none that a correction could start from.
     usable = np.isfinite(achieved.position).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
     correction = np.where(close[:, None], exact, first_order)
@@ -209,13 +204,13 @@ def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tup
     return correction, status
 
 
-def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> Goals:
+def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> single.Goals:
     """Where the calibrated tool is at joints q, in the base frame."""
     rows = tool.rows(replace(result.targets.table, force=result.force))
-    return Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
+    return single.Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
 
 
-def _between(one: Goals, other: Goals) -> Array:
+def _between(one: single.Goals, other: single.Goals) -> Array:
     """(n, 6) from one pose to another: p' − p, and the rotation vector of R' Rᵀ, zero where a
     rotation is any."""
     turned = np.zeros_like(one.position)
@@ -227,7 +222,7 @@ def _between(one: Goals, other: Goals) -> Array:
 
 
 def _with_table(
-    tool: CalibratedTool, check: Compensation, correction: Array
+    tool: CalibratedTool, check: single.Compensation, correction: Array
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
     aimed = check.goals.in_base(check.T_data_base)
@@ -250,17 +245,6 @@ def _with_table(
 
 
 # As the command line states and writes them.
-
-
-def _remedies() -> dict[str, str]:
-    box, near, turned = (option(name) for name in ("box", "near", "rotation"))
-    return {
-        "limit": f"joint limits prevent it: widen [limits], or give a smaller {box} or another "
-        f"{near}",
-        "not reached": f"out of reach, or beside a singular posture: give a smaller {box}, another "
-        f"{turned} or another {near}",
-        "no equilibrium": f"no static equilibrium under this load: check {option('load')}",
-    }
 
 
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
@@ -326,8 +310,16 @@ def summary_and_csv(
     # A grid point has no line in any file of the user's: it is named by where it lies.
     named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
     what = f"{option('table')}: %d of %d grid points ({', '.join(heads)})"
+    box, near, rotation = (option(name) for name in ("box", "near", "rotation"))
+    remedies = {
+        "limit": f"joint limits prevent it: widen [limits], or give a smaller {box} or another "
+        f"{near}",
+        "not reached": f"out of reach, or beside a singular posture: give a smaller {box}, another "
+        f"{rotation} or another {near}",
+        "no equilibrium": f"no static equilibrium under this load: check {option('load')}",
+    }
     if not partial:
-        check_status(what, named, plain, EXACT, _remedies())
+        single.check_status(what, named, plain, EXACT, remedies)
     order = np.lexsort(found.points.T[::-1])
     moved, turned = found.correction[order, :3] * 1e3, np.degrees(found.correction[order, 3:])
     blocks = [(heads, points[order], ".9g"), (["dx_mm", "dy_mm", "dz_mm"], moved, ".7f")]
@@ -339,11 +331,11 @@ def summary_and_csv(
         "first_order": found.status.count(FIRST_ORDER),
         "levels": [len(axis) for axis in found.grid.axes],
         "checked_between": len(found.between),
-        "error_without_um": spread(found.before[:, 0]),
-        "error_with_um": spread(found.between[:, 0]),
+        "error_without_um": single.spread(found.before[:, 0]),
+        "error_with_um": single.spread(found.between[:, 0]),
         "warnings": list(found.warnings),
     }
     if found.oriented:
-        content["rotation_without_urad"] = spread(found.before[:, 1])
-        content["rotation_with_urad"] = spread(found.between[:, 1])
-    return content, table_csv(blocks, [found.status[i] for i in order])
+        content["rotation_without_urad"] = single.spread(found.before[:, 1])
+        content["rotation_with_urad"] = single.spread(found.between[:, 1])
+    return content, single.table_csv(blocks, [found.status[i] for i in order])

@@ -154,24 +154,6 @@ class Assembled:
     origin: list[str]
     warnings: tuple[str, ...]
 
-    def __len__(self) -> int:
-        return len(self.origin)
-
-
-def with_joint_values(points: Records, log: Records, joined: Joined) -> Records:
-    """The points that have joint values, with these and what else the log says of them."""
-    rows = np.flatnonzero(joined.row >= 0)
-    own, theirs = points.take(rows), log.take(joined.row[rows])
-    stems = joint_stems(log.numbers)
-    q = {stem: joined.q[rows, j] for j, stem in enumerate(stems)}
-    poses = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
-    return replace(
-        own,
-        numbers=theirs.numbers | own.numbers | q,
-        units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
-        texts=poses | own.texts,
-    )
-
 
 def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
     """A row for each point, in their order.
@@ -269,27 +251,6 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
                 "shots numbered in order"
             )
     return np.array([int(text) for text in stated], dtype=np.int64)
-
-
-def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measurements:
-    """The table as the reader of `identify` reads it.
-
-    With `cell`, joints, markers and columns must be those that it asks for.
-    """
-    observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
-    try:
-        return read_measurements(
-            f"{name} (not written)",
-            joint_kinds=made.kinds if cell is None else load_chain(cell).kinds,
-            marker_names=() if cell is None else tuple(cell.tool.markers),
-            observe=observe if cell is None else cell.model.observe,
-            text=text,
-        )
-    except InputError as error:
-        named = re.search(r"line (\d+)", str(error))
-        row = int(named[1]) - 2 if named else -1
-        meant = f" (from {made.origin[row]})" if 0 <= row < len(made) else ""
-        raise InputError(f"{error}{meant}") from None
 
 
 # Whether an imported table can be right: its units, and whether the robot of a cell fits it.
@@ -435,14 +396,36 @@ def import_files(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
     joined = None if log is None else joining.join(points, log, table.join)
-    if log is not None and joined is not None:
-        points = with_joint_values(points, log, joined)
+    if log is not None and joined is not None:  # those that have joint values, and what it says
+        rows = np.flatnonzero(joined.row >= 0)
+        pose = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
+        own, theirs, stems = points.take(rows), log.take(joined.row[rows]), joint_stems(log.numbers)
+        q = {stem: joined.q[rows, j] for j, stem in enumerate(stems)}
+        points = replace(
+            own,
+            numbers=theirs.numbers | own.numbers | q,
+            units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
+            texts=pose | own.texts,
+        )
     made = assemble(where, points, table)
     # Numbers with the digits that read back exactly.
     cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
              for values in made.columns.values()]  # fmt: skip
     text = csv_text(made.columns, zip(*cells, strict=True))
-    measured = validated(text, name, made, cell)
+    observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
+    try:  # as the reader of `identify` reads it, and as the cell asks for it
+        measured = read_measurements(
+            f"{name} (not written)",
+            joint_kinds=made.kinds if cell is None else load_chain(cell).kinds,
+            marker_names=() if cell is None else tuple(cell.tool.markers),
+            observe=observe if cell is None else cell.model.observe,
+            text=text,
+        )
+    except InputError as error:
+        named = re.search(r"line (\d+)", str(error))
+        row = int(named[1]) - 2 if named else -1
+        meant = f" (from {made.origin[row]})" if 0 <= row < len(made.origin) else ""
+        raise InputError(f"{error}{meant}") from None
     fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
     remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]
     warnings = [*told, *(r.removeprefix("WARNING: ") for r in remarks), *made.warnings]

@@ -571,8 +571,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in every if not c.is_text and c.index[0] < len(row)),
     )  # fmt: skip
-    kept, values, ignored = _rows(name, table, columns, cells)
-    numbers, of = _numbers(columns, values, kept, source.coverage_factor)
+    kept, numbers, of, ignored = _rows(name, table, columns, cells, source.coverage_factor)
     texts = {}
     for c in (c for c in next(iter(columns.values())) if c.is_text):
         glue = " " if c.stem == "time_text" else "::"
@@ -602,11 +601,15 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
 
 
 def _rows(
-    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]], cells: NumberCells
-) -> tuple[list[tuple[int, list[str], str]], list[list[float]], list[tuple[int, str]]]:
-    """Complete rows (line, cells, marker) and their numbers; what is passed over and why."""
+    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]], cells: NumberCells,
+    coverage: float,
+) -> tuple[list[tuple[int, list[str], str]], dict[str, Array], dict[str, str],
+           list[tuple[int, str]]]:  # fmt: skip
+    """Complete rows (line, cells, marker), their numbers by column and the units of the measurement
+    table that these are in; what is passed over and why."""
     widest = max((c for own in columns.values() for c in own), key=lambda c: max(c.index))
-    kept, values, ignored = [], [], []
+    kept, ignored = list[tuple[int, list[str], str]](), list[tuple[int, str]]()
+    read: dict[str, list[list[float]]] = {marker: [] for marker in columns}
     for number, row in table.rows:
         if max(widest.index) >= len(row):
             raise InputError(
@@ -624,32 +627,24 @@ def _rows(
                 found.append(value)
             else:
                 kept.append((number, row, marker))
-                values.append(found)
+                read[marker].append(found)
     if not kept:
         number, reason = ignored[0]
         raise InputError(
             f"{name}: none of its {len(table.rows)} rows is complete (line {number}: "
             f"{reason}); correct the places in [source.columns]"
         )
-    return kept, values, ignored
-
-
-def _numbers(
-    columns: Mapping[str, Sequence[ColumnKey]], values: list[list[float]],
-    kept: Sequence[tuple[int, list[str], str]], coverage: float,
-) -> tuple[dict[str, Array], dict[str, str]]:  # fmt: skip
-    """The numbers by column, and the units of the measurement table that they are in."""
-    read, of_row = np.array(values).reshape(len(kept), -1), np.array([row[2] for row in kept])
-    numbers, of = dict[str, Array](), dict[str, str]()
+    of_row, numbers, of = np.array([row[2] for row in kept]), dict[str, Array](), dict[str, str]()
     for marker, own in columns.items():
         rows = np.flatnonzero(of_row == marker)
         for k, c in enumerate(c for c in own if not c.is_text):
             sigma = c.stem.startswith("sigma_")
             of[c.stem] = "um" if sigma else next(iter(FACTORS[quantities(c.unit)[0]]))
-            found = convert(read[rows, k], c.unit, of[c.stem]) / (coverage if sigma else 1.0)
+            values = np.array([values[k] for values in read[marker]])
+            values = convert(values, c.unit, of[c.stem]) / (coverage if sigma else 1.0)
             # Seconds and nanoseconds of a time add up.
-            numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += found
-    return numbers, of
+            numbers.setdefault(c.stem, np.zeros(len(kept)))[rows] += values
+    return kept, numbers, of, ignored
 
 
 def likely_presets(path: Path) -> list[str]:

@@ -137,6 +137,8 @@ class Effect:
     formats: ClassVar[tuple[Format, ...]] = ()
     # One of many causes at once: a diagnosis judges it only in the sum of all components.
     together: ClassVar[bool] = False
+    # The one kind of reading that shows it.
+    seen_in: ClassVar[str] = ""
     # It corrects the arm and names no cause.
     nameless: ClassVar[bool] = False
     # A column of the table that says better what it takes from elsewhere.
@@ -214,7 +216,7 @@ class Effect:
 
     def may_be_missing(self, cell: Cell) -> bool:
         """Whether a diagnosis of this cell's data may suspect it by itself."""
-        return not self.together
+        return not self.together and self.seen_in in ("", cell.model.observe)
 
     def acts(self, place: str, chain: Chain, cell: Cell) -> bool:
         """Whether it moves anything at this place of an arm that is mounted as the cell says."""

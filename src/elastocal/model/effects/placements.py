@@ -145,10 +145,8 @@ class MarkerOrientation(Effect):
     registered = True
     rank = MARKER
     formats = ("rigid", "elastic")
+    seen_in = "pose"
     unknowns = tuple(ParameterSpec(k, "rad", 0.0, 3e-3) for k in ("rx", "ry", "rz"))
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return cell.model.observe == "pose"
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         vector = ca.vertcat(p["rx"], p["ry"], p["rz"])
@@ -165,12 +163,10 @@ class DistanceSensor(Effect):
 
     name = "distance_sensor"
     stage = "tracker"
+    seen_in = "distance"
     at = "tracker"
     registered = True
     rank = STATION
-
-    def may_be_missing(self, cell: Cell) -> bool:
-        return cell.model.observe == "distance"
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.tracker.anchor if cell.tracker.anchor is not None else np.zeros(3)
