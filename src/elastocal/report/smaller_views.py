@@ -344,7 +344,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
         yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
         yield say.Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
     columns = found.assembled.columns
-    first = range(min(FIRST_ROWS, len(found.assembled)))
+    first = range(min(FIRST_ROWS, len(found.table)))
     every = {n: [_cell(columns[n], i) for i in first] for n in columns if n != "note_source"}
     # Whole columns, two blanks apart: a head is not broken.
     ends = np.cumsum([max(map(len, (n, *texts))) + 2 for n, texts in every.items()])
