@@ -503,7 +503,7 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "readings": len(table),
         "configurations": len(table.configuration_labels),
         "markers": list(table.marker_names),
-        "columns": list(found.assembled.columns),
+        "columns": list(found.columns),
         "joined_by": None if joined is None else joined.how,
         "left_out": [] if joined is None else list(joined.left_out),
         "poses_without_point": [] if joined is None else list(joined.unused),

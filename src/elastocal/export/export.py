@@ -333,7 +333,7 @@ class _Writing:
                 "alone are known. Its kinematics and weights are right; before simulating motion "
                 "put in tensors"
                 + (", or export as .xml, which keeps those of the model" * (robot.mjcf is not None))
-                if self.pieces.nominal_masses
+                if self.pieces.masses or self.pieces.chain.masses
                 else "the links have no <inertial> in this file, as their masses are not known"
             ]
         back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF")).chain(base, flange)

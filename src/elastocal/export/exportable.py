@@ -213,11 +213,6 @@ class ExportNumbers:
         joint = self.chain.joints[i]
         return rigid.moved(joint.kind, joint.axis, float(self.offsets[i]))
 
-    @property
-    def nominal_masses(self) -> tuple[LinkMass, ...]:
-        """`masses`, else those of the robot's description, where no weights act in the model."""
-        return self.masses or self.chain.masses
-
     def springs_at(self, site: str) -> dict[Spring, float]:
         return {s: k for s, k in self.springs.items() if s.site == site}
 

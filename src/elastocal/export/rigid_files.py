@@ -129,7 +129,8 @@ def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> 
     Joints bear the table's names and limits (continuous where one has none); masses that are known
     stand with a zero inertia tensor.
     """
-    chain, masses = pieces.calibrated_chain(), pieces.nominal_masses
+    # Masses of the robot's description where no weights act in the model.
+    chain, masses = pieces.calibrated_chain(), pieces.masses or pieces.chain.masses
     lines = []
     if base_frame:
         lines += fixed_link(TRACKER, TRACKER, BASE, pieces.T_tracker_base)

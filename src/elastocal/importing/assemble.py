@@ -25,7 +25,6 @@ from elastocal.importing import joining
 from elastocal.importing.exports import FORCES, Records, Understood, joint_stems, read_records
 from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import (
-    ImportMapping,
     LoadStatesTable,
     MappingTable,
     SourceTable,
@@ -142,21 +141,14 @@ def with_loads_of_names(
 WHOLE = re.compile(r"-?[0-9]{1,15}")
 
 
-@dataclass(frozen=True)
-class Assembled:
-    """`columns` header → n texts or numbers, in the order of the table; `kinds` per joint.
-
-    `origin` (n,) says file and line of each row; `warnings` are sentences for the preview.
-    """
-
-    columns: dict[str, Sequence[str] | NDArray]
-    kinds: tuple[str, ...]
-    origin: list[str]
-    warnings: tuple[str, ...]
+# Header → n texts or numbers, in the order of the table; note_source says where each row is from.
+Columns = dict[str, Sequence[str] | NDArray]
 
 
-def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
-    """A row for each point, in their order.
+def assemble(
+    where: str, points: Records, mapping: MappingTable
+) -> tuple[Columns, tuple[str, ...], list[str]]:
+    """A row for each point, in their order; the kind of each joint; sentences for the preview.
 
     Configurations are those of the names, else of the joint log, else joint values that agree
     within same_pose_deg.  Repeats are numbered in order where the file does not number them.  Times
@@ -182,7 +174,7 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
         numbers |= dict.fromkeys(absent, np.zeros(n))
         units |= dict.fromkeys(absent, "N")
         warnings.append(f"{listed(absent)} in no column: taken as 0 N beside {listed(stated)}")
-    columns: dict[str, Sequence[str] | NDArray] = {"configuration": configuration}
+    columns: Columns = {"configuration": configuration}
     marker = points.texts.get("marker")
     force = np.column_stack([numbers.get(stem, np.zeros(n)) for stem in FORCES])
     keys = zip(configuration, marker or [""] * n, map(tuple, force), strict=True)
@@ -203,9 +195,8 @@ def assemble(where: str, points: Records, mapping: MappingTable) -> Assembled:
         columns["time_s"] = np.round(time - time.min(), 6)
     if any(points.names):
         columns["note_point"] = points.names
-    origin = [points.where(i) for i in range(n)]
-    columns["note_source"] = origin
-    return Assembled(columns, kinds, origin, tuple(warnings))
+    columns["note_source"] = [points.where(i) for i in range(n)]
+    return columns, kinds, warnings
 
 
 def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str]]:
@@ -263,9 +254,9 @@ LARGEST_FORCE_N = 2e5
 LARGEST_SIGMA_M = 5e-3
 
 
-def plausibility(made: Assembled, table: Measurements, observe: str | None) -> list[str]:
+def plausibility(columns: Columns, table: Measurements, observe: str | None) -> list[str]:
     """Sentences about columns that are likely in another unit, and about pairs that are missing."""
-    turning = table.q[:, np.array([kind == "revolute" for kind in made.kinds])]
+    turning = table.q[:, np.array([kind == "revolute" for kind in table.kinds])]
     turned = float(np.degrees(np.abs(turning).max(initial=0.0)))
     span = float(np.degrees(np.ptp(turning, axis=0).max(initial=0.0)))
     several = turning.size > 0 and len(np.unique(table.q, axis=0)) >= 5
@@ -285,7 +276,7 @@ def plausibility(made: Assembled, table: Measurements, observe: str | None) -> l
         (
             (turned > LARGEST_TURN_DEG, f"a joint stands at {turned:.4g}°, more than two turns: "
              "degrees read as radians? Map q#_deg"),
-            (several and "q1_deg" in made.columns and span < SMALLEST_SPREAD_DEG,
+            (several and "q1_deg" in columns and span < SMALLEST_SPREAD_DEG,
              f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"),
             (several and still, f"{listed(still)} never moved; is it mapped to the right column?"),
         ),
@@ -314,7 +305,7 @@ SLACK = 1e-6  # rad or m beyond a limit that rounding explains
 
 
 def against_cell(
-    cell: Cell, table: Measurements, made: Assembled, spherical: bool = False
+    cell: Cell, table: Measurements, columns: Columns, spherical: bool
 ) -> tuple[NominalFit | None, str]:
     """The fit to the nominal arm (None without positions or with few poses), and why the cell's
     limits refuse the table ("" where they do not).
@@ -331,7 +322,7 @@ def against_cell(
         revolute = chain.kinds[j] == "revolute"
         factor, unit = (180 / np.pi, "°") if revolute else (1e3, " mm")
         refused = (
-            f"{made.origin[i]}: joint{j + 1} ({chain.joints[j].name}) at "
+            f"{columns['note_source'][i]}: joint{j + 1} ({chain.joints[j].name}) at "
             f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
             f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} ({len(rows)} of "
             f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
@@ -349,7 +340,7 @@ class Imported:
     """
 
     understood: tuple[Understood, ...]
-    assembled: Assembled
+    columns: Columns
     joined: Joined | None
     text: str
     table: Measurements
@@ -359,14 +350,15 @@ class Imported:
 
 
 def import_files(
-    files: Sequence[Path], mapping: ImportMapping, cell: Cell | None = None, name: str = "data.csv"
-) -> Imported:
+    files: Sequence[Path], mapping: tuple[str, MappingTable], cell: Cell | None = None,
+    name: str = "data.csv",
+) -> Imported:  # fmt: skip
     """Read `files` as `mapping` says, join, convert, and validate the measurement table.
 
     `cell`: the robot that the table must fit: number and kind of joints, markers, limits;
     `name`: what messages call the table.  Nothing is written.
     """
-    where, table = mapping.path, mapping.table
+    where, table = mapping
     names = () if cell is None else tuple(joint.name for joint in load_chain(cell).joints)
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
@@ -407,16 +399,16 @@ def import_files(
             units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
             texts=pose | own.texts,
         )
-    made = assemble(where, points, table)
+    columns, kinds, doubts = assemble(where, points, table)
     # Numbers with the digits that read back exactly.
     cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
-             for values in made.columns.values()]  # fmt: skip
-    text = csv_text(made.columns, zip(*cells, strict=True))
-    observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
+             for values in columns.values()]  # fmt: skip
+    text = csv_text(columns, zip(*cells, strict=True))
+    observe = "position" if any(c.startswith("x_") for c in columns) else "distance"
     try:  # as the reader of `identify` reads it, and as the cell asks for it
         measured = read_measurements(
             f"{name} (not written)",
-            joint_kinds=made.kinds if cell is None else load_chain(cell).kinds,
+            joint_kinds=kinds if cell is None else load_chain(cell).kinds,
             marker_names=() if cell is None else tuple(cell.tool.markers),
             observe=observe if cell is None else cell.model.observe,
             text=text,
@@ -424,15 +416,19 @@ def import_files(
     except InputError as error:
         named = re.search(r"line (\d+)", str(error))
         row = int(named[1]) - 2 if named else -1
-        meant = f" (from {made.origin[row]})" if 0 <= row < len(made.origin) else ""
+        meant = f" (from {points.where(row)})" if 0 <= row < len(points) else ""
         raise InputError(f"{error}{meant}") from None
-    fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
+    fit, refused = (
+        against_cell(cell, measured, columns, spherical) if cell is not None else (None, "")
+    )
     remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]
-    warnings = [*told, *(r.removeprefix("WARNING: ") for r in remarks), *made.warnings]
-    warnings += plausibility(made, measured, None if cell is None else cell.model.observe)
+    warnings = [*told, *(r.removeprefix("WARNING: ") for r in remarks), *doubts]
+    warnings += plausibility(columns, measured, None if cell is None else cell.model.observe)
     if fit is not None and fit.warning:
         warnings.append(fit.warning)
-    return Imported(tuple(understood), made, joined, text, measured, tuple(warnings), fit, refused)
+    return Imported(
+        tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
+    )
 
 
 def _assigned(

@@ -132,7 +132,7 @@ def table_rows(
     passed over and listed.
     """
     guess = NumberCells("auto", settings.thousands, settings.missing, ())
-    places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
+    places = [c.at for c in asked if c.required and c.quantities and isinstance(c.at, int)]
 
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
@@ -569,11 +569,11 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     cells = NumberCells(
         settings.decimal, settings.thousands, settings.missing,
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
-         for c in every if not c.is_text and c.index[0] < len(row)),
+         for c in every if c.quantities and c.index[0] < len(row)),
     )  # fmt: skip
     kept, numbers, of, ignored = _rows(name, table, columns, cells, source.coverage_factor)
     texts = {}
-    for c in (c for c in next(iter(columns.values())) if c.is_text):
+    for c in (c for c in next(iter(columns.values())) if not c.quantities):
         glue = " " if c.stem == "time_text" else "::"
         texts[c.stem] = [glue.join(row[i].strip() for i in c.index) for _, row, _ in kept]
         # A load that is a bare size gets the unit in its header.
@@ -619,7 +619,7 @@ def _rows(
             )
         for marker, own in columns.items():
             found = []
-            for c in (c for c in own if not c.is_text):
+            for c in (c for c in own if c.quantities):
                 value = cells.value(name, number, c.header, row[c.index[0]])
                 if value is None:
                     ignored.append((number, f"no value in column {c.header}"))
@@ -637,7 +637,7 @@ def _rows(
     of_row, numbers, of = np.array([row[2] for row in kept]), dict[str, Array](), dict[str, str]()
     for marker, own in columns.items():
         rows = np.flatnonzero(of_row == marker)
-        for k, c in enumerate(c for c in own if not c.is_text):
+        for k, c in enumerate(c for c in own if c.quantities):
             sigma = c.stem.startswith("sigma_")
             of[c.stem] = "um" if sigma else next(iter(FACTORS[quantities(c.unit)[0]]))
             values = np.array([values[k] for values in read[marker]])
@@ -651,8 +651,8 @@ def likely_presets(path: Path) -> list[str]:
     """The presets that read most rows of a file; none where no preset reads it."""
     rows = dict[str, int]()
     for name in mapping_file.PRESETS:
-        mapping = mapping_file.read_mapping(None, [name])
-        for source in mapping.table.source or ():
+        where, mapping = mapping_file.read_mapping(None, [name])
+        for source in mapping.source or ():
             with suppress(ElastocalError):
-                rows[name] = len(read_records(mapping.path, path, source, UnitsTable()))
+                rows[name] = len(read_records(where, path, source, UnitsTable()))
     return [name for name, n in rows.items() if n == max(rows.values())]

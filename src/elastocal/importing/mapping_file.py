@@ -156,14 +156,6 @@ MAX_BYTES = 1_000_000
 _UNIT = re.compile(r"_[A-Za-z]+$")
 
 
-@dataclass(frozen=True)
-class ImportMapping:
-    """`path` says in messages where it was stated; each source has its preset merged in."""
-
-    path: str
-    table: MappingTable
-
-
 def preset_text(name: str) -> str:
     check_known(name, PRESETS, f"no preset {quoted(name)}")
     folder = resources.files("elastocal.importing") / "presets"
@@ -173,9 +165,9 @@ def preset_text(name: str) -> str:
 def read_mapping(
     path: str | Path | None, presets: Sequence[str] = (), length_unit: str | None = None,
     angle_unit: str | None = None,
-) -> ImportMapping:  # fmt: skip
+) -> tuple[str, MappingTable]:  # fmt: skip
     """The mapping of a file, of presets (one source each), or of both; units given count instead of
-    its own.
+    its own.  Before it, where messages say that it was stated; sources have their presets in them.
 
     A mapping file without [[source]] tables says how to join and convert what `presets` read.
     """
@@ -206,7 +198,7 @@ def read_mapping(
             f"{where}: {place('source', k)} has neither preset nor columns; say where the "
             'numbers stand, as in x_mm = "X"',
         )
-    return ImportMapping(where, table)
+    return where, table
 
 
 def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
@@ -258,6 +250,7 @@ _QUANTITIES = _quantities()
 class ColumnKey:
     """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto").
 
+    `quantities` that its units are of, the usual first (joints are angles first), none of a text;
     `at`: where the mapping has it; `required`: it is of [source.columns], not [source.optional].
     Found in a file, it has its `index` among the cells of a row (several are joined, for texts),
     the file's own name and its unit there.
@@ -266,7 +259,7 @@ class ColumnKey:
     key: str
     stem: str
     unit: str
-    is_text: bool = False
+    quantities: tuple[str, ...] = ()
     at: Where = ""
     required: bool = True
     index: tuple[int, ...] = ()
@@ -285,15 +278,6 @@ class ColumnKey:
         return replace(self, at=str(self.at).replace(EACH, name)) if self.of_each_marker else self
 
     @property
-    def quantities(self) -> tuple[str, ...]:
-        return _QUANTITIES[_of_any_joint(self.stem)]
-
-    @property
-    def default(self) -> str:
-        # Joints are angles first.
-        return self.quantities[0]
-
-    @property
     def is_template(self) -> bool:
         """q#: one column for each joint."""
         return self.stem.endswith("#")
@@ -305,7 +289,7 @@ class ColumnKey:
 
 def column_key(where: str, key: str) -> ColumnKey:
     if _of_any_joint(key) in TEXTS:
-        return ColumnKey(key, key, "", is_text=True)
+        return ColumnKey(key, key, "")
     stem, unit = key, ""
     if _of_any_joint(key) not in _QUANTITIES:
         stem, _, unit = key.rpartition("_")
@@ -317,13 +301,11 @@ def column_key(where: str, key: str) -> ColumnKey:
             f"{listed(valid, 40)}"
         )
     units = [u for quantity in _QUANTITIES[general] for u in FACTORS[quantity]]
-    if unit == AUTO and units != [""]:
-        return ColumnKey(key, stem, AUTO)
-    if unit not in units:
+    if unit not in units and (unit != AUTO or units == [""]):
         ways = [column(stem, u) for u in units]
         what = f"the unit {unit} is not one of its" if unit else "has no unit"
         raise InputError(f"{where}: column {quoted(key)}: {what}; write {listed(ways)}")
-    return ColumnKey(key, stem, unit)
+    return ColumnKey(key, stem, unit, _QUANTITIES[general])
 
 
 MOST_JOINTS = 64
@@ -350,11 +332,11 @@ def wanted(
             f"{name.replace('#', '1')} = {at}, … for columns by number",
         )
         require(
-            target.is_text or not isinstance(at, list),
+            not target.quantities or not isinstance(at, list),
             f"{where}: {name} takes one column; only texts such as name are joined from several",
         )
         require(
-            EACH not in str(at) or (target.of_each_marker and not target.is_text),
+            EACH not in str(at) or (target.of_each_marker and bool(target.quantities)),
             f"{where}: {name} = {quoted(str(at))}: {EACH} stands for the markers of a row in "
             'places of numbers, as in x_mm = "*_x"',
         )
@@ -438,13 +420,13 @@ def resolve(
             if found is None:
                 break
             columns.append(_with_unit(source, found, units, hint))
-    unstated = {c: column(c.stem, next(iter(FACTORS[c.default]))) for c in columns
+    unstated = {c: column(c.stem, next(iter(FACTORS[c.quantities[0]]))) for c in columns
                 if c.unit == AUTO}  # fmt: skip
     if not unstated:
         return tuple(columns)
     needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in unstated
-                             if (unit := USUAL.get(q := c.default)))]  # fmt: skip
-    if by_key := [key for c, key in unstated.items() if c.default not in USUAL]:
+                             if (unit := USUAL.get(q := c.quantities[0])))]  # fmt: skip
+    if by_key := [key for c, key in unstated.items() if c.quantities[0] not in USUAL]:
         needed.append(f"{listed(by_key)} in [source.columns]")
     several = len(unstated) > 1
     raise InputError(
@@ -513,7 +495,7 @@ def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
 def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | None) -> ColumnKey:
     """The column with its unit found out (AUTO where nothing says it), or compared with what the
     file says."""
-    if target.is_text or target.unit == "":
+    if target.unit == "":
         return target
     stated = split_unit(target.header)[1]
     if stated is not None and not set(quantities(stated)) & set(target.quantities):
@@ -526,6 +508,6 @@ def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | No
             )
         return target
     told = known_unit(hint) if hint else None
-    general = {"length": units.length, "angle": units.angle}.get(target.default)
+    general = {"length": units.length, "angle": units.angle}.get(target.quantities[0])
     fitting = told if told and set(quantities(told)) & set(target.quantities) else None
     return replace(target, unit=stated or fitting or general or AUTO)

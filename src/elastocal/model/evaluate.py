@@ -226,7 +226,12 @@ class BatchFunction:
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
         few = n <= FEW * -(-n // max(chunk, 1)) and dtype == np.float64
         if few and chosen_backend(self._asked) == "auto":
-            self._by_casadi(arrays, results)
+            # It takes rows side by side, and what is the same in all of them once.
+            found = self._function.call([ca.DM(a.T if a.ndim == 2 else a) for a in arrays])
+            for result, value in zip(results, found, strict=True):
+                if result.size:
+                    side_by_side = value.full().reshape(result.shape[1], -1, result.shape[2])
+                    result[:] = side_by_side.transpose(1, 0, 2)
             return results
         width = self._by_numpy[1] + sum(r * c for r, c in self.shapes)
         blocks = row_blocks(n, min(chunk, max(LARGEST_BUFFER // max(width, 1), 1)))
@@ -265,14 +270,6 @@ class BatchFunction:
                     outputs[a][b] = held[out]
             for f, output in zip(flat, outputs, strict=True):
                 f[block] = output.T
-
-    def _by_casadi(self, arrays: Sequence[NDArray], results: Sequence[NDArray]) -> None:
-        """CasADi takes rows side by side, and what is the same in all of them once."""
-        found = self._function.call([ca.DM(a.T if a.ndim == 2 else a) for a in arrays])
-        for result, value in zip(results, found, strict=True):
-            _, rows, columns = result.shape
-            if result.size:
-                result[:] = value.full().reshape(rows, -1, columns).transpose(1, 0, 2)
 
     def _rows(self, inputs: Sequence[NDArray]) -> tuple[list[NDArray], int]:
         arrays = [np.asarray(a) for a in inputs]

@@ -343,7 +343,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
         rows = [(name, column, unit or "–") for name, column, unit in seen.columns]
         yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
         yield say.Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
-    columns = found.assembled.columns
+    columns = found.columns
     first = range(min(FIRST_ROWS, len(found.table)))
     every = {n: [_cell(columns[n], i) for i in first] for n in columns if n != "note_source"}
     # Whole columns, two blanks apart: a head is not broken.

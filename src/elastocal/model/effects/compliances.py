@@ -126,16 +126,13 @@ def weight_torque(chain: Chain, i: int) -> float:
     """
     axis = chain.joints[i].axis
     ends = [T[:3, 3] for T in link_ends(chain)]
-
-    def off_axis(point: Array) -> float:
-        return float(np.linalg.norm(point - axis * (axis @ point)))
-
     moment, reach = 0.0, 0.0
     for j, body in enumerate(chain.masses[i:], start=i):
         # Only the joint's own link keeps its direction to the axis in every pose.
-        length = off_axis if j == i else np.linalg.norm
-        moment += body.mass * (reach + float(length(body.com)))
-        reach += float(length(ends[j]))
+        along = np.outer(axis, axis) if j == i else np.zeros((3, 3))
+        to_com, to_end = (float(np.linalg.norm(p - along @ p)) for p in (body.com, ends[j]))
+        moment += body.mass * (reach + to_com)
+        reach += to_end
     return STANDARD_GRAVITY * moment
 
 

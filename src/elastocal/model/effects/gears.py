@@ -54,28 +54,25 @@ class EncoderScale(DrivenEffect):
         return p["encoder_scale"] * arm.q_commanded[index(place)]
 
 
+def sine_and_cosine(key: str, typical: float) -> tuple[ParameterSpec, ...]:
+    return tuple(ParameterSpec(f"{key}_{part}", "rad", 0.0, typical) for part in ("sin", "cos"))
+
+
 class GearHarmonic(DrivenEffect):
     """δq = a sin Nq + b cos Nq with the commanded joint angle q; a and b in rad.
 
-    A subclass states the order N, the prefix of its two parameters' keys and their typical size.
+    A subclass states the order N and the two parameters.
     """
 
     stage = "transmission"
     at = "turning joints"
     entry = JointMotion()
-    prefix: ClassVar[str]
-    typical: ClassVar[float]
     N: ClassVar[int | None] = None  # periods of the error in one turn; None: a setting says it
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(
-            ParameterSpec(f"{self.prefix}_{part}", "rad", 0.0, self.typical)
-            for part in ("sin", "cos")
-        )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         phase = (self.N or p["ripple_order"]) * arm.q_commanded[index(place)]
-        return p[f"{self.prefix}_sin"] * ca.sin(phase) + p[f"{self.prefix}_cos"] * ca.cos(phase)
+        a, b = (p[spec.key] for spec in self.unknowns)
+        return a * ca.sin(phase) + b * ca.cos(phase)
 
 
 class GearEccentricity(GearHarmonic):
@@ -89,8 +86,7 @@ class GearEccentricity(GearHarmonic):
     """
 
     name = "gear_eccentricity"
-    prefix = "eccentricity"
-    typical = 1e-4
+    unknowns = sine_and_cosine("eccentricity", 1e-4)
     N = 1
 
 
@@ -103,8 +99,7 @@ class GearSecondHarmonic(GearHarmonic):
     """
 
     name = "gear_second_harmonic"
-    prefix = "harmonic2"
-    typical = 5e-5
+    unknowns = sine_and_cosine("harmonic2", 5e-5)
     N = 2
 
 
@@ -118,8 +113,7 @@ class GearRipple(GearHarmonic):
     """
 
     name = "gear_ripple"
-    prefix = "ripple"
-    typical = 5e-5
+    unknowns = sine_and_cosine("ripple", 5e-5)
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
         orders = cell.model.gear_ripple_orders
