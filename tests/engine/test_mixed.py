@@ -9,7 +9,7 @@ import pytest
 import statsmodels.formula.api as smf
 from engine.dense import Table, dense, readings
 
-from elastocal.engine.mixed import LogPrior, fit
+from elastocal.engine.mixed import Expected, LogPrior, fit
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_choice import NoisyReadings, fitted, prior_of_groups
 from elastocal.identification.noise_structure import STRUCTURES, Kind, Readings
@@ -47,7 +47,7 @@ def test_likelihood_slope_and_information_are_those_of_all_rows(table, name, sha
     # The average of observed and expected curvature.
     average = np.outer(theta, theta) * (whole.observed + whole.information)
     np.testing.assert_allclose(information, average, rtol=1e-6, atol=1e-6 * np.abs(average).max())
-    at = model.expected(model.state(theta))
+    at = Expected(model.state(theta))
     scale = np.sqrt(np.diag(whole.information))
     shape = np.outer(scale, scale)
     np.testing.assert_allclose(at.information / shape, whole.information / shape, atol=1e-8)

@@ -243,12 +243,20 @@ class Mixed:
             information = 2 * self.prior.curved(information / 2)
         return value, slope, information
 
-    def expected(self, state: State) -> Expected:
-        """The expected information on θ at a state, and what Kenward and Roger need."""
-        K, p = self.K, len(self.precision)
+
+LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if x were known
+
+
+class Expected:
+    """The expected information on θ at a state, ½ tr P K_k P K_l (K, K), and what Kenward and Roger
+    need: twice the same diagonal were x known (K,), BᵀV⁻¹K_kV⁻¹B (K, p, p), Φ, and of each pack
+    R⁻¹K_lR⁻ᵀR⁻¹B (C, L, m, p) with the numbers (C, L) of these parts."""
+
+    def __init__(self, state: State) -> None:
+        K, p = len(state.theta), len(state.x)
         Phi, half = state.Phi, state.inverse.T
         C, pairs, known = np.zeros((K, p, p)), np.zeros((K, K)), np.zeros(K)
-        turned = []
+        turned: list[tuple[IntArray, Array]] = []
         for w in state.packs:
             A = np.concatenate([part.turned(w.root) for part in w.pack.parts], axis=1)
             flat, left = A.reshape(*A.shape[:2], -1), A  # (C, k, m, m)
@@ -263,23 +271,8 @@ class Mixed:
             known += w.pack.added((flat**2).sum(axis=2), K)
         rotated = (half.T @ C @ half).reshape(K, -1)
         information = 0.5 * (pairs + rotated @ rotated.T)
-        information = (information + information.T) / 2
-        return Expected(information, known, C, Phi, tuple(turned))
-
-
-LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if x were known
-
-
-@dataclass(frozen=True)
-class Expected:
-    """½ tr P K_k P K_l (K, K), the same diagonal were x known, twice (K,), BᵀV⁻¹K_kV⁻¹B (K, p, p),
-    Φ, and of each pack R⁻¹K_lR⁻ᵀR⁻¹B (C, L, m, p) with the numbers (C, L) of these parts."""
-
-    information: Array
-    known: Array
-    C: Array
-    Phi: Array
-    turned: tuple[tuple[IntArray, Array], ...]
+        self.information = (information + information.T) / 2
+        self.known, self.C, self.Phi, self.turned = known, C, Phi, turned
 
     @property
     def told(self) -> BoolArray:
@@ -346,7 +339,7 @@ class MixedFit:
 
     @cached_property
     def expected(self) -> Expected:
-        return self.model.expected(self.state)
+        return Expected(self.state)
 
     @cached_property
     def _curvature(self) -> Array:
@@ -370,10 +363,6 @@ class MixedFit:
                 scale, scale
             )
         return out
-
-    def kenward_roger(self, rows: Array) -> tuple[Array, Array]:
-        """Covariance (k, k) and degrees of freedom (k,) of combinations `rows` (k, p) of x."""
-        return self.expected.kenward_roger(self.covariance, rows)
 
     @cached_property
     def log_likelihood(self) -> float:

@@ -22,7 +22,7 @@ from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.knowledge import ROUND_OFF, ActiveConstraint, Matrix, System
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.text import listed
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray
 
 # Linear equalities, by the space that they leave.
 
@@ -69,7 +69,6 @@ UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
 STEEPEST = 1e7  # deviations from the free minimum: across them an interval has no width left
 
 
-@dataclass(frozen=True)
 class Reduced:
     """|t − J x|² = constant + |u|² on x = unit · (centre + T u), all x that the equalities allow,
     where rows u ≥ least and every matrix ⪰ 0.
@@ -77,37 +76,24 @@ class Reduced:
     `unit` (p,) makes the columns of J unit length, so that slacks and tolerances do not depend on
     a parameter's physical unit; `limits` are the constraints on x/unit − centre.  The rows (k, q)
     are the finite bounds, lower ones first, of unit length: `sides` (k,) is 1 for a lower bound and
-    −1 for an upper one of parameter `of` (k,), `lengths` (k,) what a row was divided by.
+    −1 for an upper one of parameter `of_row` (k,), `lengths` (k,) what a row was divided by.
+
+    Raises InputError where equalities contradict each other, which it names, and
+    InsufficientDataError where they and J (rows, p) leave a direction undetermined.
     """
 
-    J: Array
-    t: Array
-    system: System
-    unit: Array
-    centre: Array
-    T: Array
-    limits: System
-    rows: Array
-    least: Array
-    of_row: IntArray
-    sides: Array
-    lengths: Array
-    matrices: tuple[Matrix, ...]
-
-    @classmethod
-    def of(cls, J: Array, t: Array, system: System) -> Reduced:
-        """Raises InputError where equalities contradict each other, which it names, and
-        InsufficientDataError where they and J (rows, p) leave a direction undetermined."""
+    def __init__(self, J: Array, t: Array, system: System) -> None:
+        self.J, self.t, self.system = J, t, system
         norms = np.linalg.norm(J, axis=0)
-        unit = 1 / np.where(norms > 0, norms, 1.0)
+        self.unit = unit = 1 / np.where(norms > 0, norms, 1.0)
         zero = np.zeros(len(unit))
         limits = system.moved(zero, unit)
         origin, basis, gap = equality_space(limits.A, limits.b)
         if gap > CONTRADICTION * max(1.0, float(np.max(np.abs(origin), initial=0.0))):
             raise_conflict(limits)
-        centre, T = _free_minimum(J * unit, t, origin, basis, system.names)
+        self.centre, self.T = centre, T = _free_minimum(J * unit, t, origin, basis, system.names)
         # About the free minimum numbers are as small as the constraints allow.
-        limits = limits.moved(centre, zero + 1)
+        self.limits = limits = limits.moved(centre, zero + 1)
         below, above = (np.flatnonzero(np.isfinite(b)) for b in (limits.lower, limits.upper))
         of, sides = np.append(below, above), np.repeat([1.0, -1.0], [len(below), len(above)])
         rows, least = sides[:, None] * T[of], np.append(limits.lower[below], -limits.upper[above])
@@ -116,15 +102,12 @@ class Reduced:
         moves = lengths > RANK * np.max(np.linalg.norm(T, axis=1), initial=0.0)
         if np.max(least[~moves], initial=0.0) > RANK:
             raise_conflict(limits)
-        matrices = tuple(
+        self.matrices = tuple(
             replace(m, slopes=np.tensordot(T.T, m.slopes, axes=1)).balanced()
             for m in limits.matrices
         )
-        rows, least, lengths = rows[moves], least[moves], lengths[moves]
-        return cls(
-            J, t, system, unit, centre, T, limits, rows / lengths[:, None], least / lengths,
-            of[moves], sides[moves], lengths, matrices,
-        )  # fmt: skip
+        self.lengths, self.of_row, self.sides = lengths[moves], of[moves], sides[moves]
+        self.rows, self.least = rows[moves] / self.lengths[:, None], least[moves] / self.lengths
 
     def minimum(self, stated: System | None = None) -> Minimum:
         """The minimum under all constraints; `active` in the terms of `stated`, if given, where x
@@ -297,7 +280,7 @@ class Reduced:
 
 def minimise(J: Array, t: Array, system: System) -> Minimum:
     """Minimise |t − J x|² over the system's x; errors as in `Reduced`."""
-    return Reduced.of(J, t, system).minimum()
+    return Reduced(J, t, system).minimum()
 
 
 def _free_minimum(

@@ -180,7 +180,6 @@ def _changed(fit: FitToGood, members: BoolArray, sign: int) -> tuple[float, floa
     return max(rss, 0.0), fit.dof + sign * e.size, G, c
 
 
-@dataclass(frozen=True)
 class _Judged:
     """Readings y (n, size) ≈ B z, whitened, B (n, size, p) per prior deviation of the parameters
     `names`; `off` (n, …) are their errors in m, `good` (n,) those to rely on.
@@ -188,14 +187,39 @@ class _Judged:
     `groups` are those by name; for each of the `lines` (n,) there is a `marker`.
     """
 
-    B: Array
-    y: Array
-    off: Array
-    good: BoolArray
-    names: tuple[str, ...]
-    lines: IntArray
-    marker: NDArray[Any]
-    groups: list[Group]
+    def __init__(
+        self, whole: Solution, clean: Solution, noise: NoiseFit | None, good: BoolArray,
+        residual: Array | None,
+    ) -> None:  # fmt: skip
+        problem, columns = whole.problem, clean.fit.columns
+        if residual is not None:
+            columns = columns[~np.isin(columns, clean.reduction.with_prior)]
+        observed, table = problem.observations, problem.observations.table
+        readings = linearised(problem.model, observed, clean.fit.x, columns)
+        if residual is not None:
+            readings = replace(readings, e=residual)
+        width = prior_widths(clean.problem)[columns]
+        B, e = readings.B.reshape(len(observed.value), -1) * width, readings.e.ravel()
+        shared = noise is not None and (
+            bool((noise.fit.common > 0).any()) or noise.lasting is not None
+        )
+        if noise is None:
+            B, e = problem.weights.apply(B), problem.weights.apply(e)
+        else:
+            own, weights = own_noise(noise.fit, readings)[0], weights_of(noise, readings)
+            if shared and weights.whiten is not None:
+                e = block_diagonal(own) @ (weights.whiten.T @ weights.beside(weights.apply(e)))
+            root = block_diagonal(inverse_factor(own))
+            B, e = root @ B, root @ e
+        lead, fitted = observed.lead, [problem.model.parameters[c] for c in columns]
+        own_places = {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
+        self.B, self.y = B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1)
+        self.off, self.good, self.names = readings.e[:, :3], good, [p.name for p in fitted]
+        self.lines, self.marker = table.row[lead], np.array(table.marker_names)[table.marker[lead]]
+        self.groups = list(_groups("marker", self.marker, own_places))
+        if not shared:
+            visited = np.array(table.configuration_labels)[table.configuration[lead]]
+            self.groups += _groups("configuration", visited)
 
     @cached_property
     def tests(self) -> dict[Level, int]:
@@ -330,36 +354,7 @@ def report_faulty(
 
     None for a table too large for B.
     """
-    problem, columns = whole.problem, clean.fit.columns
-    if problem.large:
-        return None
-    if residual is not None:
-        columns = columns[~np.isin(columns, clean.reduction.with_prior)]
-    observed, table = problem.observations, problem.observations.table
-    readings = linearised(problem.model, observed, clean.fit.x, columns)
-    if residual is not None:
-        readings = replace(readings, e=residual)
-    width = prior_widths(clean.problem)[columns]
-    B, e = readings.B.reshape(len(observed.value), -1) * width, readings.e.ravel()
-    shared = noise is not None and (bool((noise.fit.common > 0).any()) or noise.lasting is not None)
-    if noise is None:
-        B, e = problem.weights.apply(B), problem.weights.apply(e)
-    else:
-        own, weights = own_noise(noise.fit, readings)[0], weights_of(noise, readings)
-        if shared and weights.whiten is not None:
-            e = block_diagonal(own) @ (weights.whiten.T @ weights.beside(weights.apply(e)))
-        root = block_diagonal(inverse_factor(own))
-        B, e = root @ B, root @ e
-    lead, fitted = observed.lead, [problem.model.parameters[c] for c in columns]
-    own_places = {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
-    marker = np.array(table.marker_names)[table.marker[lead]]
-    visited = np.array(table.configuration_labels)[table.configuration[lead]]
-    groups = [*_groups("marker", marker, own_places), *_groups("configuration", visited)]
-    return _Judged(
-        B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1), readings.e[:, :3], good,
-        tuple(p.name for p in fitted), table.row[lead], marker,
-        [group for group in groups if not shared or group.level == "marker"],
-    ).report()  # fmt: skip
+    return None if whole.problem.large else _Judged(whole, clean, noise, good, residual).report()
 
 
 def _groups(

@@ -20,7 +20,7 @@ from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Severity
 from elastocal.identification.sentences import AT_BOUND, STATE_NOISE, made, more_poses
 from elastocal.identification.solve import Solution
-from elastocal.identification.start import OF_A_TARGET, SCALED, linear_fits
+from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
@@ -322,7 +322,7 @@ def scale_of(result: Calibration) -> float | None:
         return None
     table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
     flange = result.model.rigid.flange_poses(table)
-    found = linear_fits(flange[None], np.asarray(table.position), table.marker)
+    found = LinearFits(flange[None], np.asarray(table.position), table.marker)
     if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
         return None
     size = np.linalg.svd(found.matrix[0], compute_uv=False)

@@ -53,7 +53,7 @@ class KnownFit:
         x, rows = self.fit.x[self.fit.columns], self.fit.r_factor.augmented
         J, lack = np.vstack([rows[:, :-1], self.known.P]), self.known.target - self.known.P @ x
         limits = self.known.system.moved(x, np.ones(len(x)))
-        return Reduced.of(J, np.concatenate([rows[:, -1], lack]), limits)
+        return Reduced(J, np.concatenate([rows[:, -1], lack]), limits)
 
     @cached_property
     def best(self) -> Minimum:
@@ -127,7 +127,7 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     at = objective.evaluate(u)
     for _ in range(MOST_STEPS):
         A, b = objective.rows(u, at)
-        reduced = Reduced.of(A, b, objective.limits.moved(u, np.ones(len(u))))
+        reduced = Reduced(A, b, objective.limits.moved(u, np.ones(len(u))))
         best = reduced.minimum()
         step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
         while True:

@@ -106,29 +106,17 @@ class PriorRows:
         return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
 
 
-@dataclass(frozen=True)
 class Objective:
     """|e(u)|² + |target − P u|² under the `limits` on u, where X[columns] = x[columns] + size · u
     and the other parameters are x (parameters,)."""
 
-    problem: Problem
-    columns: IntArray
-    x: Array
-    size: Array
-    known: PriorRows
-
-    @cached_property
-    def P(self) -> Array:
-        return self.known.P * self.size
-
-    @cached_property
-    def target(self) -> Array:
-        return self.known.target - self.known.P @ self.x[self.columns]
-
-    @cached_property
-    def limits(self) -> System | None:
-        system = self.known.system
-        return None if system is None else system.moved(self.x[self.columns], self.size)
+    def __init__(
+        self, problem: Problem, columns: IntArray, x: Array, size: Array, known: PriorRows
+    ) -> None:
+        self.problem, self.columns, self.x, self.size = problem, columns, x, size
+        self.P, self.target = known.P * size, known.target - known.P @ x[columns]
+        self.system = known.system
+        self.limits = None if self.system is None else self.system.moved(x[columns], size)
 
     def evaluate(self, u: Array) -> Evaluation:
         """e, and the R factor of it and of B per unit of u; ElastocalError where the model has no
@@ -144,7 +132,7 @@ class Objective:
 
     def values(self, u: Array) -> Array:
         """X (parameters,), what lies at its bound but for rounding on it."""
-        values, system = moved(self.x, self.columns, self.size * u), self.known.system
+        values, system = moved(self.x, self.columns, self.size * u), self.system
         if system is not None:
             own = values[self.columns]
             for bound in (system.lower, system.upper):

@@ -25,7 +25,6 @@ from elastocal.identification.start import (
     SCALED,
     LinearFits,
     Registration,
-    linear_fits,
     nominal_problem,
     register,
 )
@@ -231,7 +230,7 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
         points += [(swapped, ("with zenith angles read as elevations or the other way round",))]
     found: list[tuple[float, float, Alternative]] = []
     for place, of_angles in points:
-        fits = linear_fits(flange, place, table.marker)
+        fits = LinearFits(flange, place, table.marker)
         for k in np.flatnonzero(np.isfinite(fits.left)):
             undone, more = _of_positions(place, fits, int(k), spherical)
             words = [*maps[k].words, *of_angles, *more]
@@ -340,7 +339,7 @@ def _blocks(
         rows = np.flatnonzero((visit >= first) & (visit < first + BLOCK))
         own = shifts[(rows[0] + shifts >= 0) & (rows[-1] + shifts < len(table))]
         at = rows + own[:, None]
-        fits = linear_fits(flange[at], np.asarray(table.position)[rows], table.marker[at])
+        fits = LinearFits(flange[at], np.asarray(table.position)[rows], table.marker[at])
         found += [(left > NEAR / 2, abs(s), left, first, rows, int(s))
                   for s, left in zip(own.tolist(), fits.left.tolist(), strict=True)]  # fmt: skip
     found.sort(key=lambda one: one[:4])
@@ -461,7 +460,7 @@ def _placed(model: Model, table: Measurements) -> bool:
         return True
     some = table.take(np.arange(min(len(table), SAMPLE)))
     flange = model.rigid.flange_poses(some)
-    found = linear_fits(flange[None], np.asarray(some.position), some.marker)
+    found = LinearFits(flange[None], np.asarray(some.position), some.marker)
     rigid = found.determinant[0] > 0 and abs(found.scale[0] - 1) < OF_A_UNIT
     return bool(rigid and found.left[0] <= POOR)
 

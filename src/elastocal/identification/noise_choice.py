@@ -247,7 +247,7 @@ class Fitted(MixedFit):
         """T x (p,) of the parameters x without the coefficients of a course in time, which come
         last; its covariance by Kenward and Roger, and degrees of freedom."""
         rows = np.pad(T, ((0, 0), (0, len(self.state.x) - len(T))))
-        return rows @ self.state.x, *self.kenward_roger(rows)
+        return rows @ self.state.x, *self.expected.kenward_roger(self.covariance, rows)
 
     def of(self, readings: Readings) -> list[tuple[Deviation, float]]:
         """The deviations that these readings share, be they those fitted or others."""

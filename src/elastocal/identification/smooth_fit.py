@@ -217,34 +217,26 @@ STILL = 0.05  # relative change of the noise at which the rounds end
 LEAST_GAIN, CERTAIN = 0.01, 50.0
 
 
-@dataclass(frozen=True)
 class Functions:
-    """What has a prior: columns (shrunk,), in groups (shrunk,) of one scale each.
+    """What of the parameters `free` has a prior: columns (shrunk,), in groups (shrunk,) of one
+    scale each.
 
-    First the smooth functions `groups`, then parameters of known size, those of an effect at a
-    place that have one unit together.
+    First the smooth functions `groups`, then parameters of known size, `sized`, those of an effect
+    at a place that have one unit together.
     """
 
-    groups: tuple[SmoothGroup, ...]
-    columns: IntArray
-    group: IntArray
-    std: Array
-    nominal: Array
-
-    @classmethod
-    def of(cls, model: Model, free: IntArray, sized: IntArray) -> Functions:
-        """Those of the parameters `free`, and the parameters `sized`."""
-        own = [g for g in smooth_groups(model) if np.isin(g.columns, free).any()]
-        columns = [c[np.isin(c, free)] for c in (g.columns.ravel() for g in own)]
+    def __init__(self, model: Model, free: IntArray, sized: IntArray) -> None:
+        self.groups = [g for g in smooth_groups(model) if np.isin(g.columns, free).any()]
+        columns = [c[np.isin(c, free)] for c in (g.columns.ravel() for g in self.groups)]
         alike: dict[tuple[str, str, str], list[int]] = {}
         for c in sized.tolist():
             p = model.parameters[c]
             alike.setdefault((p.effect, p.where, p.unit), []).append(c)
         columns += [np.array(same) for same in alike.values()]
-        group = np.repeat(np.arange(len(columns)), [len(c) for c in columns])
-        every = np.concatenate(columns)
-        std = np.array([model.parameters[c].typical for c in every], dtype=float)
-        return cls(tuple(own), every, group, std, model.nominal[every])
+        self.group = np.repeat(np.arange(len(columns)), [len(c) for c in columns])
+        self.columns = np.concatenate(columns)
+        self.std = np.array([model.parameters[c].typical for c in self.columns], dtype=float)
+        self.nominal = model.nominal[self.columns]
 
     def rows(self, factor: RFactor, x: Array) -> LinearRows:
         """From the R factor of the free ordinary columns and these at x."""
@@ -324,7 +316,7 @@ def fit_smooth(course: Course) -> MethodResult:
     model, size = problem.model, problem.observations.size
     for sized in (sized_of(model, free), free[:0]):
         course.progress("fitting smooth functions")
-        search = _Search(course, Functions.of(model, free, sized))
+        search = _Search(course, Functions(model, free, sized))
         fit, noise, good = search.settled(~course.faulty)
         fit, cross = search.without_those_that_harm(fit)
         held = rms_3d(cross[0], size)

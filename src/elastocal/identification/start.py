@@ -33,45 +33,32 @@ OF_A_TARGET = 0.05
 SCALED = 0.005  # no arm's lengths are this far off together, relatively: the readings' are
 
 
-@dataclass(frozen=True)
 class LinearFits:
-    """Of K joint tables: A (K, 3, 3), and the rms (K,) in m that is left in each component,
-    infinite where A is no rotation with a scale."""
+    """Fits of readings `points` (n, 3) of `marker` (n,) or (K, n) to flanges (K, n, 4, 4): A
+    (K, 3, 3), the rms (K,) in m that is left in each component, infinite where A is no rotation
+    with a scale, and by what the readings (K,) are to be multiplied, `scale`."""
 
-    matrix: Array
-    left: Array
-
-    @property
-    def determinant(self) -> Array:
-        return np.linalg.det(self.matrix)
-
-    @property
-    def scale(self) -> Array:
-        """By what the readings (K,) are to be multiplied."""
-        return np.cbrt(np.abs(self.determinant))
-
-
-def linear_fits(flange: Array, points: Array, marker: IntArray) -> LinearFits:
-    """Fits of readings `points` (n, 3) of `marker` (n,) or (K, n) to flanges (K, n, 4, 4)."""
-    marker = np.broadcast_to(marker, flange.shape[:2])
-    own = marker[..., None, None, None] == np.arange(int(marker.max()) + 1)[:, None]
-    turned = (flange[..., :3, None, :3] * own).reshape(*marker.shape, 3, -1)
-    G = np.concatenate([turned, flange[..., :3, 3:]], axis=3)
-    # Rows are components of a reading, one after the other; A and s are the same for all tables
-    # and are fitted along by an orthonormal basis.
-    Q, R = np.linalg.qr(np.hstack([points - points.mean(axis=0), np.ones((len(points), 1))]))
-    along = np.einsum("na,knrm->karm", Q, G)
-    off = (G - np.einsum("na,karm->knrm", Q, along)).reshape(len(G), -1, G.shape[3])
-    X, y = off[..., :-1], off[..., -1:]
-    Xt = X.transpose(0, 2, 1)
-    m = -np.linalg.pinv(Xt @ X, rcond=DIGITS, hermitian=True) @ (Xt @ y)
-    left = np.sqrt(((X @ m + y) ** 2).mean(axis=(1, 2)))
-    A = np.linalg.pinv(R)[:3] @ (
-        along[..., -1] + np.einsum("karm,km->kar", along[..., :-1], m[..., 0])
-    )
-    size = np.linalg.svd(A, compute_uv=False)
-    left[~(size[:, 0] <= UNSKEWED * size[:, -1])] = np.inf
-    return LinearFits(A, left)
+    def __init__(self, flange: Array, points: Array, marker: IntArray) -> None:
+        marker = np.broadcast_to(marker, flange.shape[:2])
+        own = marker[..., None, None, None] == np.arange(int(marker.max()) + 1)[:, None]
+        turned = (flange[..., :3, None, :3] * own).reshape(*marker.shape, 3, -1)
+        G = np.concatenate([turned, flange[..., :3, 3:]], axis=3)
+        # Rows are components of a reading, one after the other; A and s are the same for all tables
+        # and are fitted along by an orthonormal basis.
+        Q, R = np.linalg.qr(np.hstack([points - points.mean(axis=0), np.ones((len(points), 1))]))
+        along = np.einsum("na,knrm->karm", Q, G)
+        off = (G - np.einsum("na,karm->knrm", Q, along)).reshape(len(G), -1, G.shape[3])
+        X, y = off[..., :-1], off[..., -1:]
+        Xt = X.transpose(0, 2, 1)
+        m = -np.linalg.pinv(Xt @ X, rcond=DIGITS, hermitian=True) @ (Xt @ y)
+        left = np.sqrt(((X @ m + y) ** 2).mean(axis=(1, 2)))
+        self.matrix = np.linalg.pinv(R)[:3] @ (
+            along[..., -1] + np.einsum("karm,km->kar", along[..., :-1], m[..., 0])
+        )
+        size = np.linalg.svd(self.matrix, compute_uv=False)
+        left[~(size[:, 0] <= UNSKEWED * size[:, -1])] = np.inf
+        self.left, self.determinant = left, np.linalg.det(self.matrix)
+        self.scale = np.cbrt(np.abs(self.determinant))
 
 
 # A start from nothing: where base and markers are, from the nominal arm and the readings.
@@ -139,7 +126,7 @@ def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
         problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
     starts = problem.base_rotation[None]
     if problem.free_base:
-        linear = linear_fits(problem.flange[None], problem.points, problem.marker).matrix[0]
+        linear = LinearFits(problem.flange[None], problem.points, problem.marker).matrix[0]
         U, _, Vt = np.linalg.svd(linear.T)
         body = _body_points(problem, problem.start_markers)
         starts = np.stack([
