@@ -21,7 +21,6 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.diagnosis.unknown import Generic
-from elastocal.engine.mixed import ROUNDING
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
@@ -37,13 +36,11 @@ from elastocal.units import Array
 #
 #     log ev(s) = ½ Σ_k [s²β_k² / (1 + s²λ_k) − log(1 + s²λ_k)].
 
-FEW = 3  # columns of a group that is multiplied element by element
-
 
 @dataclass(frozen=True)
 class Spectrum:
     """V groups of K columns: eigenvalues `lam` (V, K) of A, `beta` (V, K) = Uᵀb, and `flips`
-    (F, V, K): β of residuals whose configurations had their signs flipped, F = 0 unless asked
+    (V, K, F): β of residuals whose configurations had their signs flipped, F = 0 unless asked
     for."""
 
     lam: Array
@@ -100,17 +97,15 @@ def exceedance(flipped: Array, observed: float) -> float:
 
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
-    """Log evidence (…,) from eigenvalues (V, K) and β (…, V, K); mixed over `scales` (S,)."""
-    each = log_sum(at_scales(lam, beta.reshape(-1, *lam.shape), scales), axis=1)
-    return np.asarray((each - np.log(len(scales))).T.reshape(beta.shape[:-1]))
+    """Log evidence (V,) from eigenvalues and β (V, K); mixed over `scales` (S,)."""
+    return log_sum(at_scales(lam, beta[..., None], scales)[..., 0]) - np.log(len(scales))
 
 
 def at_scales(lam: Array, beta: Array, scales: Array) -> Array:
-    """Log evidence (V, S, F) at each of the scales, from eigenvalues (V, K) and β (F, V, K)."""
+    """Log evidence (V, S, F) at each of the scales, from eigenvalues (V, K) and β (V, K, F)."""
     squared = scales[:, None] ** 2
     shrunk = squared * lam[:, None, :]
-    # Flips last: a product for every group, and sums over the others that run along them.
-    each = (0.5 * squared / (1 + shrunk)) @ np.square(beta.transpose(1, 2, 0), order="C")
+    each = (0.5 * squared / (1 + shrunk)) @ np.square(beta)
     each -= 0.5 * np.log1p(shrunk).sum(axis=2)[:, :, None]
     return np.asarray(each)
 
@@ -133,40 +128,20 @@ def evidence_of_groups(
     best = np.full(len(groups), -np.inf)
     for k, same in of_width.items():
         of, A, b = (np.array(each) for each in zip(*same, strict=True))
-        found = spectrum(A, b, np.zeros((0, len(b), k)))
+        found = spectrum(A, b, np.zeros((len(b), k, 0)))
         np.maximum.at(best, of, found.evidence(scales))
     return best.tolist()
 
 
 def spectrum(A: Array, b: Array, flips: Array) -> Spectrum:
-    """Of Gram matrices A (V, K, K), b (V, K) and those of flipped residuals (F, V, K)."""
-    lam, U = _principal(A) if A.shape[1] == 2 else np.linalg.eigh(A)
-    beta, flips = _turned(b[None], U)[0], _turned(flips, U)
+    """Of Gram matrices A (V, K, K), b (V, K) and those of flipped residuals (V, K, F)."""
+    lam, U = np.linalg.eigh(A)
+    back = U.transpose(0, 2, 1)
+    beta, flips = (back @ b[..., None])[..., 0], back @ flips
     # Rounding leaves a tiny β along directions that P removes altogether.
     gone = lam <= 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
-    return Spectrum(*(np.where(gone, 0.0, each) for each in (lam, beta, flips)))
-
-
-def _principal(A: Array) -> tuple[Array, Array]:
-    """Eigenvalues (V, 2), the smaller first, and eigenvectors of A (V, 2, 2), whose larger one lies
-    at the angle ½ atan2(2A₁₂, A₁₁ − A₂₂): of thousands a tenth of what a call for each takes."""
-    a, b, c = A[:, 0, 0], A[:, 1, 1], A[:, 0, 1]
-    middle, half = (a + b) / 2, np.hypot((a - b) / 2, c)
-    angle = np.arctan2(2 * c, a - b) / 2
-    x, y = np.cos(angle), np.sin(angle)
-    U = np.stack([np.stack([-y, x], axis=1), np.stack([x, y], axis=1)], axis=2)
-    return np.stack([middle - half, middle + half], axis=1), U
-
-
-def _turned(b: Array, U: Array) -> Array:
-    """Σ_k b_fvk U_vkl (F, V, K)."""
-    if U.shape[1] > FEW:
-        return np.asarray((b.transpose(1, 0, 2) @ U).transpose(1, 0, 2))
-    # Thousands of tiny products: sums over their few elements are faster than a call for each.
-    out = np.empty_like(b)
-    for j in range(U.shape[1]):
-        out[..., j] = sum(b[..., k] * U[:, k, j] for k in range(U.shape[1]))
-    return out
+    flips[gone] = 0.0
+    return Spectrum(np.where(gone, 0.0, lam), np.where(gone, 0.0, beta), flips)
 
 
 # Prior probabilities, fixed before any data: nothing, something unknown, or a known effect.
@@ -265,25 +240,6 @@ class EntrySums:
             flip=self.flip.sum(axis=1, keepdims=True),
         )._by_fewest  # fmt: skip
 
-    @cached_property
-    def most_explained(self) -> float:
-        """What motions of the entry that differ from visit to visit in any way take off eᵀPe, of no
-        size charged: no directions take off more.
-
-        bᵀ(K − HᵀH)⁺b with K = `local`: with b̃ = K^−½b and H̃ = HK^−½ it is
-        b̃ᵀb̃ + (H̃b̃)ᵀ(1 − H̃H̃ᵀ)⁻¹H̃b̃.
-        """
-        C, n = len(self.b), self.b[0].size
-        values, U = np.linalg.eigh(self.local.reshape(C, n, n))
-        # What moves nothing takes off nothing.
-        shown = values > ROUNDING * values.max(initial=1e-300)
-        U = U * np.where(shown, values, np.inf)[:, None, :] ** -0.5
-        b = np.einsum("ci,cik->ck", self.b.reshape(C, n), U).ravel()
-        H = (self.H.reshape(-1, C, n).transpose(1, 0, 2) @ U).transpose(1, 0, 2).reshape(-1, C * n)
-        left, vectors = np.linalg.eigh(np.eye(len(H)) - H @ H.T)
-        moved = vectors.T @ (H @ b)
-        return float(b @ b + (moved**2 / np.maximum(left, ROUNDING)).sum())
-
     def each(
         self, n: int, width: int, directions: Callable[[slice], Array], threads: int = 1
     ) -> Spectrum:
@@ -291,10 +247,10 @@ class EntrySums:
         numbers, of `width` columns each."""
         step = max(1, HELD // (self.b.size * width))
         D = (directions(slice(k, k + step)) for k in range(0, n, step))
-        lam, beta, flips = zip(
+        parts = zip(
             *((s.lam, s.beta, s.flips) for s in ahead(self.driven, D, threads)), strict=True
         )
-        return Spectrum(np.concatenate(lam), np.concatenate(beta), np.concatenate(flips, axis=1))
+        return Spectrum(*map(np.concatenate, parts))
 
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
@@ -310,11 +266,11 @@ class EntrySums:
         A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
         b = self.b.ravel() @ flat.reshape(C * n, V * k)
-        flips = np.zeros((len(self.signs), V * k))
-        if len(flips):
+        flips = np.zeros((V * k, len(self.signs)))
+        if flips.size:
             own = np.einsum("ci,cig->cg", self.flip.reshape(C, n), flat)
-            flips = self.signs @ own - self.h @ Z
-        return spectrum(A, b.reshape(V, k), flips.reshape(-1, V, k))
+            flips = own.T @ self.signs.T - Z.T @ self.h.T
+        return spectrum(A, b.reshape(V, k), flips.reshape(V, k, -1))
 
 
 def _each_with_each(a: Array, b: Array) -> Array:
@@ -339,7 +295,7 @@ def direct(C: Array, at: Projection, flips: Flips | None = None) -> Spectrum:
     b = np.einsum("cmk,cm->k", C, at.u)
     signs, u, h = _flipped(at, flips)
     flipped = signs @ np.einsum("cmk,cm->ck", C, u) - h @ Z
-    return spectrum((A - Z.T @ Z)[None], b[None], flipped[:, None, :])
+    return spectrum((A - Z.T @ Z)[None], b[None], flipped.T[None])
 
 
 # Numbers of regressor directions that are held at a time: with more of them the sums over thousands

@@ -666,9 +666,18 @@ def compute_columns(
     table = base.observed.table
     chain, cell = base.model.chain, base.model.cell
     direct = [h for h in hypotheses if not h.driven]
-    full, x = _with_all(
-        base, direct, [(e, w) for e in ENTRIES for w in e.places(chain, cell)], found or {}
+    spec = replace(
+        cell.model,
+        effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
+        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
+        deflection_model="linear",
     )
+    whole = replace(cell, model=spec)
+    extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
+    key = "columns", spec.effects
+    full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra))
+    at = dict(zip(base.model.names, base.x, strict=True)) | (found or {})
+    x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
     observed = observe(table, full.observe)
     B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
     spans: dict[tuple[str, str], list[int]] = {}
@@ -677,39 +686,6 @@ def compute_columns(
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
     B, x, shares = with_tangents(full, places, direct, base, x, B)
     return Columns(base, B, places, full, x, shares)
-
-
-def columns_alone(base: Baseline, hypotheses: Sequence[Hypothesis]) -> list[Array]:
-    """The columns (n_rows, size, k) that `Columns.of` has of each of these, none of them driven or
-    looked for from starts, and nothing else of B."""
-    table = base.observed.table
-    full, x = _with_all(base, hypotheses, (), {})
-    owns = [own_columns(full, h) for h in hypotheses]
-    every = np.array([k for own in owns for k in own])
-    observed = observe(table, full.observe)
-    B = full.regressor(table, x, every, observed).B.reshape(len(table), observed.size, -1)
-    return np.split(B, np.cumsum([len(own) for own in owns])[:-1], axis=2)
-
-
-def _with_all(
-    base: Baseline,
-    direct: Sequence[Hypothesis],
-    extra: Sequence[tuple[Effect, str]],
-    found: dict[str, float],
-) -> tuple[Model, Array]:
-    """The base's model with all of these in it, by eq. (3), and its values (K,)."""
-    model = base.model
-    chain, cell = model.chain, model.cell
-    spec = replace(
-        cell.model,
-        effects=(*cell.model.effects, *(EffectChoice(*h.key) for h in direct)),
-        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
-        deflection_model="linear",
-    )
-    key = "columns", spec.effects, bool(extra)
-    full = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
-    at = dict(zip(model.names, base.x, strict=True)) | found
-    return full, np.array([at.get(p.name, p.nominal) for p in full.parameters])
 
 
 def cell_with(cell: Cell, where: str, settings: Mapping[str, float]) -> Cell:

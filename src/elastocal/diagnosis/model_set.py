@@ -14,7 +14,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, columns_alone, with_keys
+from elastocal.diagnosis.hypotheses import Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import (
     SHARED,
     NoiseValues,
@@ -272,7 +272,6 @@ def beside(dataset: DiagnosisData, chosen: ModelSet, k: int) -> NoisyData:
 # Which other effects would look the same in these poses: what no size of noise can tell apart.
 
 PLAUSIBLE = 5.0
-SURELY = 1e-6  # of a signal's square: far beyond rounding
 
 
 def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
@@ -281,16 +280,12 @@ def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
     return dataset.data.masked(columns @ chosen.at.beta[chosen.spans[k]])
 
 
-def distances(
-    dataset: DiagnosisData, chosen: ModelSet, k: int, beyond: float = np.inf
-) -> tuple[float, dict[tuple[str, str], float]]:
-    """d of item k from nothing, and from each other hypothesis that the data could mean instead.
+def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[str, str], float]:
+    """d of item k from each other hypothesis that the data could mean instead.
 
     d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's
     columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
     standard deviations.  A rival larger than usual is less probable, but it is no less alike.
-    `beyond`: of one that is farther than so much at any settings, whatever its motion at each
-    visit, it is only said how far it is at least.
     """
     v, data = signal_of(dataset, chosen, k), beside(dataset, chosen, k)
     at = project(replace(data, r=v), chosen.noise)
@@ -299,15 +294,10 @@ def distances(
     out: dict[tuple[str, str], float] = {}
     for h in dataset.hypotheses:
         if h is not chosen.items[k].what:
-            if h.settings and beyond < np.inf:
-                most = grams.entry(h.entry_key(dataset.base.model)).most_explained
-                if signal * (1 - SURELY) - most > beyond**2:
-                    out[h.key] = float(np.sqrt(signal - most))
-                    continue
             found = grams.of(h, settings_to_try(dataset, h, chosen.items[k]))
             explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
             out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))
-    return float(np.sqrt(max(signal, 0.0))), out
+    return out
 
 
 def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array | None:
@@ -384,8 +374,9 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     # From both to the load alone.
     other = replace(dataset.base, model=with_keys(model, play_side=BY_LOAD))
     columns = replace(dataset.columns, base=other, rows=dataset.columns.rows.copy())
-    for h, own in zip(play, columns_alone(other, play), strict=True):
-        columns.rows[:, :, columns.places[h.key]] = own
+    by_load = compute_columns(other, play)
+    for h in play:
+        columns.rows[:, :, columns.places[h.key]] = by_load.of(h)
     # Of the fitted parameters none is of play: their columns are those they were.
     under_other = replace(dataset, base=other, columns=columns)
     here, there = (_likeliest(d, noise) for d in (dataset, under_other))

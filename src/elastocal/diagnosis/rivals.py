@@ -221,7 +221,7 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
         near = dict.fromkeys(items, np.inf)
         for rival in s.rivals:
             of_rival = fit_set(dataset, (rival, *s.beside), noise)
-            found = distances(dataset, of_rival, 0, NEAR)[1]
+            found = distances(dataset, of_rival, 0)
             near |= {key: min(near[key], d) for key, d in found.items()}
         taken = {item.key for item in (*s.rivals, *s.beside)}
         free = [

@@ -58,7 +58,7 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
     own = next(i for i, other in enumerate(slot.items) if other.what is item.what)
     if not item.known:
         return ((item, float(each[own])),)
-    near = distances(found.dataset, found.chosen, k, TOO_NEAR)[1]
+    near = distances(found.dataset, found.chosen, k)
     taken = {id(other.what) for other in found.chosen.items}
     same = [
         i
