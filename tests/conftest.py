@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from importlib import import_module, metadata
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +17,17 @@ from typer import testing
 gc.disable()  # what is collected stays: to look for garbage in it is a third of the time
 
 WHOLE = {"order"}  # tests of that search itself
+
+
+SLOW = Path(__file__).with_name("slow.txt").read_text(encoding="utf-8").splitlines()
+
+
+@pytest.hookimpl(tryfirst=True)  # before those that -m leaves out are
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    slow = {f"tests/{line}" for line in SLOW if not line.startswith("#")}
+    for item in items:
+        if {item.nodeid, item.nodeid.partition("[")[0]} & slow:
+            item.add_marker("slow")
 
 
 def pytest_collection_finish() -> None:

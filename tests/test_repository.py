@@ -116,6 +116,12 @@ def test_no_name_of_a_file_or_a_class_stands_for_two_things() -> None:
     assert {name for names in (stems, classes) for name in names if names.count(name) > 1} == set()
 
 
+def test_every_slow_test_is_there() -> None:
+    lines = (ROOT / "tests" / "slow.txt").read_text(encoding="utf-8").splitlines()
+    for path, _, name in (line.partition("::") for line in lines if not line.startswith("#")):
+        assert f"def {name.partition('[')[0]}(" in (ROOT / "tests" / path).read_text("utf-8"), name
+
+
 # Imports
 
 

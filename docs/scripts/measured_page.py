@@ -29,7 +29,7 @@ get them.
 TESTED = """\
 ## Bounds that the tests check
 
-`make test` checks these bounds each time.
+Continuous integration checks these bounds at each change, `make test` most of them.
 
 | what | bound | test |
 |---|---|---|
