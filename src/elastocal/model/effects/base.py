@@ -162,10 +162,17 @@ class Effect:
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         """The parameters at one place; loads may have none."""
-        return tuple(
-            replace(p, unit=motion_unit(place, chain)) if p.unit == MOTION else p
-            for p in self.unknowns
-        )
+        shrunk = self.shrunk_keys(place, chain)
+        size = self.stated(place, chain, cell)[self.sized_by] if shrunk else 0.0
+        return (
+            *(replace(p, unit=motion_unit(place, chain)) if p.unit == MOTION else p
+              for p in self.unknowns),
+            *(ParameterSpec(key, unit, 0.0, size, shrunk=True) for key, unit in shrunk.items()),
+        )  # fmt: skip
+
+    def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
+        """Keys of its shrunk parameters of the one size that `sized_by` states → units."""
+        return {}
 
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         """Values of some parameters from which to look for the others, where nominal ones say

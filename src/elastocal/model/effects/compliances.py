@@ -303,13 +303,9 @@ class TorqueDriven(DrivenEffect):
         """What ends a parameter's key → index of the joint and direction a (entry.size,)."""
         raise NotImplementedError
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
+    def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
         unit = motion_unit(place, chain) if place.startswith("joint") else "rad"
-        return tuple(
-            ParameterSpec(f"{self.prefix}_{key}", f"{unit}/(N*m)", 0.0, size, shrunk=True)
-            for key in self.ways(place, chain)
-        )
+        return {f"{self.prefix}_{key}": f"{unit}/(N*m)" for key in self.ways(place, chain)}
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         torque, u = arm.input("torque", arm.chain.n_joints), ca.SX.zeros(self.entry.size)

@@ -358,12 +358,8 @@ class GravitySag(DrivenEffect):
     sized_by = "sag_size_rad"
     entry = JointMotion()
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        return tuple(
-            ParameterSpec(f"sag_{k + 1}", "rad", 0.0, size, shrunk=True)
-            for k in range(len(_sizes(chain, index(place))))
-        )
+    def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
+        return {f"sag_{n}": "rad" for n, _ in enumerate(_sizes(chain, index(place)), 1)}
 
     def acts(self, place: str, chain: Chain, cell: Cell) -> bool:
         turned = cell.model.nominal.base_rotation

@@ -285,12 +285,8 @@ class ResidualStep(AnyMotion, Jump):
         Setting("step_size", "range", 1e-4, 0.0, 1.0),
     )
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        return tuple(
-            ParameterSpec(f"step_{k}", unit, 0.0, size, shrunk=True)
-            for k, unit in enumerate(self.entry_at(place).units, start=1)
-        )
+    def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
+        return {f"step_{k}": unit for k, unit in enumerate(self.entry_at(place).units, start=1)}
 
 
 class JointResponse(TorqueEffect):
@@ -315,14 +311,12 @@ class JointResponse(TorqueEffect):
         """φ (count,) at u and a."""
         raise NotImplementedError
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        keys = (f"{self.name}_{k}" for k in range(1, self.count + 1))
-        return tuple(ParameterSpec(key, "rad", 0.0, size, shrunk=True) for key in keys)
+    def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
+        return {f"{self.name}_{k}": "rad" for k in range(1, self.count + 1)}
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         i, largest = index(place), p[f"{self.name}_Nm"]
-        c = ca.vertcat(*(p[f"{self.name}_{k}"] for k in range(1, self.count + 1)))
+        c = ca.vertcat(*(p[key] for key in self.shrunk_keys(place, arm.chain)))
         side = came_from(arm)[i] if "approach" in self.needs else ca.SX(1)
         add_deflection(
             arm, i, f"{place}.{self.name}", lambda tau: ca.dot(c, self.laws(tau / largest, side))
@@ -402,12 +396,8 @@ class LoadResponse(LoadedEffect):
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return ("base", *links(chain))
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        return tuple(
-            ParameterSpec(f"load_response_{key}", unit, 0.0, size, shrunk=True)
-            for key, unit in zip(KEYS, LinkFrame.units, strict=True)
-        )
+    def shrunk_keys(self, place: str, chain: Chain) -> dict[str, str]:
+        return {f"load_response_{k}": u for k, u in zip(KEYS, LinkFrame.units, strict=True)}
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         for k, key in enumerate(KEYS):
