@@ -645,9 +645,10 @@ def _fitted(
     fit = [k for k, e in enumerate(effects) if (geometry if e in GEOMETRY else yields[k])]
     turns = [k for k, e in enumerate(effects) if e == JointOffset.name and correct]
     assert kept.conditions.visits is not None
-    curves = _Curves(rows, kept.conditions.visits.q) if correct else None
-    asked = np.array(sorted({*fit, *turns}), dtype=np.int64)
-    size = curves.count if curves else 0
+    basis = _basis(kept.conditions.visits.q) if correct else []
+    bent = [JointCorrection({(j, of): (at, by)})(rows.q, rows.approach)[:, j] - rows.q[:, j]
+            for j, of, at, by in basis]  # fmt: skip
+    asked, size = np.array(sorted({*fit, *turns}), dtype=np.int64), len(basis)
     least = np.array([*(model.parameters[k].lower for k in fit), *[-np.inf] * size])
     u = np.concatenate([x[fit], np.zeros(size)])
     first, sizes, correction = u.copy(), np.zeros(0), start
@@ -659,8 +660,9 @@ def _fitted(
             whole = np.zeros((len(r), len(x)))
             whole[:, fit] = B
             sizes = np.concatenate([model.sizes(whole)[fit], np.full(size, SLOPPY)])
-        if curves is not None:
-            B = np.hstack([B, curves.columns(regression.B[:, np.searchsorted(asked, turns)])])
+        if basis:
+            turned = regression.B[:, np.searchsorted(asked, turns)][:, [j for j, *_ in basis]]
+            B = np.hstack([B, turned * np.repeat(np.transpose(bent), 3, axis=0)])
         sigma = max(float(np.sqrt(np.mean(r**2))), SMALLEST)
         # The step d that minimises |B d − r|²/σ² + Σ ((d + u − first) / size)², with u + d no less
         # than `least`: a spring that would yield the wrong way is rigid.
@@ -670,42 +672,18 @@ def _fitted(
         # At its bound to the last bit.
         u = u + np.where(step.active_mask < 0, least - u, step.x * sizes)
         x[fit] = u[: len(fit)]
-        correction = start if curves is None else curves.correction(start, u[len(fit) :])
+        sized = zip(basis, u[len(fit) :], strict=True)
+        correction = start.plus((j, of, at, c * by) for (j, of, at, by), c in sized)
     values = part.values | dict(zip(model.names, x, strict=True))
     return replace(part, x=np.array([values[n] for n in part.model.names])), correction
 
 
-class _Curves:
-    """Curves of every joint against every joint's angle, linear between KNOTS places, and what it
-    errs by with the sides that the joints came from: the coefficients of a joint correction."""
-
-    def __init__(self, rows: Measurements, measured: Array) -> None:
-        n = measured.shape[1]
-        self.places = np.linspace(measured.min(axis=0), measured.max(axis=0), KNOTS)
-        self.moving = [i for i in range(n) if np.ptp(measured[:, i]) > MOVED]
-        hats = [np.interp(rows.q[:, i], self.places[:, i], unit)
-                for i in self.moving for unit in np.eye(KNOTS)]  # fmt: skip
-        self.hats = np.column_stack(hats)  # rows, moving joints · KNOTS
-        assert rows.approach is not None  # drawn
-        self.side, self.n = rows.approach, n
-
-    @property
-    def count(self) -> int:
-        return self.n * len(self.moving) * KNOTS + self.n
-
-    def columns(self, B: Array) -> Array:
-        """(components, count): what each coefficient moves, by B (components, joints)."""
-        size = len(B) // len(self.side)
-        hats, side = (np.repeat(values, size, axis=0) for values in (self.hats, self.side))
-        return np.hstack([(B[:, :, None] * hats[:, None, :]).reshape(len(B), -1), B * side])
-
-    def correction(self, start: JointCorrection, c: Array) -> JointCorrection:
-        bent = c[: -self.n].reshape(self.n, len(self.moving), KNOTS)
-        curves: list[Curve] = [
-            (j, f"{JOINT}{i + 1}", self.places[:, i], bent[j, k])
-            for j in range(self.n)
-            for k, i in enumerate(self.moving)
-        ]
-        ends = np.array([-1.0, 1.0])
-        sides = [(j, f"{SIDE}{j + 1}", ends, s * ends) for j, s in enumerate(c[-self.n :])]
-        return start.plus([*curves, *sides])
+def _basis(measured: Array) -> list[Curve]:
+    """Curves of every joint against every joint's angle, linear between KNOTS places, and with the
+    side that it came from, each with the coefficient one: a joint correction is a sum of them."""
+    places = np.linspace(measured.min(axis=0), measured.max(axis=0), KNOTS)
+    moving = np.flatnonzero(np.ptp(measured, axis=0) > MOVED)
+    joints, ends = range(measured.shape[1]), np.array([-1.0, 1.0])
+    bent = [(j, f"{JOINT}{i + 1}", places[:, i], hat)
+            for j in joints for i in moving for hat in np.eye(KNOTS)]  # fmt: skip
+    return [*bent, *((j, f"{SIDE}{j + 1}", ends, ends) for j in joints)]
