@@ -208,7 +208,7 @@ def write_page(
 
 def headline(result: object) -> str:
     """The verdict on a calibration, in the words of terminal, page and notebook."""
-    return str(import_module(WORDS).judgement(result).headline)
+    return str(import_module(WORDS).judgement(result).sentence)
 
 
 # Arguments

@@ -116,7 +116,7 @@ def test_noise_stated_far_too_large_is_no_noise_that_explains_the_residual(clean
     result = identify(model, table)
     f = result.finding("residual_below_stated_noise")
     assert f.severity == "care" and f.number("ratio") == pytest.approx(0.1, rel=0.15)
-    assert "stated noise is too large" in judgement(result).headline
+    assert "stated noise is too large" in judgement(result).sentence
     slightly = judged(replace(result, noise=replace(result.noise, ratio_to_stated=0.8)))
     assert slightly.finding("residual_below_stated_noise").severity == "note"
 

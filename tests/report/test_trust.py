@@ -16,16 +16,21 @@ import elastocal as ec
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.result import TestErrors
+from elastocal.identification.sentences import next_steps
 from elastocal.report import judgement_view
-from elastocal.report.blocks import length
+from elastocal.report.blocks import ShownVerdict, length
 from elastocal.report.renderers import page_of
 
 MISFIT = LackOfFit(9.0, 1e-5, 30, 20)
 
 
-def judgement(result: Any) -> judgement_view.Judgement:
+def judgement(result: Any) -> ShownVerdict:
     """What is said of a result whose fields were changed, judged anew."""
     return judgement_view.judgement(judged(result))
+
+
+def steps(result: Any) -> list[str]:
+    return [f.remedy for f in next_steps(judged(result))]
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +50,13 @@ def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     found = judgement(fine)
     assert found.tone == "good"
     at = length(fine.predicted.ci95[1])
-    assert found.headline.startswith(
+    assert found.sentence.startswith(
         f"This calibration can be used. Expected error at new poses: ≤ {at} "
     )
-    assert any("give them with `test`" in step for step in found.steps)
-    assert not any("diagnose" in step for step in found.steps)
+    assert any("give them with `test`" in step for step in steps(fine))
+    assert not any("diagnose" in step for step in steps(fine))
     tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))
-    assert not any("give them with `test`" in step for step in judgement(tested).steps)
+    assert not any("give them with `test`" in step for step in steps(tested))
 
 
 def test_one_sentence_says_which_error_has_the_noise_of_a_reading(
@@ -59,7 +64,7 @@ def test_one_sentence_says_which_error_has_the_noise_of_a_reading(
 ) -> None:
     """In terminal, page, notebook, certificate and JSON."""
     fit = case.result
-    sentence = judgement_view.judgement(fit).headline
+    sentence = judgement_view.judgement(fit).sentence
     own, _, read = sentence.partition(" Held-out error: ")
     assert "measurement noise excluded" in own and length(fit.verdict.at) in own
     assert length(fit.heldout_rms) in read
@@ -83,14 +88,14 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
         ("the test error (", "", {"test": TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)}),
     ):  # fmt: skip
         found = judgement(replace(fine, **changed))
-        assert found.tone == "warn" and text in found.headline, text
-        assert any(remedy in step for step in found.steps), text
+        assert found.tone == "warn" and text in found.sentence, text
+        assert any(remedy in step for step in steps(replace(fine, **changed))), text
     for text, changed in (
         ("is not below that of the nominal arm", {"heldout_rms": 2 * fine.nominal_rms}),
         ("did not converge (100 steps)", {"converged": False, "reason": "100 steps"}),
     ):
         found = judgement(replace(fine, **changed))
-        assert found.tone == "poor" and text in found.headline
+        assert found.tone == "poor" and text in found.sentence
 
 
 @pytest.mark.parametrize(
@@ -101,8 +106,8 @@ def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doub
     """Twenty readings may be 1.38 times worse by chance (1 %), five 1.74 times."""
     known = replace(fine, dof=600, test=TestErrors(ratio * fine.heldout_rms, 0.0, 0.0, n))
     found = judgement(known)
-    assert ("larger than chance explains" in found.headline) == doubted
-    assert any("Compare the test poses" in step for step in found.steps) == doubted
+    assert ("larger than chance explains" in found.sentence) == doubted
+    assert any("Compare the test poses" in step for step in steps(known)) == doubted
 
 
 def test_headline_default_point_and_map_speak_of_the_same_point(tmp_path: Path) -> None:

@@ -327,10 +327,14 @@ def outlier_blocks(
     return [*blocks, Sentence(f"and {more} more", soft=True)] if more else blocks
 
 
-def budget_table(
-    steps: Sequence[tuple[str, float, tuple[float, float]]], floor: tuple[str, float] | None
-) -> ShownTable:
-    """Steps (name, held-out rms in m, its 95 % interval) and what each changes; `floor` last."""
+# Steps (name, held-out rms in m, its 95 % interval), and name and size of what noise leaves.
+Steps = Sequence[tuple[str, float, tuple[float, float]]]
+Floor = tuple[str, float] | None
+Budget = tuple[Steps, Floor]
+
+
+def budget_table(steps: Steps, floor: Floor) -> ShownTable:
+    """Steps and what each changes; `floor` last."""
     rows: list[tuple[str, ...]] = []
     for k, (name, rms, ci95) in enumerate(steps):
         change = signed(rms - steps[k - 1][1], length) if k else ""

@@ -68,7 +68,7 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     yield added_parameter_table(d)
     yield say.Fold("Place by place", lambda: [place_table(d)], printed=True)
     yield say.Fold("Corrections without a name", lambda: _corrections(d), printed=True)
-    yield say.Fold("Error budget", lambda: [gap_table(d)], printed=True)
+    yield say.Fold("Error budget", lambda: [say.budget_table(*_budget(d))], printed=True)
     best = candidate_table(d)
     yield say.Fold("Candidates", lambda: [best], printed=True)
     yield say.Fold("Rivals", lambda: [pair_table(d)], printed=True)
@@ -94,7 +94,7 @@ def _figures(d: Diagnosis, which: str) -> Iterator[say.Figure]:
         yield from effects_over_joints(d)
         return
     if d.budget:
-        yield waterfall("budget", _named_steps(d), ("noise alone", d.gap.noise_floor))
+        yield waterfall("budget", *_budget(d))
     if d.curves:
         yield unknown_curves(d)
 
@@ -355,13 +355,10 @@ def alike(d: Diagnosis) -> list[str]:
 # Tables
 
 
-def gap_table(d: Diagnosis) -> say.ShownTable:
-    return say.budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
-
-
-def _named_steps(d: Diagnosis) -> list[tuple[str, float, tuple[float, float]]]:
-    models = (step for step in d.budget if step.step != "noise_floor")
-    return [(say.name_of(step.step), step.heldout_rms, step.ci95) for step in models]
+def _budget(d: Diagnosis) -> say.Budget:
+    steps = [step for step in d.budget if step.step != "noise_floor"]
+    named = [(say.name_of(step.step), step.heldout_rms, step.ci95) for step in steps]
+    return named, ("noise alone", d.gap.noise_floor)
 
 
 def candidate_table(d: Diagnosis) -> say.ShownTable:

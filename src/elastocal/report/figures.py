@@ -205,11 +205,7 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
         axes.xaxis.set_minor_formatter(lambda x, _: "")
 
 
-def waterfall(
-    name: str, steps: Sequence[tuple[str, float, tuple[float, float]]],
-    floor: tuple[str, float] | None,
-) -> say.Figure:  # fmt: skip
-    """Steps (name, held-out rms in m, 95 % interval), and the `floor` (m) that noise leaves."""
+def waterfall(name: str, steps: say.Steps, floor: say.Floor) -> say.Figure:
     rows = [(n, v * 1e6, (low * 1e6, high * 1e6), say.length(v)) for n, v, (low, high) in steps]
     caption = (
         "Held-out 3-D rms error with its 95 % interval, as the model gains one part after the "

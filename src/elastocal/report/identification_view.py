@@ -32,6 +32,7 @@ from elastocal.identification.result import (
     deviation,
 )
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
+from elastocal.identification.sentences import next_steps
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
@@ -65,12 +66,11 @@ def calibration_blocks(
     """An identification; `truth` and `published` (SI) stand beside the estimates."""
     budget = cache(lambda: gap_budget(result))
     yield say.Fold("", lambda: [_key(result, budget())])
-    verdict = judgement(result)
-    yield say.ShownVerdict(verdict.tone, verdict.headline)
+    yield judgement(result)
     new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
     yield say.Lines([
         ("Error (rms)", error_line(result)), *new,
-        *(("Next", step) for step in verdict.steps),
+        *(("Next", f.remedy) for f in next_steps(result)),
         *warnings_beside(result),
     ])  # fmt: skip
     yield say.Fold("", lambda: _error_figures(result, budget()), figures=("waterfall", "sureness"))
@@ -315,10 +315,7 @@ def nominal_held_out(result: Calibration) -> str:
     return f"{NOMINAL}, held out" if placed else NOMINAL
 
 
-def budget_steps(
-    result: Calibration, budget: ErrorBudget
-) -> tuple[list[tuple[str, float, tuple[float, float]]], tuple[str, float] | None]:
-    """Name, held-out rms (m) and its 95 % interval of every step; name and size of the floor."""
+def budget_steps(result: Calibration, budget: ErrorBudget) -> say.Budget:
     named = {"nominal_arm": nominal_held_out(result)}
     steps = [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
     return steps, None if budget.floor is None else (budget.floor_name, budget.floor)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,34 +16,25 @@ from elastocal.identification.noise_structure import Kind
 from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
-from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
 from elastocal.text import gathered, listed, printable, some
 
 
-@dataclass(frozen=True)
-class Judgement:
-    tone: say.Tone
-    headline: str
-    steps: tuple[str, ...]
-
-
-def judgement(result: Calibration) -> Judgement:
-    """How good the calibration is and what follows from it, as the result's findings say."""
-    steps = tuple(f.remedy for f in next_steps(result))
+def judgement(result: Calibration) -> say.ShownVerdict:
+    """How good the calibration is, as the result's findings say."""
     trust = result.finding("trust")
     assert trust is not None, "every identification is judged"
     if trust.severity == "poor":
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
-        return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
+        return say.ShownVerdict("poor", f"Do not use this calibration: {_doubt(why)}.")
     if trust.severity == "care":
-        named = "; and ".join(DOUBTS[f.kind](f) for f in result.verdict.missing)
+        named = "; and ".join(map(_doubt, result.verdict.missing))
         told = f"Use this calibration with care: {named}. {_accuracy(result)}"
-        return Judgement("warn", told, steps)
+        return say.ShownVerdict("warn", told)
     compared = result.finding(*COMPARED[1:])
     noise = "" if compared is None else " The residual is consistent with noise."
-    return Judgement("good", f"This calibration can be used. {_accuracy(result)}{noise}", steps)
+    return say.ShownVerdict("good", f"This calibration can be used. {_accuracy(result)}{noise}")
 
 
 def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
@@ -61,12 +51,24 @@ def _length(f: Finding, name: str) -> str:
     return say.length(f.number(name) * 1e-6)
 
 
-# What speaks against a calibration, in words.
-DOUBTS: dict[str, Callable[[Finding], str]] = {
-    "not_converged": lambda f: f"the fit did not converge ({f.numbers['reason']})",
-    "no_better_than_nominal": lambda f: (
-        f"the held-out error ({_length(f, 'heldout_rms_um')} rms) is not below that of the nominal "
-        f"arm ({_length(f, 'nominal_rms_um')})"
+def _doubt(f: Finding) -> str:
+    """What speaks against a calibration: the words of its kind with its numbers, lengths in the
+    units people think in, others to three digits."""
+    words = DOUBTS[f.kind]
+    if not isinstance(words, str):
+        return words(f)
+    return words.format(**{
+        name: _length(f, name) if name.endswith("_um")
+        else say.significant(value) if isinstance(value, float) else value
+        for name, value in f.numbers.items()
+    })  # fmt: skip
+
+
+DOUBTS: dict[str, str | Callable[[Finding], str]] = {
+    "not_converged": "the fit did not converge ({reason})",
+    "no_better_than_nominal": (
+        "the held-out error ({heldout_rms_um} rms) is not below that of the nominal arm "
+        "({nominal_rms_um})"
     ),
     "not_held_out": lambda f: (
         "there is no held-out error: some pose alone determines a parameter, and nothing checks it"
@@ -76,18 +78,16 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
             else ""
         )
     ),
-    "residual_above_stated_noise": lambda f: (
-        f"the residual is {say.significant(f.number('ratio'))} times the stated noise"
-    ),
-    "residual_below_stated_noise": lambda f: (
-        f"the stated noise is too large (the residual is {say.significant(f.number('ratio'))} "
-        "times it), so a missing effect would not show"
+    "residual_above_stated_noise": "the residual is {ratio} times the stated noise",
+    "residual_below_stated_noise": (
+        "the stated noise is too large (the residual is {ratio} times it), so a missing effect "
+        "would not show"
     ),
     "residuals_heavy_tailed": lambda f: (
         "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
     ),
-    "autocorrelated": lambda f: "residuals of successive visits are correlated, as under a drift",
+    "autocorrelated": "residuals of successive visits are correlated, as under a drift",
     "exchanged_markers": lambda f: (
         f"the names of markers {listed(map(str, f.listed('markers')))} are exchanged"
     ),
@@ -96,13 +96,9 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"{f.numbers['by']}: the loads may be in another unit"
     ),
     "impossible_values": lambda f: _impossible(f),
-    "scatter_not_counted": lambda f: (
-        "residuals scatter between visits, or drift, beyond the noise model"
-    ),
-    "lack_of_fit": lambda f: "configurations scatter more than their repeats",
-    "fit_flatters": lambda f: (
-        f"the held-out error is larger than the fitted one ({_length(f, 'residual_rms_um')})"
-    ),
+    "scatter_not_counted": "residuals scatter between visits, or drift, beyond the noise model",
+    "lack_of_fit": "configurations scatter more than their repeats",
+    "fit_flatters": "the held-out error is larger than the fitted one ({residual_rms_um})",
     "scale": lambda f: (
         f"all measured lengths are {say.significant(f.number('readings_over_file'), 4)} times "
         "those of the robot's file: "
@@ -113,13 +109,13 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         )
     ),
     "unheard_of": lambda f: _unheard_of(f),
-    "little_gain": lambda f: "the error is hardly smaller than that of the nominal arm",
+    "little_gain": "the error is hardly smaller than that of the nominal arm",
     "few_configurations": lambda f: (
         f"{say.counted(int(str(f.numbers['configurations'])), 'configuration')} give only "
         f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters "
         f"(needed: {f.numbers['needed']})"
     ),
-    "noise_unknown": lambda f: (
+    "noise_unknown": (
         "the noise level is unknown (neither stated nor repeated), so the residual may hide a "
         "missing effect"
     ),
@@ -132,19 +128,12 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         + ("hardly smaller" if f.number("rms_um") <= f.number("nominal_rms_um") else "larger")
         + f" than that of the nominal arm at measured poses ({_length(f, 'nominal_rms_um')})"
     ),
-    "many_faulty_readings": lambda f: (
-        f"{f.numbers['faulty']} of the {f.numbers['fitted']} fitted readings are outliers"
-    ),
-    "drift": lambda f: (
-        f"base or tracker drift by {_length(f, 'sigma_um')} during the measurement session"
-    ),
-    "test_data_worse": lambda f: (
-        f"the test error ({_length(f, 'test_rms_um')} rms) is larger than chance explains"
-    ),
-    "test_data_far": lambda f: (
-        f"{f.numbers['far']} of {f.numbers['configurations']} test poses are more uncertain than "
-        f"every measured pose ({_length(f, 'predicted_std_um')} rms over all test poses, at most "
-        f"{_length(f, 'fitted_std_um')} at measured ones)"
+    "many_faulty_readings": "{faulty} of the {fitted} fitted readings are outliers",
+    "drift": "base or tracker drift by {sigma_um} during the measurement session",
+    "test_data_worse": "the test error ({test_rms_um} rms) is larger than chance explains",
+    "test_data_far": (
+        "{far} of {configurations} test poses are more uncertain than every measured pose "
+        "({predicted_std_um} rms over all test poses, at most {fitted_std_um} at measured ones)"
     ),
 }
 

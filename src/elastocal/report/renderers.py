@@ -31,13 +31,13 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal import __version__
-from elastocal.errors import InputError, option, require
+from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
 from elastocal.screen import safe_console, shown
-from elastocal.text import cell_meaning, did_you_mean, listed, printable, quoted
+from elastocal.text import cell_meaning, listed, printable, quoted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -443,9 +443,7 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
     if not found:
         opened = say.unfolded(folds, lambda fold: bool(fold.figures))
         there = [block.name for block in opened if isinstance(block, say.Figure)]
-        raise InputError(
-            f"no figure {quoted(chosen)}{did_you_mean(chosen, there)}; there are {listed(there)}"
-        )
+        check_known(chosen, there, f"no figure {quoted(chosen)}")
     if interactive:
         if found[0].space is None:
             told = f"; interactive=True turns the arm: {listed(arms)}" if arms else ""

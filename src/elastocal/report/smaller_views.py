@@ -417,8 +417,8 @@ SIDES = math.sqrt(3.0)  # a 3-D rms over that of one coordinate
 def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
     """A page to print and file: entries, verdict, conformity, uncertainty, pose accuracy."""
     entries, budget = result.model.cell.certificate, gap_budget(result)
-    verdict, certified = judgement(result), certified_values(result, budget)
-    yield say.ShownVerdict(verdict.tone, verdict.headline)
+    certified = certified_values(result, budget)
+    yield judgement(result)
     told = [
         (name.replace("_", " "), printable(value))
         for name, value in vars(entries).items() if isinstance(value, str)
@@ -641,7 +641,7 @@ def dcc_text(result: Calibration) -> str:
             f"{listed(c.missing)}; without them write the report as .html"
         )
     certified = certified_values(result, gap_budget(result))
-    statement, u = judgement(result).headline, certified.of_deviations
+    statement, u = judgement(result).sentence, certified.of_deviations
     if c.limit is not None:
         statement = f"{certified.conformity(c.limit)} {statement}"
     found = [
