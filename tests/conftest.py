@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import gc
-import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +72,9 @@ def plain_layout(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def once() -> Iterator[None]:
-    """What is the same all through: the command line that typer builds of its functions, and the
-    plug-ins of installed packages while the same folders are searched for them."""
-    ask = metadata.entry_points
-
-    @cache
-    def remembered(path: tuple[str, ...], **sought: str) -> Any:
-        return ask(**sought)
-
+    """What is the same all through: the command line that typer builds of its functions."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(testing, "_get_command", cache(testing._get_command))
-        patch.setattr(metadata, "entry_points", lambda **s: remembered(tuple(sys.path), **s))
         yield
 
 

@@ -95,12 +95,13 @@ class Key:
     """A key of a file; `takes` completes the sentence 'key … takes …'.
 
     `form`: the type of its value there, None where it is the field's.  `into`: makes the field's
-    value of it, its table and its name; None converts from the unit that the name ends with.
-    `kind`: the type that is checked, as `fields_of` finds it.
+    value of it, its table and its name; None converts from the unit that the name ends with.  Both
+    may stand in the Annotated of a type instead.  `kind`: the type that is checked, as `fields_of`
+    finds it.
     """
 
-    name: str
-    takes: str
+    name: str = ""
+    takes: str = ""
     form: Any = None
     into: Into | None = None
     required: bool = False
@@ -110,14 +111,6 @@ class Key:
     def unit(self) -> str:
         """The unit of its value, "" where that is SI or has none."""
         return max((u for u in UNITS if self.name.endswith("_" + u)), key=len, default="")
-
-
-@dataclass(frozen=True)
-class FromFile:
-    """In the Annotated of a type: the `form` and `into` of its keys, as of `Key`."""
-
-    form: Any
-    into: Into
 
 
 def keyed(
@@ -192,7 +185,7 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
         }  # fmt: skip
     found = {}
     for name, one in cls.__dataclass_fields__.items():
-        how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
+        how = next((note for note in _notes(hints[name]) if isinstance(note, Key)), None)
         found[name] = tuple(
             replace(
                 known,
@@ -581,9 +574,11 @@ TUPLE = BeforeValidator(_tuple)
 AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
 AS_PATH = BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
-File = Annotated[Path, AS_PATH, FromFile(Text, existing_file)]
+File = Annotated[Path, AS_PATH, Key(form=Text, into=existing_file)]
 Rotation = Annotated[
-    Array, matrix(3, 3), FromFile(Vector3, lambda rpy, *_: rotation_from_rpy(np.radians(rpy)))
+    Array,
+    matrix(3, 3),
+    Key(form=Vector3, into=lambda rpy, *_: rotation_from_rpy(np.radians(rpy))),
 ]
 Transform = Annotated[Array, matrix(4, 4)]
-Direction = Annotated[Array, PlainValidator(_direction), FromFile(Vector3, direction)]
+Direction = Annotated[Array, PlainValidator(_direction), Key(form=Vector3, into=direction)]

@@ -208,4 +208,4 @@ def check_known(name: str, there: Collection[str], told: str, them: str = "there
     """Raise InputError unless `name` is one of those that are `there`: behind what is `told` of it
     stand the nearest of them, and all."""
     if name not in there:
-        raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there)}")
+        raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there) or 'none'}")

@@ -12,7 +12,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import CodeType, ModuleType
 from typing import TYPE_CHECKING, Any
@@ -103,10 +103,17 @@ def is_plugin_file(module: str) -> bool:
     return module.endswith(".py")
 
 
-def load_installed() -> None:
+@cache
+def _installed_in(folders: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """The entry points of packages in the folders of sys.path: looking for them reads what every
+    package says of itself, so it is done once in a process, or again after `cache_clear`."""
     from importlib.metadata import entry_points
 
-    for point in entry_points(group=GROUP):
+    return tuple(entry_points(group=GROUP))
+
+
+def load_installed() -> None:
+    for point in _installed_in(tuple(sys.path)):
         if point.value not in _installed:
             source = f" of the package {point.dist.name}" if point.dist else ""
 

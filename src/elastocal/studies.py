@@ -48,7 +48,7 @@ from pydantic import Field
 
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
-from elastocal.errors import ElastocalError, InputError, option, raised_at, require
+from elastocal.errors import ElastocalError, InputError, check_known, option, raised_at, require
 from elastocal.files import atomic_write, read_bytes, read_json, read_text
 from elastocal.screen import StudyStop, shown
 from elastocal.text import did_you_mean, json_text, listed, printable, quoted
@@ -161,11 +161,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
         key, equals, written = (part.strip() for part in text.partition("="))
         here = option("options", text)
         require(bool(equals), f"{option('options')} takes KEY=VALUE; found {quoted(text)}")
-        require(
-            key in options,
-            f"{here}: {path} has no option {quoted(key)}{did_you_mean(key, options)}; "
-            f"it has {listed(options) or 'none'}",
-        )
+        check_known(key, options, f"{here}: {path} has no option {quoted(key)}", "it has")
         default, value = defaults[key], None
         with suppress(tomllib.TOMLDecodeError):
             value = tomllib.loads(f"value = {written}")["value"]

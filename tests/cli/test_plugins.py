@@ -303,7 +303,7 @@ def test_an_installed_package_registers_by_its_entry_point(
     (site / "lobed_effects.py").write_text("1 / 0\n")
     (info / "entry_points.txt").write_text("[elastocal.plugins]\nbad = lobed_broken\n")
     (site / "lobed_broken.py").write_text("1 / 0\n")
-    monkeypatch.syspath_prepend(str(tmp_path))  # in other folders tests look for packages anew
+    monkeypatch.syspath_prepend(str(tmp_path))  # in other folders packages are looked for anew
     with pytest.raises(
         InputError, match=r"plug-in 'bad' of the package lobed: .*lobed_broken\.py, line 1"
     ):

@@ -22,12 +22,13 @@ from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
 from elastocal.model.manipulator import load_chain
 from elastocal.report.arm_view import (
     in_script,
-    plan_figure,
+    plan_arm,
     residual_arm,
     shells_of,
     triangles_of,
     write_plan_picture,
 )
+from elastocal.report.figures import figure_of
 
 PLACED = np.eye(4)
 PLACED[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
@@ -94,12 +95,12 @@ def test_a_urdf_with_collision_meshes_at_hand_is_drawn_from_them() -> None:
     urdf, flange = packaged_urdf("UR5")
     cell = replace(kr270_cell(), robot=Robot(urdf=urdf, flange=flange))
     chain = load_chain(cell)
-    shells = shells_of(cell, chain)
-    assert "URDF" in shells.drawn_from
-    assert {shell.carrier for shell in shells.arm} == set(range(chain.n_joints + 1))
+    arm, *_, drawn_from = shells_of(cell, chain)
+    assert "URDF" in drawn_from
+    assert {shell.carrier for shell in arm} == set(range(chain.n_joints + 1))
     # Radii that the cell states come first.
     stated = replace(cell, workspace=Workspace(link_radius=(0.05,)))
-    assert "capsules" in shells_of(stated, chain).drawn_from
+    assert "capsules" in shells_of(stated, chain)[-1]
 
 
 @pytest.fixture(scope="module")
@@ -129,9 +130,8 @@ def tips(axes):
 
 def test_flanges_are_drawn_where_the_model_puts_them_in_every_view(cell):
     level = [int(np.argmin(np.abs(np.subtract(LEVELS, v)))) for v in TABLE_2[:, 1]]
-    figure = plan_figure(
-        plan_at(cell, TABLE_2, level, [f"q2 = {np.degrees(v):.2f}°" for v in LEVELS])
-    )
+    names = [f"q2 = {np.degrees(v):.2f}°" for v in LEVELS]
+    figure = figure_of(plan_arm(plan_at(cell, TABLE_2, level, names)))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cell.model.nominal.base_rotation, cell.model.nominal.base_position
     expected = (T @ nominal_flanges(kr270_chain(), TABLE_2))[:, :3, 3]

@@ -49,7 +49,7 @@ from elastocal.config import (
 from elastocal.errors import check_known, require
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file
-from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
@@ -529,12 +529,8 @@ class Cell:
     def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
         markers = tuple(self.tool.markers)
         for name in names:
-            require(
-                name in markers,
-                f"{self.source}: {header(table)} names {quoted(name)}, which is no "
-                f"marker of the cell{did_you_mean(name, markers)}; [tool.markers_m] has "
-                f"{listed(markers) or 'none'}",
-            )
+            told = f"{self.source}: {header(table)} names {quoted(name)}, which is no marker of the"
+            check_known(name, markers, f"{told} cell", "[tool.markers_m] has")
 
 
 read_cell = Cell.read

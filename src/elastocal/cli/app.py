@@ -78,20 +78,14 @@ class InOrder(TyperGroup):
 
     def main(self, *args: Any, **extra: Any) -> Any:
         """As inherited; but however it ends, one message says why, with names escaped."""
-        told, standalone = StringIO(), extra.pop("standalone_mode", True)
+        standalone = extra.pop("standalone_mode", True)
         extra["standalone_mode"] = False
         try:
             words = (args[0] if args else extra.get("args")) or sys.argv[1:]
             _refuse_empty(words)
             code = 0 if self._helped(words) else super().main(*args, **extra)
-        except (ElastocalError, OSError, typer.Abort, KeyboardInterrupt, EOFError) as error:
+        except (Exception, KeyboardInterrupt) as error:
             code = _ended(error)
-        except Exception as error:
-            if not hasattr(error, "show"):
-                raise
-            error.show(told)  # of typer's own: a usage error
-            say(told.getvalue(), error=True, end="")
-            code = getattr(error, "exit_code", 2)
         if code == INTERRUPTED:
             complain("interrupted")
         if not standalone:
@@ -141,35 +135,39 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
                 warnings.simplefilter("ignore", RuntimeWarning)
                 command(*args, **kwargs)
-        except (ElastocalError, OSError, KeyboardInterrupt) as error:
-            raise typer.Exit(_ended(error)) from None
-        except Exception as error:
+        except (Exception, KeyboardInterrupt) as error:
             if isinstance(error, typer.Exit | typer.Abort) or hasattr(error, "show"):
                 raise  # typer's own, as a usage error
-            if len(interrupts) > before:  # which a library has turned into an error of its own
-                raise typer.Exit(INTERRUPTED) from None
-            if os.environ.get(TRACEBACK):
-                traceback.print_exc()
-            message, code = explained(error, [kwargs.get(name) for name in READ])
-            complain(message)
-            raise typer.Exit(code) from None
+            read = [kwargs.get(name) for name in READ]
+            raise typer.Exit(_ended(error, read, len(interrupts) > before)) from None
 
     return run
 
 
-def _ended(error: BaseException) -> int:
-    """Say why a command ends; the exit code."""
+def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool = False) -> int:
+    """Say why a command that `read` these files ends; the exit code."""
     if isinstance(error, ElastocalError):
         complain(str(error))
         return error.exit_code
-    if not isinstance(error, OSError):
-        return INTERRUPTED
     if isinstance(error, BrokenPipeError):
         # The reader of stdout went away (… | head): nothing is wrong with the input.
         return 0
-    # What reads and writes files names them; streams have no name.
-    complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
-    return 2
+    if isinstance(error, OSError):
+        # What reads and writes files names them; streams have no name.
+        complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
+        return 2
+    # An interrupt may have been turned by a library into an error of its own.
+    if interrupted or not isinstance(error, Exception) or isinstance(error, typer.Abort | EOFError):
+        return INTERRUPTED
+    if hasattr(error, "show"):  # of typer's own: a usage error
+        error.show(told := StringIO())
+        say(told.getvalue(), error=True, end="")
+        return getattr(error, "exit_code", 2)
+    if os.environ.get(TRACEBACK):
+        traceback.print_exc()
+    message, code = explained(error, read)
+    complain(message)
+    return code
 
 
 # The files that a command reads and writes: checked before the work, written after it.

@@ -554,7 +554,7 @@ def study(
     with StudyStop() as stop, progress_line(quiet or not progress, EVERY) as tell:
         ending = run_study(
             prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
-            retry_failed=retry_failed, stop=stop, progress=Pace(tell).show,
+            retry_failed=retry_failed, stop=stop, progress=pace(tell),
             tell=lambda text: say(f"… {text}", error=True),
             tls_ca=tls_ca, tls_cert=tls_cert, tls_key=tls_key, unencrypted=unencrypted,
         )  # fmt: skip
@@ -589,19 +589,20 @@ def _told(ending: Ending, results: Path) -> str:
     return text
 
 
-class Pace:
-    """Says how far a study is: done of total, rate per minute of this run, time left, failures."""
+def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
+    """Tells how far a study is, of `total` tasks those that `ended`, failures among them: rate per
+    minute of this run, time left, failures; the first call begins."""
+    begun, before = time.monotonic(), -1
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self._begun, self._before = tell, time.monotonic(), -1
-
-    def show(self, total: int, ended: int, failed: int) -> None:
-        """`ended` of `total` tasks, failures among them, are there; the first call begins."""
-        if self._before < 0:
-            self._begun, self._before = time.monotonic(), ended
+    def show(total: int, ended: int, failed: int) -> None:
+        nonlocal begun, before
+        if before < 0:
+            begun, before = time.monotonic(), ended
         text = f"{ended} of {total} tasks"
-        if ended > self._before:
-            rate = (ended - self._before) / max(time.monotonic() - self._begun, 1e-3)
+        if ended > before:
+            rate = (ended - before) / max(time.monotonic() - begun, 1e-3)
             left = timedelta(seconds=round((total - ended) / rate))
             text += f", {60 * rate:.{0 if rate > 1 else 1}f} per minute, {left} left"
-        self._tell(text + (f", {failed} failed" if failed else ""))
+        tell(text + (f", {failed} failed" if failed else ""))
+
+    return show

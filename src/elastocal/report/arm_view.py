@@ -54,18 +54,11 @@ class Shell:
     name: str = ""
 
 
-@dataclass(frozen=True)
-class Shells:
-    """What is drawn of a cell: the arm with what it carries, and how; what stands around it."""
-
-    arm: tuple[Shell, ...]
-    around: tuple[Shell, ...]
-    walls: tuple[HalfSpace, ...]
-    drawn_from: str
-
-
-def shells_of(cell: Cell, chain: Chain) -> Shells:
-    """The bodies of a cell; a geometry that cannot be had is replaced by capsules, and said so."""
+def shells_of(
+    cell: Cell, chain: Chain
+) -> tuple[tuple[Shell, ...], tuple[Shell, ...], tuple[HalfSpace, ...], str]:
+    """What is drawn of a cell: the arm with what it carries, what stands around it, walls, and how
+    the arm is drawn; a geometry that cannot be had is replaced by capsules, and said so."""
     radii, drawn_from = cell.workspace.link_radius, "capsules between its joints"
     arm: tuple[Shell, ...] = ()
     if cell.robot.urdf is not None and not radii:
@@ -86,12 +79,9 @@ def shells_of(cell: Cell, chain: Chain) -> Shells:
     except ElastocalError:
         bodies = []  # a mesh that is not there stops no report
     carried = [b for b in bodies if b.kind == "carried" and b.carrier >= 0]
-    return Shells(
-        (*arm, *_shells([(b.solid, b.carrier) for b in carried])),
-        _shells([(b.solid, -1) for b in bodies if b.kind == "obstacle"]),
-        cell.workspace.keep_out,
-        drawn_from,
-    )
+    arm = (*arm, *_shells([(b.solid, b.carrier) for b in carried]))
+    around = _shells([(b.solid, -1) for b in bodies if b.kind == "obstacle"])
+    return arm, around, cell.workspace.keep_out, drawn_from
 
 
 def _shells(solids: Sequence[tuple[Solid, int]]) -> tuple[Shell, ...]:
@@ -158,11 +148,14 @@ class Posed:
 
 @dataclass(frozen=True)
 class Space:
-    """All poses, bodies, and the instrument where it stands near; `first` is shown first, and a
-    legend names the `groups` of poses."""
+    """All poses, bodies as of `shells_of`, and the instrument where it stands near; `first` is
+    shown first, and a legend names the `groups` of poses."""
 
     poses: tuple[Posed, ...]
-    shells: Shells
+    arm: tuple[Shell, ...]
+    around: tuple[Shell, ...]
+    walls: tuple[HalfSpace, ...]
+    drawn_from: str
     tracker: Array | None
     first: int
     what: str
@@ -175,7 +168,7 @@ class Space:
     @property
     def bodies(self) -> list[Array]:
         """Points (k, 3) m of the arm's bodies in the first pose."""
-        placed = [(s.points, self.poses[self.first].frames[s.carrier]) for s in self.shells.arm]
+        placed = [(s.points, self.poses[self.first].frames[s.carrier]) for s in self.arm]
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
 
     @cached_property
@@ -186,7 +179,7 @@ class Space:
         low, high = every.min(axis=0), every.max(axis=0)
         room = AROUND * float((high - low).max())
         # A hall's floor would shrink the arm to a dot.
-        near = [np.clip(s.points, low - room, high + room) for s in self.shells.around]
+        near = [np.clip(s.points, low - room, high + room) for s in self.around]
         near += [] if self.tracker is None else [self.tracker[None]]
         every = np.vstack([every, *near])
         low, high = every.min(axis=0), every.max(axis=0)
@@ -222,7 +215,7 @@ class Space:
         return in_script({
             "what": self.what, "first": self.first, "scale": self.scale, "arrows": self.has_arrows,
             "range": flat(self.extent.T, 3), "tracker": flat(self.tracker, 3),
-            "bodies": bodies(self.shells.arm), "things": bodies(self.shells.around),
+            "bodies": bodies(self.arm), "things": bodies(self.around),
             "poses": [
                 {"name": printable(p.name), "about": printable(p.about),
                  "frames": flat(p.frames[:, :3].reshape(len(p.frames), 12), 5),
@@ -265,7 +258,7 @@ def space_of(
     groups: tuple[str, ...] = (),
 ) -> Space:  # fmt: skip
     """The poses with the bodies of the cell, and the tracker where it is known to stand near."""
-    space = Space(tuple(poses), shells_of(cell, chain), None, first, what, groups)
+    space = Space(tuple(poses), *shells_of(cell, chain), None, first, what, groups)
     low, high = space.extent
     at = cell.tracker.position
     if not at.any():
@@ -328,7 +321,7 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
     text = (
         f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
         f"configuration {printable(poses[first_shown].name)}, which has the largest, and in all of "
-        f"them. The arm is drawn as {space.shells.drawn_from}."
+        f"them. The arm is drawn as {space.drawn_from}."
     )
     if len(poses) < observed.n_configurations:
         text += (
@@ -357,7 +350,7 @@ def plan_arm(plan: Plan) -> say.Figure:
     space = space_of(cell, chain, poses, groups=plan.group_names)
     caption = (
         "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
-        f"{space.shells.drawn_from}."
+        f"{space.drawn_from}."
     )
     return posed("poses", "The arm in the poses of the plan", caption, space)
 
@@ -402,15 +395,12 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
     suffix = Path(path).suffix.lower()
     told = f"{path}: a picture of poses is written as .png or .svg"
     require(suffix in (".png", ".svg"), told)
-    picture, figure = BytesIO(), plan_figure(plan)
+    figure: Any = figure_of(plan_arm(plan))
+    picture = BytesIO()
     nothing = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}
     with style():
         figure.savefig(picture, format=suffix[1:], dpi=200, metadata=nothing, facecolor="white")
     atomic_write(path, picture.getvalue())
-
-
-def plan_figure(plan: Plan) -> Any:
-    return figure_of(plan_arm(plan))
 
 
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
@@ -465,14 +455,14 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
 
 def _draw_around(axes: Axes, space: Space, view: Array, whole: bool) -> None:
     """Obstacles; where `whole` with their names, and keep-out planes that stand upright."""
-    for shell in space.shells.around:
+    for shell in space.around:
         points = shell.points @ view.T
         _fill(axes, points, FAINT, 0.25)
         if whole:
             top = (float(points[:, 0].mean()), float(points[:, 1].max()))
             axes.annotate(say.short_name(shell.name, LONGEST_NAME), top, (0, 2), ha="center",
                           textcoords="offset points", fontsize=7, clip_on=True)  # fmt: skip
-    for wall in space.shells.walls if whole else ():
+    for wall in space.walls if whole else ():
         normal, at = (view @ wall.normal)[:2], (view @ wall.point)[:2]
         if abs(float(np.linalg.norm(normal)) - 1) < 1e-6:
             beyond = (float(at[0] - normal[1]), float(at[1] + normal[0]))

@@ -303,11 +303,6 @@ def sentence(text: str) -> str:
     return f"{capital(text.rstrip('.'))}."
 
 
-def title_of(*names: str) -> str:
-    """Robot and cell, once where they have the same name."""
-    return printable(" – ".join(name for name in dict.fromkeys(names) if name))
-
-
 MOST_FAULTY = 100  # rows of the table of outliers
 
 

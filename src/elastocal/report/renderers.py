@@ -213,7 +213,9 @@ def page_of(
         names = [model.chain.name, model.cell.name]
     elif hasattr(result, "chain"):
         names = [result.chain.name]
-    head = f"{kind} of {text_of(say.title_of(*names), False)}"
+    # Robot and cell, once where they have the same name.
+    title = printable(" – ".join(name for name in dict.fromkeys(names) if name))
+    head = f"{kind} of {text_of(title, False)}"
     space = VIEW in body
     libraries = (*LIBRARIES, "plotly") if space else LIBRARIES
     versions = [f"{name} {metadata.version(name)}" for name in libraries]
