@@ -65,6 +65,10 @@ def test_the_example_without_a_bound_plans_by_exchange_alone(own, cell):
     assert plan.certificate.efficiency_pool is plan.bound_reported is None
     (line,) = re.findall(r"^    Certificate: (none: .*)$", PAGE.read_text("utf-8"), re.M)
     assert dict(plan_lines(plan))["Certificate"] == line
+    timed = design(
+        replace(cell, design=replace(asked, minutes=40.0)), DesignOptions(effort="quick")
+    )
+    assert timed.timed and timed.bound_reported is None and timed.execution.total <= 2400
 
 
 def test_the_same_file_again_replaces_its_criterion_and_another_may_not_take_its_name(own):

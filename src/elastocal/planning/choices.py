@@ -32,7 +32,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Plan, TimedSize
-from elastocal.planning.relaxation import Relaxed, exact_plan, prospects, relax
+from elastocal.planning.relaxation import Relaxed, exact_plan, prospects
 from elastocal.planning.setup import FeasiblePool, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, BoolArray, IntArray, Progress
@@ -236,7 +236,7 @@ class Choice:
                 ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
                 setup = replace(setup, ways=ways)
             pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
-            relaxed = relax(setup.problem(pool, shares).balanced(), GAIN / 10)
+            relaxed = prospects(setup.problem(pool, shares).balanced(), GAIN / 10)
         except ElastocalError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, tried.feasible / tried.tried)
