@@ -32,7 +32,6 @@ from elastocal.model.calibrated import (
     tool_point,
 )
 from elastocal.model.chain import Chain, joint_limits
-from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import (
     ARM_LENGTH,
     BoundedSearch,
@@ -543,9 +542,8 @@ def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) ->
 
 def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     spec, targets = arm.model.cell.model, c.targets
-    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
     acts = targets.table.force.any() or spec.link_gravity or spec.torque != "computed"
-    if elastic and not acts:
+    if arm.elastic and not acts:
         yield (
             f"{targets.table.source}: no load is stated, so no compliance is compensated; where "
             f"the tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"

@@ -6,16 +6,14 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from elastocal.cell.arm_description import Robot
+from elastocal.cell.arm_description import Convention, Robot
 from elastocal.errors import InputError, option, require
 from elastocal.export.exportable import ExportNumbers, nothing, numbers, origin_attributes
 from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint, LinkMass
-from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import parsed
 from elastocal.model.urdf import tree_of, urdf_file
@@ -342,7 +340,6 @@ def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
 # X = Tx(a) Rx(α) Ry(β).  A standard row is an L with the X after it, a modified row an L with the
 # X before it.
 
-Convention = Literal["standard", "modified"]
 CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
 HEADER = ("joint", "type", "theta0_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
 LIMITS = {"revolute": ("lower_rad", "upper_rad"), "prismatic": ("lower_m", "upper_m")}
@@ -436,7 +433,7 @@ def _decompose(
 def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> Sequence[Array | None]:
     """What the user's own table says of links 0 … n; None where it is in another convention."""
     unknown = [None] * (chain.n_joints + 1)
-    if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in UR_ENDINGS:
+    if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in dh.UR_ENDINGS:
         return unknown
     table = dh.read_dh_table(robot.dh)
     n = len(table.row)

@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
+from elastocal.cell.arm_description import Convention
 from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import read_text
 from elastocal.model import rigid
@@ -42,7 +43,6 @@ from elastocal.tables import (
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
-Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 FIXED = "fixed"

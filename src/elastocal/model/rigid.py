@@ -7,7 +7,6 @@ vectors (3, 1).
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,15 +22,6 @@ from elastocal.units import Array
 TINY = 1e-30
 
 
-def skew(v: Any) -> ca.SX:
-    v = ca.SX(v)
-    return ca.vertcat(
-        ca.horzcat(0, -v[2], v[1]),
-        ca.horzcat(v[2], 0, -v[0]),
-        ca.horzcat(-v[1], v[0], 0),
-    )
-
-
 def rotation_about(axis: Any, angle: Any) -> ca.SX:
     """Rotation by `angle` about the constant unit `axis` (Rodrigues)."""
     along, across, about = _rodrigues(tuple(map(float, axis)))
@@ -43,7 +33,7 @@ def _rodrigues(axis: tuple[float, float, float]) -> tuple[ca.SX, ca.SX, ca.SX]:
     """a aᵀ, 1 − a aᵀ and skew(a): an arm turns about the same few axes in every model of it."""
     a = np.array(axis)
     along = np.outer(a, a)
-    return constant(along), constant(np.eye(3) - along), constant(ca.DM(skew(a)))
+    return constant(along), constant(np.eye(3) - along), constant(ca.skew(ca.DM(a)))
 
 
 def rotation_from_vector(r: Any) -> ca.SX:
@@ -51,7 +41,7 @@ def rotation_from_vector(r: Any) -> ca.SX:
     r = ca.SX(r)
     angle = ca.sqrt(ca.sumsqr(r) + TINY)
     half = ca.sin(angle / 2) / angle
-    k = skew(r)
+    k = ca.skew(r)
     return ca.SX.eye(3) + ca.sin(angle) / angle * k + 2 * half**2 * (k @ k)
 
 
@@ -133,10 +123,10 @@ def reach_of(chain: Chain) -> float:
     turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
     first = turning[0] if turning else 0
     q[:, :first] = (low + high)[:first] / 2
-    until = replace(chain, joints=chain.joints[:first], flange_placement=np.eye(4), masses=())
-    centre = nominal_flanges(until, q[:1, :first])[0] if first else np.eye(4)
-    centre = (centre @ chain.joints[first].placement)[:3, 3]
-    return float(np.linalg.norm(nominal_flanges(chain, q)[:, :3, 3] - centre, axis=1).max())
+    symbol = ca.SX.sym("q", chain.n_joints)
+    frames = nominal_frames(chain, symbol, ca.SX.eye(4))
+    reach = ca.norm_2(frames[-1][:3, 3] - frames[first][:3, 3])
+    return float(BatchFunction([symbol], [reach])(q)[0].max())
 
 
 # Of the KR 270 of the demo, in m and N, from which loads are guessed by the fourth power of the

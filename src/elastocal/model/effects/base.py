@@ -6,25 +6,18 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import casadi as ca
 
-from elastocal.above import later
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
 from elastocal.model import rigid
-from elastocal.model.arm import ParameterSpec, Setting
+from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.plugin_loader import check_registered
 from elastocal.text import listed
 from elastocal.units import Array
-
-if TYPE_CHECKING:
-    from elastocal.model.arm import Arm
-else:
-    globals().update(later("elastocal.model.arm Arm"))
-
 
 Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]
 # Kinds of file that can hold an effect: of a rigid arm (URDF, DH table), or with springs (MJCF).
