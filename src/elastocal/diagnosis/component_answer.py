@@ -249,7 +249,8 @@ class SumAnswer:
     def decided(self) -> SumAnswer:
         """The same without doubtful effects that are not missed at left-out configurations, and
         without what does harm there.  What they may take from others is in the shares still."""
-        gone = [k for k in self._doubtful if not self._missed(k)]
+        now = self._left_out[0]
+        gone = [k for k in self._doubtful if not pays(self._left_out_without([k])[0], now)]
         answer = self._without(gone) if gone else self
         harmful = [
             k for key, gain in answer._not_paying.items() if gain < -HARM
@@ -265,10 +266,6 @@ class SumAnswer:
             k for k in self._rivals
             if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
         ]  # fmt: skip
-
-    def _missed(self, k: int) -> bool:
-        """Whether the error of left-out configurations grows by PAYS without component k."""
-        return pays(self._left_out_without([k])[0], self._left_out[0])
 
     def _without(self, gone: Sequence[int]) -> SumAnswer:
         removed = [self.found.components[k] for k in gone]

@@ -29,14 +29,13 @@ from elastocal.diagnosis.components import (
     Component,
     FittedSum,
     Pool,
-    indices,
     presence_cost,
 )
 from elastocal.diagnosis.evidence import at_scales
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import Weighted
 from elastocal.engine.mixed import beside
-from elastocal.units import Array, IntArray
+from elastocal.units import Array
 
 GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
 SIZES = np.exp(GRID)
@@ -56,7 +55,7 @@ def drawn(
     components, prior = (*found.components, *hidden), at.prior(precision)
     every = spans_of([c.width for c in components], len(prior))
     own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
-    c = indices([every[k] for k in own])
+    c = np.r_[(slice(0, 0), *(every[k] for k in own))]
     x = np.setdiff1d(np.arange(len(prior)), c)
     M, right = at.products.M, at.products.z
     L = linalg.cholesky(M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
@@ -143,20 +142,17 @@ def _kinds(components: Sequence[Component], own: Sequence[int]) -> list[_Kind]:
     for members, places in zip(pool.kinds, pool.places, strict=True):
         mine = [k for k in members.tolist() if k in spans]
         for k in (k for k in mine if components[k].given):
-            for some in _alike(components[k]):
-                columns = (spans[k].start + some).tolist()
+            h = components[k].hypothesis
+            assert h is not None
+            # Of its parameters those that are of similar sizes together.
+            words = np.array([p.alike for p in h.parameters])
+            for word in np.unique(words):
+                columns = (spans[k].start + np.flatnonzero(words == word)).tolist()
                 out.append(_Kind({(k, i): slice(i, i + 1) for i in columns}, {}, None))
         free = [k for k in mine if not components[k].given]
         sought = {(k, 0): float(pool.sought[k]) for k in free}
         out.append(_Kind({(k, 0): spans[k] for k in free}, sought, places))
     return out
-
-
-def _alike(c: Component) -> list[IntArray]:
-    """The numbers of its parameters, those that are of similar sizes together."""
-    assert c.hypothesis is not None
-    words = np.array([p.alike for p in c.hypothesis.parameters])
-    return [np.flatnonzero(words == word) for word in np.unique(words)]
 
 
 def _one_of(log_p: Array, rng: np.random.Generator) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
-from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, wrenches
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import (
     CHANGE_TIMES,
@@ -22,9 +22,7 @@ from elastocal.diagnosis.hypotheses import (
     cell_with,
     recorded,
 )
-from elastocal.diagnosis.model_set import Item, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, project
-from elastocal.diagnosis.unknown import Generic, wrenches
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, with_moves
 from elastocal.model.effects.base import (
@@ -119,7 +117,7 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
     for h in dataset.hypotheses:
         if h.settings:
             continue
-        columns = dataset.packed(h, np.zeros(0))
+        columns = dataset.packed(h)
         if np.abs(columns).max(initial=0.0) > 0:
             search = -dataset.columns.shares.get(h.key, 0.0)
             yield Component(
@@ -354,6 +352,6 @@ def _as_component(
     model = dataset.base.model
     return Component(
         family_of(effect, model.cell), effect, block.where,
-        packed_columns(dataset, Item(block, np.zeros(0), 0.0)), settings=tuple(settings.items()),
+        dataset.packed(block), settings=tuple(settings.items()),
         search=search, fellows=len(effect.places(model.chain, model.cell)),
     )  # fmt: skip

@@ -49,7 +49,6 @@ from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
     extended,
-    packed_columns,
     settings_of,
     spans_of,
 )
@@ -530,7 +529,7 @@ def imitators(
     every other hypothesis there."""
     taken = {id(c.hypothesis) for c in found.components}
     others = [h for h in dataset.hypotheses if not h.settings and id(h) not in taken]
-    beside = Beside(found, [dataset.packed(h, np.zeros(0)) for h in others])
+    beside = Beside(found, [dataset.packed(h) for h in others])
     for k in some:
         own, *each = beside.evidence_instead(found.spans[k])
         yield k, own, {h.key: evidence for h, evidence in zip(others, each, strict=True)}
@@ -644,7 +643,7 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
 
 
 def _component(dataset: DiagnosisData, item: Item) -> Component:
-    h, columns = item.what, packed_columns(dataset, item)
+    h, columns = item.what, dataset.packed(item.what, item.settings)
     if not isinstance(h, Hypothesis):
         return Component("pose", ResidualField(), h.where, columns, follows=h.covariate)
     family, settings = family_of(h.effect, dataset.base.model.cell), settings_of(item)

@@ -20,9 +20,9 @@ components of one kind, the share that is present and their common size are unkn
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from elastocal.diagnosis.noise_floor import (
     fit_noise,
     log_prior,
     posterior,
+    precision_of,
 )
 from elastocal.engine.mixed import Products, Standardised, climb
 from elastocal.model.effects.base import Effect
@@ -138,20 +139,13 @@ class Sizes:
         return Sizes(self.factor, self.size[at], self.length[at])
 
 
-@cache
-def precision_of_sizes(k: int) -> Array:
-    """Of the logarithms of k sizes of a kind (k, k), which have SPREAD in all, ALONE of it their
-    own: the inverse of ALONE² I + COMMON² 11ᵀ."""
-    return np.asarray(np.linalg.inv(ALONE**2 * np.eye(k) + COMMON**2))
-
-
 class Pool:
     """The prior of which components are there, and of the logarithms of their sizes.
 
     A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  It is there
     with probability PRESENT, then at any number of them with equal probability, and at any k of
     them (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n
-    over k) nats.  Sizes of a kind have the precision of `precision_of_sizes`.
+    over k) nats.  The logarithms of a kind's sizes spread by SPREAD in all, ALONE of it their own.
     """
 
     def __init__(self, components: Sequence[Component]) -> None:
@@ -168,7 +162,7 @@ class Pool:
         self.sought = np.array([c.sought for c in components])
         self.precision = np.zeros((len(components), len(components)))
         for own in self.kinds:
-            self.precision[np.ix_(own, own)] = precision_of_sizes(len(own))
+            self.precision[np.ix_(own, own)] = precision_of(len(own), ALONE, COMMON)
 
     @property
     def cost(self) -> float:
@@ -289,7 +283,7 @@ class SumOfComponents:
 
     def only(self, kept: Sequence[int]) -> SumOfComponents:
         every, own = self.products, np.arange(len(self.data.precision))
-        index = np.concatenate([own, indices([self.spans[k] for k in kept])])
+        index = np.concatenate([own, np.r_[(slice(0, 0), *(self.spans[k] for k in kept))]])
         products = replace(every, M=every.M[np.ix_(index, index)], z=every.z[index])
         narrow = replace(self.weighted, products=products)
         return replace(self, weighted=narrow, components=tuple(self.components[k] for k in kept))
@@ -315,11 +309,10 @@ class SumOfComponents:
     def across(self, columns: Sequence[Array]) -> list[Across]:
         """Of each of these columns beside the data's own and the components'; kept, since a search
         comes back to the same ones."""
-        new = {id(c): c for c in columns if id(c) not in self._known}
-        if new:
+        if new := [c for c in columns if id(c) not in self._known]:
             beside = side_by_side(self.data, [self.data.X, *(c.columns for c in self.components)])
             beside, r = _rows(beside), self.data.r.ravel()
-            for some in _in_bundles(list(new.values())):
+            for some in (new[k : k + BUNDLE] for k in range(0, len(new), BUNDLE)):
                 joined = side_by_side(self.data, some)
                 white = self.white(joined)
                 across, z = beside.T @ white, white.T @ r
@@ -399,21 +392,9 @@ def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
 
-# Columns that are multiplied together at least, since a few by themselves wait for memory, and
-# numbers that are whitened at a time.
-BUNDLE, PIECE = 48, 2_000_000
-
-
-def _in_bundles(columns: Sequence[Array]) -> Iterator[list[Array]]:
-    """Columns (C, m, k) one after the other, BUNDLE columns or more at a time."""
-    some: list[Array] = []
-    for c in columns:
-        some.append(c)
-        if sum(each.shape[2] for each in some) >= BUNDLE:
-            yield some
-            some = []
-    if some:
-        yield some
+# Groups of columns that are multiplied together, since a few columns by themselves wait for memory,
+# and numbers that are whitened at a time.
+BUNDLE, PIECE = 12, 2_000_000
 
 
 def posed(
@@ -491,16 +472,12 @@ class FittedSum:
         return plain.with_columns(columns, 1 / self.variances)
 
     @cached_property
-    def priors(self) -> tuple[Array, ...]:
-        first = self.sums.data.X.shape[2]
-        return tuple(self.variances[span.start - first : span.stop - first] for span in self.spans)
-
-    @cached_property
     def _shown(self) -> tuple[Array, ...]:
         plain, root = self.sums.data, self.sums.weighted.root
+        priors = np.append(1 / plain.precision, self.variances)
         return tuple(
-            _compressed(plain.masked(c.columns), prior, root, HARDLY)
-            for c, prior in zip(self.components, self.priors, strict=True)
+            _compressed(plain.masked(c.columns), priors[span], root, HARDLY)
+            for c, span in zip(self.components, self.spans, strict=True)
         )
 
     @property
@@ -632,8 +609,3 @@ def _compressed(columns: Array, variances: Array, root: Array, faint: float = FA
     white = (root @ scaled).reshape(-1, scaled.shape[2])
     values, vectors = np.linalg.eigh(white.T @ white)
     return np.asarray(scaled @ vectors[:, values > faint])
-
-
-def indices(spans: Sequence[slice]) -> IntArray:
-    each = (np.arange(span.start, span.stop) for span in spans)
-    return np.concatenate([np.zeros(0, dtype=np.int64), *each])

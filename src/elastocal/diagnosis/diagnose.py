@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from elastocal.diagnosis.diagnosis import (
     Gap,
     StructureTest,
 )
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
 from elastocal.diagnosis.effect_search import MANY, ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import (
@@ -41,7 +41,6 @@ from elastocal.diagnosis.model_set import with_likelier_backlash_model
 from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.reading_faults import screen_outliers
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, first_steps, noise_floor
-from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,
@@ -147,24 +146,22 @@ def _redirect(data: dict[str, Any], old: Path, new: Path) -> None:
             return path
         return Path(os.path.relpath(os.path.realpath(old / path), folder)).as_posix()
 
-    for table, keys in PATHS:
-        _change(data, table, keys, redirected)
+    for names, keys in PATHS:
+        for table in _tables(data, names):
+            table |= {key: redirected(table[key]) for key in keys if key in table}
     if modules := data.get("plugins", {}).get("modules"):
         data["plugins"]["modules"] = [redirected(m) if is_plugin_file(m) else m for m in modules]
 
 
-def _change(
-    data: Any, table: Sequence[str], keys: Sequence[str], changed: Callable[[str], str]
-) -> None:
-    """Replace the values of `keys` in the table reached by the names `table`, where it exists."""
+def _tables(data: Any, names: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """The tables reached by `names`, where there are some; every member of a list of them."""
     if isinstance(data, list):
         for member in data:
-            _change(member, table, keys, changed)
-    elif table:
-        if table[0] in data:
-            _change(data[table[0]], table[1:], keys, changed)
-    else:
-        data.update({key: changed(data[key]) for key in keys if key in data})
+            yield from _tables(member, names)
+    elif not names:
+        yield data
+    elif names[0] in data:
+        yield from _tables(data[names[0]], names[1:])
 
 
 @dataclass(frozen=True)

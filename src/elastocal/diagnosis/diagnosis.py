@@ -519,6 +519,12 @@ def _remedy(verdict: Verdict) -> str:
 
 
 SCHEMA = "elastocal/diagnosis/1"
+PUBLISHED = (
+    "verdict", "p_value", "probability_nothing", "probability_unknown", "gap", "budget", "effects",
+    "components", "groups", "fields", "slight", "candidates", "indistinguishable", "location",
+    "structure", "curves", "noise", "untested", "extra_plan", "model_keys", "warnings", "findings",
+    "backend", "n_readings", "n_configurations",
+)  # fmt: skip
 NORMAL_95 = 1.959964
 
 
@@ -531,14 +537,6 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
     """
     d = diagnosis
     content = {
-        "schema": SCHEMA,
-        "robot": model.chain.name,
-        "cell": model.cell.name,
-        "data": data,
-        "verdict": d.verdict,
-        "p_value": d.p_value,
-        "probability_nothing": d.probability_nothing,
-        "probability_unknown": d.probability_unknown,
         "gap": _in_um(d.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"),
         "budget": [
             {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
@@ -548,25 +546,16 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "components": [
             _in_um(c, "rms", "rms_ci95") | {"effect": c.effects[0]} for c in d.components
         ],
-        "groups": d.groups,
         "fields": [_found(effect) for effect in d.fields],
         "slight": [_found(effect) for effect in d.slight],
-        "candidates": d.candidates,
-        "indistinguishable": d.indistinguishable,
         "location": d.location and _location(d.location),
-        "structure": d.structure,
-        "curves": d.curves,
         "noise": _noise(d.noise, model),
-        "untested": d.untested,
         "extra_plan": d.extra and _without(vars(d.extra), "plan"),
-        "model_keys": d.model_keys,
-        "warnings": d.warnings,
-        "findings": d.findings,
         "backend": model.backend_report(),
-        "n_readings": d.n_readings,
-        "n_configurations": d.n_configurations,
     }
-    return {key: plain(value) for key, value in content.items()}
+    head = {"schema": SCHEMA, "robot": model.chain.name, "cell": model.cell.name, "data": data}
+    as_they_are = {key: getattr(d, key, None) for key in PUBLISHED}
+    return {key: plain(value) for key, value in (head | as_they_are | content).items()}
 
 
 def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:

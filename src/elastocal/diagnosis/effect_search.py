@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import (
     ANOTHER,
-    Flips,
     Scan,
     exceedance,
     log_prior_odds,
@@ -32,7 +31,6 @@ from elastocal.diagnosis.model_set import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.stated_floor import left_out_square, left_out_together
-from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.units import Array
 
@@ -102,7 +100,7 @@ FAR = 2e-4
 def is_far(dataset: DiagnosisData, chosen: ModelSet) -> bool:
     used = ~dataset.data.left_out
     signals = (signal_of(dataset, chosen, k)[used] for k in _direct(chosen))
-    return any(float(np.sqrt((signal**2).mean())) > FAR for signal in signals)
+    return any((signal**2).mean() > FAR**2 for signal in signals)
 
 
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
@@ -305,7 +303,7 @@ class ForwardSelection:
         # which a residual is flipped is that of the set that leaves it.
         key = items, current.scales, noise.logs().tobytes(), beside is not None
         if key not in self._scanned:
-            flips = None if beside is None else Flips(self.signs, beside.at.scattered)
+            flips = None if beside is None else (self.signs, beside.at.scattered)
             self._scanned[key] = scan(
                 self.dataset, self.generic, self._prior(current), current.data, noise, flips
             )

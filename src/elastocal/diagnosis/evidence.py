@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.diagnosis import SMALLEST_P
-from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
@@ -20,7 +20,6 @@ from elastocal.diagnosis.noise_floor import (
     Projection,
     project,
 )
-from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
@@ -180,16 +179,10 @@ def log_prior_odds(
 # Where D is the same in all visits of a configuration, the sums over visits come first.
 
 
-@dataclass(frozen=True)
-class Flips:
-    """A residual (C, m) whose configurations have their signs flipped by `signs` (F, C) of ±1.
-
-    It scatters as the noise does and holds no effect that has been found; everything that is tried
-    is scored against it beside the same columns as against the readings.
-    """
-
-    signs: Array
-    residual: Array
+# Signs (F, C) of ±1 by which the configurations of a residual (C, m) are flipped.  It scatters as
+# the noise does and holds no effect that has been found; everything that is tried is scored against
+# it beside the same columns as against the readings.
+Flips = tuple[Array, Array]
 
 
 @dataclass(frozen=True)
@@ -282,9 +275,9 @@ def _flipped(at: Projection, flips: Flips | None) -> tuple[Array, Array, Array]:
     """The signs (F, C), V⁻¹e (C, m), which they flip, and Σ_c signs (Hᵀe)_c (F, p)."""
     if flips is None:
         return np.zeros((0, len(at.u))), np.zeros_like(at.u), np.zeros((0, at.H.shape[2]))
-    e = flips.residual[..., None]
+    signs, e = flips[0], flips[1][..., None]
     h = (at.H.transpose(0, 2, 1) @ e)[..., 0]
-    return flips.signs, (at.inverse @ e)[..., 0], flips.signs @ h
+    return signs, (at.inverse @ e)[..., 0], signs @ h
 
 
 def direct(C: Array, at: Projection, flips: Flips | None = None) -> Spectrum:
@@ -326,7 +319,8 @@ class Grams:
         if isinstance(h, Generic):
             return self._of_blocks([h])
         if not h.driven:
-            return self._direct(self.dataset.packed(h, np.zeros(0)))
+            columns = self.data.masked(self.dataset.packed(h))
+            return direct(columns, self.at, self.flips)
         tried = self.dataset.grids[h.key].values if settings is None else settings
         sums, dataset = self.entry(h.entry_key(self.dataset.base.model)), self.dataset
         return sums.each(
@@ -352,15 +346,12 @@ class Grams:
         entry, columns = blocks[0].entry, blocks[0].columns
         if entry is None:
             assert columns is not None
-            return self._direct(columns)
+            return direct(self.data.masked(columns), self.at, self.flips)
         functions = [b.direction for b in blocks if b.direction is not None]
         return self.entry(entry).each(
             len(blocks), blocks[0].width, lambda some: np.stack(functions[some], axis=3),
             self.data.threads,
         )  # fmt: skip
-
-    def _direct(self, columns: Array) -> Spectrum:
-        return direct(self.data.masked(columns), self.at, self.flips)
 
 
 @dataclass(frozen=True)
@@ -404,7 +395,7 @@ def scan(
     grams = Grams(dataset, data, project(data, noise), flips)
     whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
     found: dict[int, Scored] = {}
-    F = 0 if flips is None else len(flips.signs)
+    F = 0 if flips is None else len(flips[0])
     flipped = np.empty((len(whats), F))
     for members, spectra in grams.of_each(whats):
         scales = whats[members[0]].scales

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 
 import numpy as np
 from scipy.special import logit, logsumexp, ndtri
@@ -63,19 +64,28 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
     """
     sums = beside(dataset, found, found.noise)
     out, now = [], sums.at.marginal
+    multiples = MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
     for h in ripples(dataset):
         i = index(h.where)
         own = [c for c in found.components if c.where == h.where]
         lines = sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
         if lines > MOST_FOUND:
             continue
-        tried = [_best(sums, h, 0.0, scatter_of(found.noise, i), ())]
         curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
-        now_scatter = [scatter_of(found.noise, i)] if curves else []
-        for scatter in less_scatter(found.noise, i) or now_scatter:
-            grams = beside(dataset, found, with_scatter(found.noise, i, scatter), curves)
-            tried.append(_best(grams, h, grams.at.marginal - now, scatter, curves))
-        best = max(tried, key=lambda family: family.gain)
+        scatter = scatter_of(found.noise, i)
+        beneath = less_scatter(found.noise, i) or ([scatter] if curves else [])
+        quieter = (
+            (beside(dataset, found, with_scatter(found.noise, i, less), curves), less, curves)
+            for less in beneath
+        )
+        best = max(
+            (
+                _best_family(grams, h, m, now, less, instead_of)
+                for grams, less, instead_of in chain([(sums, scatter, ())], quieter)
+                for m in multiples
+            ),
+            key=lambda family: family.gain,
+        )
         if best.gain > HOPELESS:
             out.append(replace(best, component=family_component(dataset, best)))
     return sorted(out, key=lambda family: -family.gain)
@@ -110,19 +120,12 @@ def less_scatter(noise: NoiseValues, i: int) -> list[tuple[float, float]]:
 MOST_FOUND = MOST_LINES - 3
 
 
-def _best(
-    grams: Grams, h: Hypothesis, gain: float, scatter: tuple[float, float],
-    curves: tuple[Component, ...],
+def _best_family(
+    grams: Grams, h: Hypothesis, m: int, now: float, scatter: tuple[float, float],
+    instead_of: tuple[Component, ...],
 ) -> LineFamily:  # fmt: skip
-    """The best family of a joint, of any number of multiples; `gain` is that of what it is in the
-    place of."""
-    tried = MULTIPLES[:1] if len(grams.dataset.blocks.member) > FEW_POSES else MULTIPLES
-    families = [_best_family(grams, h, m) for m in tried]
-    best = max(families, key=lambda family: family.gain)
-    return replace(best, gain=best.gain + gain, scatter=scatter, instead_of=curves)
-
-
-def _best_family(grams: Grams, h: Hypothesis, m: int) -> LineFamily:
+    """The best family of m lines of a joint, under its scatter and in the place of other
+    components; `now` is the log marginal likelihood of the sum as it is."""
     q = grams.dataset.table.q[:, index(h.where)]
     step = STEP / max(float(np.ptp(q)), 1e-3) / m
     orders = np.arange(LOWEST, HIGHEST / m, step)
@@ -132,7 +135,8 @@ def _best_family(grams: Grams, h: Hypothesis, m: int) -> LineFamily:
     k = int(np.argmax(each))
     search = -float(log_prior[k])
     order, sd, evidence = refined_order(grams, h, float(orders[k]), m, step)
-    return LineFamily(h.where, order, m, evidence - search, sd, search)
+    gain = evidence - search + (grams.at.marginal - now)
+    return LineFamily(h.where, order, m, gain, sd, search, scatter, instead_of)
 
 
 def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | None:

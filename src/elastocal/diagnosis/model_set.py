@@ -12,7 +12,7 @@ from scipy.special import expit, log_ndtr, logsumexp, ndtr
 
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
-from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import (
@@ -25,7 +25,6 @@ from elastocal.diagnosis.noise_floor import (
     log_prior,
     project,
 )
-from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model
@@ -98,18 +97,6 @@ def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
     """Where groups of so many coefficients each stand, the last of `total`."""
     ends = np.cumsum([total - sum(widths), *widths]).tolist()
     return tuple(slice(*pair) for pair in pairwise(ends))
-
-
-def packed_columns(dataset: DiagnosisData, item: Item) -> Array:
-    """Columns (C, m, k) of an item, scaled to its typical sizes."""
-    what = item.what
-    if isinstance(what, Hypothesis):
-        return dataset.packed(what, item.settings)
-    if what.columns is not None:
-        return what.columns
-    assert what.entry is not None and what.direction is not None
-    direction = np.einsum("cmv,cvdk->cmdk", dataset.blocks.in_visit, what.direction)
-    return np.einsum("cmd,cmdk->cmk", dataset.entry(what.entry), direction)
 
 
 def fit_set(
@@ -260,7 +247,7 @@ def with_items(
     """The data with the items' columns at the given scales."""
     if not items:
         return dataset.data
-    columns = np.concatenate([packed_columns(dataset, item) for item in items], axis=2)
+    columns = np.concatenate([dataset.packed(item.what, item.settings) for item in items], axis=2)
     p = len(dataset.data.precision)
     return dataset.data.with_columns(columns, _precision(dataset.data, items, scales)[p:])
 
@@ -276,7 +263,8 @@ PLAUSIBLE = 5.0
 
 def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
     """What item k does to the readings (C, m) at its estimate."""
-    columns = packed_columns(dataset, chosen.items[k])
+    item = chosen.items[k]
+    columns = dataset.packed(item.what, item.settings)
     return dataset.data.masked(columns @ chosen.at.beta[chosen.spans[k]])
 
 

@@ -170,9 +170,9 @@ def log_prior_of(stated: bool, joints: int) -> LogPrior:
     The joints' own have a common mean that is itself uncertain.
     """
     own = (
-        _precision(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
-        _precision(joints, SHARED_SPREAD, 0.0),
-        _precision(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
+        precision_of(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
+        precision_of(joints, SHARED_SPREAD, 0.0),
+        precision_of(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
     )
     back = np.linalg.inv(doubled(joints))
     return LogPrior(NoiseValues.usual(joints).logs(), back.T @ linalg.block_diag(*own) @ back)
@@ -190,7 +190,7 @@ def log_prior(stated: bool, noise: NoiseValues) -> float:
     return log_prior_of(stated, len(noise.joint)).penalty(noise.logs())[0]
 
 
-def _precision(n: int, apart: float, common: float) -> Array:
+def precision_of(n: int, apart: float, common: float) -> Array:
     """Inverse of apart² 1 + common² (n, n)."""
     share = common**2 / (apart**2 + n * common**2)
     return np.asarray((np.eye(n) - share) / apart**2)

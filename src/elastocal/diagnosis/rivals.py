@@ -13,7 +13,12 @@ from scipy.sparse.csgraph import connected_components
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import (
+    UNKNOWN_EFFECT,
+    DiagnosisData,
+    diagnosis_data_of,
+    generic_blocks,
+)
 from elastocal.diagnosis.evidence import Grams, evidence_of
 from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
 from elastocal.diagnosis.model_set import (
@@ -21,13 +26,11 @@ from elastocal.diagnosis.model_set import (
     Item,
     distances,
     fit_set,
-    packed_columns,
     settings_to_try,
     spans_of,
     with_items,
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
-from elastocal.diagnosis.unknown import UNKNOWN_EFFECT, generic_blocks
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
@@ -279,7 +282,7 @@ def alternatives(
     data = with_items(dataset, rivals.beside, widest)
     grams = []
     for item in rivals.rivals:
-        C = data.masked(packed_columns(dataset, item))
+        C = data.masked(dataset.packed(item.what, item.settings))
         at = project(data.with_columns(C, np.ones(C.shape[2])), noise)
         signal = C @ at.beta[data.X.shape[2] :]
         grams.append(Grams(dataset, data, project(replace(data, r=signal), noise)))
@@ -361,15 +364,17 @@ class Discrimination:
         the dataset the last are `candidates`."""
         data, measured = dataset.data, len(dataset.data.X) - candidates
         searched = alternatives(so_far, noise, rivals)
+
+        def packed(item: Item) -> Array:
+            return dataset.packed(item.what, item.settings)
+
         # What is beside counts by the widest size of its prior.
-        beside = [
-            packed_columns(dataset, item) * float(item.what.scales.max()) for item in rivals.beside
-        ]
+        beside = [packed(item) * float(item.what.scales.max()) for item in rivals.beside]
         others = [
-            [*(packed_columns(dataset, i) for i in items), *columns_of_starts(dataset, rival)]
+            [*(packed(i) for i in items), *columns_of_starts(dataset, rival)]
             for rival, items in zip(rivals.rivals, searched, strict=True)
         ]
-        own = [packed_columns(dataset, rival) for rival in rivals.rivals]
+        own = [packed(rival) for rival in rivals.rivals]
         own += chain.from_iterable(others)
         fitted, n = data.X.shape[2], len(rivals.rivals)
         nuisance = fitted + sum(C.shape[2] for C in beside)

@@ -45,32 +45,26 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
     variance = np.diagonal(data.covariance, axis1=1, axis2=2)
     ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
     variance = variance[~data.left_out]
+    # Those left out have their error against the fit to the others.
+    e, stated = _left_over(data, at), data.blocks.unpack_square(data.covariance)
+    sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
+    table, gone = dataset.table, np.flatnonzero(data.faulty)
+    faulty = tuple(
+        FaultyReading(
+            int(table.row[row]),
+            table.configuration_labels[table.configuration[row]],
+            table.marker_names[table.marker[row]],
+            float(np.linalg.norm(e[k, :3])),
+            float(np.linalg.norm(e[k] / sigma[k])),
+        )
+        for k, row in zip(gone, dataset.lead[gone], strict=True)
+    )
     return NoiseFloor(
         data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
         tuple(noise.joint.tolist()), noise.shared_by_all,
         float(np.sqrt(square / dof)) if dof else None,
-        tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise, at),
-        near_repeats(dataset, data, at), dataset.drift,
+        tuple(noise.shared.tolist()), faulty, near_repeats(dataset, data, at), dataset.drift,
     )  # fmt: skip
-
-
-def describe_faulty(
-    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, at: Projection
-) -> tuple[FaultyReading, ...]:
-    """The readings left out, with their error against the fit to the others."""
-    e, stated = _left_over(data, at), data.blocks.unpack_square(data.covariance)
-    sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
-    table, lead = dataset.table, dataset.lead
-    return tuple(
-        FaultyReading(
-            int(table.row[lead[k]]),
-            table.configuration_labels[table.configuration[lead[k]]],
-            table.marker_names[table.marker[lead[k]]],
-            float(np.linalg.norm(e[k, :3])),
-            float(np.linalg.norm(e[k] / sigma[k])),
-        )
-        for k in np.flatnonzero(data.faulty)
-    )
 
 
 def _left_over(data: NoisyData, at: Projection) -> Array:
