@@ -510,11 +510,11 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
         "files": [
             {
-                **vars(observed),
+                **observed,
                 "columns": [
-                    {"from": name, "to": to, "unit": unit} for name, to, unit in observed.columns
+                    {"from": name, "to": to, "unit": unit} for name, to, unit in observed["columns"]
                 ],
-                "ignored": [{"line": line, "reason": why} for line, why in observed.ignored],
+                "ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]],
             }
             for observed in found.understood
         ],

@@ -22,7 +22,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
 from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing import joining
-from elastocal.importing.exports import FORCES, Records, Understood, joint_stems, read_records
+from elastocal.importing.exports import FORCES, Records, joint_stems, read_records
 from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import (
     LoadStatesTable,
@@ -110,7 +110,7 @@ def with_loads_of_names(
     if not any(named.values()):
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
         told += [f"column {name} of {r.source}" for r in every
-                 for name in r.understood.unused if _WORD.search(name)]  # fmt: skip
+                 for name in r.understood["unused"] if _WORD.search(name)]  # fmt: skip
         return made, [
             f"{listed(told)}: named for a load that is not taken, and the rows are written "
             "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
@@ -339,7 +339,7 @@ class Imported:
     `refused` says why the robot of the cell cannot have measured it, "" where it can.
     """
 
-    understood: tuple[Understood, ...]
+    understood: tuple[dict[str, Any], ...]
     columns: Columns
     joined: Joined | None
     text: str

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -429,31 +430,14 @@ UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are s
 
 
 @dataclass(frozen=True)
-class Understood:
-    """What was made of a file, for people.
-
-    `columns`: (its name in the file, column of the measurement table, unit); `unused`: names of
-    the file's other columns; `ignored`: (line, reason) of everything passed over.
-    """
-
-    file: str
-    preset: str | None
-    role: str
-    encoding: str
-    layout: str
-    decimal: str
-    columns: tuple[tuple[str, str, str], ...]
-    unused: tuple[str, ...]
-    rows: int
-    ignored: tuple[tuple[int, str], ...]
-
-
-@dataclass(frozen=True)
 class Records:
     """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
 
     `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` (name,
     configuration, marker, repeat, load) → n texts; `load` of all rows, where one is stated.
+    `understood` says for people what was made of the file, by the keys of the command's JSON:
+    `columns` are (its name in the file, column of the measurement table, unit), `unused` names of
+    the file's other columns, `ignored` (line, reason) of everything passed over.
     """
 
     files: tuple[str, ...]
@@ -462,7 +446,7 @@ class Records:
     numbers: dict[str, Array]
     units: dict[str, str]
     texts: dict[str, list[str]]
-    understood: Understood
+    understood: dict[str, Any]
     load: str | None = None
 
     def __len__(self) -> int:
@@ -590,12 +574,14 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         seconds = seconds_of(name, line.tolist(), written, formats)
         numbers["time"], of["time"] = np.array(seconds), "s"
     used = {i for c in every for i in c.index}
-    understood = Understood(
-        name, source.preset, source.role or "both", encoding, table.layout, cells.decimal,
-        columns=tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
-        unused=tuple(n or f"column {i + 1}" for i, n in enumerate(table.header) if i not in used),
-        rows=len(kept), ignored=tuple(sorted({*table.ignored, *ignored})),
-    )  # fmt: skip
+    understood = {
+        "file": name, "preset": source.preset, "role": source.role or "both",
+        "encoding": encoding, "layout": table.layout, "decimal": cells.decimal,
+        "columns": tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
+        "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
+                        if i - 1 not in used),
+        "rows": len(kept), "ignored": tuple(sorted({*table.ignored, *ignored})),
+    }  # fmt: skip
     file = np.zeros(len(line), dtype=np.int64)
     return Records((name,), file, line, numbers, of, texts, understood, source.load)
 

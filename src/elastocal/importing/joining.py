@@ -147,8 +147,8 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
     reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
     good = np.setdiff1d(np.arange(len(records)), bad)
     kept = replace(records, texts=present | records.texts).take(good)
-    ignored = tuple(sorted([*records.understood.ignored, *reasons]))
-    return replace(kept, understood=replace(records.understood, rows=len(kept), ignored=ignored))
+    ignored = tuple(sorted([*records.understood["ignored"], *reasons]))
+    return replace(kept, understood=kept.understood | {"rows": len(kept), "ignored": ignored})
 
 
 def with_joints(

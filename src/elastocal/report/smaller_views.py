@@ -318,9 +318,9 @@ ROLES = {"points": "points", "joints": "joint values", "both": "points and joint
 def left_out(found: Imported) -> list[str]:
     lines = []
     for observed in found.understood:
-        if n := len(observed.ignored):
-            rows = listed((f"line {line} ({reason})" for line, reason in observed.ignored), 8)
-            lines.append(f"{observed.file}: passed over {say.counted(n, 'line')}: {rows}")
+        if n := len(observed["ignored"]):
+            rows = listed((f"line {line} ({reason})" for line, reason in observed["ignored"]), 8)
+            lines.append(f"{observed['file']}: passed over {say.counted(n, 'line')}: {rows}")
     if (joined := found.joined) is not None:
         for told, names in (("left out, without joint values: %d points", joined.left_out),
                             ("poses without a point: %d", joined.unused)):  # fmt: skip
@@ -334,15 +334,15 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
     `width`: columns of letters that there is room for.
     """
     for seen in found.understood:
-        preset = f"preset {seen.preset}, " if seen.preset else ""
-        decimals = ", decimal commas" if seen.decimal == "," else ""
+        preset = f"preset {seen['preset']}, " if seen["preset"] else ""
+        decimals = ", decimal commas" if seen["decimal"] == "," else ""
         yield say.Heading(
-            f"{seen.file}: {say.counted(seen.rows, 'row')} of {ROLES[seen.role]} "
-            f"({preset}{seen.encoding}, {seen.layout}{decimals})"
+            f"{seen['file']}: {say.counted(seen['rows'], 'row')} of {ROLES[seen['role']]} "
+            f"({preset}{seen['encoding']}, {seen['layout']}{decimals})"
         )
-        rows = [(name, column, unit or "–") for name, column, unit in seen.columns]
+        rows = [(name, column, unit or "–") for name, column, unit in seen["columns"]]
         yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
-        yield say.Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
+        yield say.Lines([("Not used", listed(seen["unused"], 20))] if seen["unused"] else [])
     columns = found.columns
     first = range(min(FIRST_ROWS, len(found.table)))
     every = {n: [_cell(columns[n], i) for i in first] for n in columns if n != "note_source"}
