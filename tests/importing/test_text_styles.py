@@ -61,7 +61,7 @@ def test_preamble_repeated_headers_footers_and_rows_without_a_value(tmp_path):
         imported(tmp_path, files, MAPPING.format(text=""))
     found = imported(tmp_path, files, MAPPING.format(text="ignore = 'exported$'"))
     check(found)
-    ignored = found.understood[0].ignored
+    ignored = found.understood[0]["ignored"]
     assert [line for line, _ in ignored] == [1, 5, 7, 8]
     assert ignored[-1][1] == "no value in column Gelenkstück 2"
 
@@ -88,7 +88,7 @@ def test_robot_programs_over_several_lines_in_logs_and_arrays(tmp_path, text, pr
     found = program(tmp_path, text, preset)
     joints = [[1.5, -20, 3, 4, 5, 6], [7, 8, 9, 1, 2, 3]]
     np.testing.assert_allclose(np.degrees(found.table.q), joints)
-    assert [line for line, _ in found.understood[1].ignored] == lines
+    assert [line for line, _ in found.understood[1]["ignored"]] == lines
 
 
 @pytest.mark.parametrize(

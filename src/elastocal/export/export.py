@@ -7,7 +7,7 @@ functions are written here.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from elastocal.identification.least_squares import t_quantile
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
-from elastocal.model.manipulator import SmoothGroup, smooth_groups
+from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.xml_file import XmlFile
@@ -288,8 +288,29 @@ class _Writing:
         in the flange frame.  `position_deg` or `time_s` is what it follows.  A line that begins
         with # says where the numbers come from.
         """
-        groups = smooth_groups(self.calibrated.model)
-        rows = [row for group in groups for row in _correction_rows(self.calibrated, group)]
+        arm, rows = self.calibrated, list[tuple[str, ...]]()
+        names, place = arm.model.names, {n: k for k, n in enumerate(arm.determined)}
+        quantile = float(t_quantile(LEVEL, np.array(np.inf)))
+        for group in smooth_groups(arm.model):
+            if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+                continue
+            steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
+            x = group.grid(min(max(steps + 1, FEWEST), MOST))
+            waves = group.basis(x)
+            for number, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
+                known = np.array([names[c] in place for c in columns])
+                at = [place[names[c]] for c in columns[known]]
+                own = waves[:, known]
+                variance = np.einsum("nk,kl,nl->n", own, arm.covariance[np.ix_(at, at)], own)
+                half = quantile * np.sqrt(np.maximum(variance, 0.0))
+                for position, *sizes in zip(x, waves @ arm.x[columns], half, strict=True):
+                    angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
+                    micro = (f"{size * 1e6 + 0.0:.3f}" for size in sizes)
+                    rows.append((
+                        group.effect, group.where, group.follows,
+                        *((angle, "") if group.lasting else ("", time)),
+                        str(number + 1), MICRO.get(unit, unit), *micro,
+                    ))  # fmt: skip
         if not rows:
             raise InputError(
                 f"{self.calibrated.source}: this arm has no smooth function to be written as "
@@ -459,31 +480,6 @@ class _Writing:
         checked(text)
         done = replace(self.done, without_beta=beta)
         return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
-
-
-def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:
-    names, place = calibrated.model.names, {n: k for k, n in enumerate(calibrated.determined)}
-    if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
-        return
-    steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
-    x = group.grid(min(max(steps + 1, FEWEST), MOST))
-    waves = group.basis(x)
-    quantile = float(t_quantile(LEVEL, np.array(np.inf)))
-    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True), 1):
-        known = np.array([names[c] in place for c in columns])
-        at = [place[names[c]] for c in columns[known]]
-        own = waves[:, known]
-        variance = np.einsum("nk,kl,nl->n", own, calibrated.covariance[np.ix_(at, at)], own)
-        half = quantile * np.sqrt(np.maximum(variance, 0.0))
-        value = waves @ calibrated.x[columns]
-        for position, *sizes in zip(x, value, half, strict=True):
-            angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
-            micro = (f"{size * 1e6 + 0.0:.3f}" for size in sizes)
-            yield (
-                group.effect, group.where, group.follows,
-                *((angle, "") if group.lasting else ("", time)),
-                str(component), MICRO.get(unit, unit), *micro,
-            )  # fmt: skip
 
 
 def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:

@@ -374,8 +374,16 @@ def tree_of(file: XmlFile) -> Tree:
     )
     links: dict[str, LinkMass] = {}
     for tag in root.all("link"):
-        name = _name(path, tag, links)
-        links[name] = _mass(f"{path}: link '{name}'", tag.first("inertial"))
+        name, inertial = _name(path, tag, links), tag.first("inertial")
+        where, mass, com = f"{path}: link '{name}'", 0.0, (0.0, 0.0, 0.0)
+        if inertial is not None:
+            if (value := inertial.of("mass", "value")) is None:
+                told = f'{where}: <inertial> without <mass value="…">; add it or remove <inertial>'
+                raise InputError(told)
+            mass = _number(f"{where}, mass value", value)
+            require(mass >= 0, f"{where}: mass {mass:g} kg is negative; give kg, zero or more")
+            com = _vector(where, inertial, "origin", "xyz")
+        links[name] = LinkMass(mass, np.array(com))
     require(bool(links), f"{path}: <robot> has no <link>; a robot needs links and joints")
     joints: dict[str, FileJoint] = {}
     for tag in root.all("joint"):
@@ -410,17 +418,6 @@ def _name(path: Path, tag: Tag, known: Collection[str]) -> str:
         f"{path}: two {kind}s are named '{name}'; names must be unique, rename one",
     )
     return name
-
-
-def _mass(where: str, inertial: Tag | None) -> LinkMass:
-    if inertial is None:
-        return LinkMass(0.0, np.zeros(3))
-    if (value := inertial.of("mass", "value")) is None:
-        told = f'{where}: <inertial> without <mass value="…">; add it or remove <inertial>'
-        raise InputError(told)
-    mass = _number(f"{where}, mass value", value)
-    require(mass >= 0, f"{where}: mass {mass:g} kg is negative; give kg, zero or more")
-    return LinkMass(mass, np.array(_vector(where, inertial, "origin", "xyz")))
 
 
 def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint:

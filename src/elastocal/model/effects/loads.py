@@ -222,14 +222,13 @@ class GravityCompensator(Effect):
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = EXAMPLE | (cell.model.nominal.gravity_compensator or {})
-        anchor_x, anchor_y = given["anchor_m"]
         stiffness = float(given["stiffness_N_per_m"])
+        shape = zip(
+            GEOMETRY, (*given["anchor_m"], given["arm_m"], given["free_length_m"]), strict=True
+        )
         return (
             ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or None),
-            ParameterSpec("compensator_anchor_x", "m", float(anchor_x), 1e-2),
-            ParameterSpec("compensator_anchor_y", "m", float(anchor_y), 1e-2),
-            ParameterSpec("compensator_arm", "m", float(given["arm_m"]), 1e-2),
-            ParameterSpec("compensator_free_length", "m", float(given["free_length_m"]), 1e-2),
+            *(ParameterSpec(key, "m", float(value), 1e-2) for key, value in shape),
         )
 
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
