@@ -107,7 +107,8 @@ def read_dh(
         require(ur_model is None, told)
         return _of_origins(path, text)
     table = read_dh_table(path)
-    moving = [i for i in range(len(table.row)) if not _still(table, i)]
+    kinds = [_kind(table, i) for i in range(len(table.row))]
+    moving = [i for i, kind in enumerate(kinds) if kind is not None]
     if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
         raise InputError(
             f"{path}: {len(moving)} rows below the header, one per joint; "
@@ -118,19 +119,23 @@ def read_dh(
         if names.count(name) > 1:
             raise InputError(f"{table.where(i, 'joint')}: '{name}' appears twice; rename one")
     joints, after, passed = list[Joint](), list[Array](), np.eye(4)
-    for i in range(len(table.row)):
+    for i, kind in enumerate(kinds):
         theta0, alpha, beta = (
             _plausible(table, i, "angle", k) for k in ("theta0", "alpha", "beta")
         )
         d, a = (_plausible(table, i, "length", k) for k in ("d", "a"))
         beta = 0.0 if math.isnan(beta) else beta
         T_before, T_after = link(theta0, d, a, alpha, beta, convention)
-        if i not in moving:
+        if kind is None:
             passed = passed @ T_before @ T_after
             continue
-        kind = _kind(table, i)
-        limits, axis = _limits(table, i, kind), _sign(table, i) * np.array(Z)
-        joints.append(Joint(names[len(joints)], kind, passed @ T_before, axis, *limits))
+        sign = dh_number(table, i, "sign", "sign")
+        require(
+            sign in (1.0, -1.0) or math.isnan(sign),
+            f"{table.where(i, 'sign')}: {sign:g}; write 1, or -1 where the joint turns against z",
+        )
+        axis, name = np.array(Z) * (-1.0 if sign == -1.0 else 1.0), names[len(joints)]
+        joints.append(Joint(name, kind, passed @ T_before, axis, *_limits(table, i, kind)))
         passed = T_after
         after.append(T_after)
     masses = () if masses_path is None else _masses(Path(masses_path), names, after)
@@ -246,32 +251,21 @@ def _meant(known: Sequence[Family], what: str, header: str) -> str | None:
     )
 
 
-def _still(table: RawTable, i: int) -> bool:
-    kind, name = table.text(i, "type"), table.text(i, "joint").lower()
-    if not kind and name in NO_JOINTS:
+def _kind(table: RawTable, i: int) -> JointKind | None:
+    """None of a row that no joint moves."""
+    kind, name = table.text(i, "type"), table.text(i, "joint")
+    if not kind and name.lower() in NO_JOINTS:
         raise InputError(
-            f"{table.where(i, 'joint')}: '{table.text(i, 'joint')}' names no joint; give the row "
-            f"type {FIXED} in the column type (or revolute, prismatic, if a joint moves it)"
+            f"{table.where(i, 'joint')}: '{name}' names no joint; give the row type {FIXED} in the "
+            "column type (or revolute, prismatic, if a joint moves it)"
         )
-    return kind.lower() in STILL
-
-
-def _sign(table: RawTable, i: int) -> float:
-    value = dh_number(table, i, "sign", "sign")
-    if value not in (1.0, -1.0) and not math.isnan(value):
-        raise InputError(
-            f"{table.where(i, 'sign')}: {value:g}; write 1, or -1 where the joint turns against z"
-        )
-    return -1.0 if value == -1.0 else 1.0
-
-
-def _kind(table: RawTable, i: int) -> JointKind:
-    text = table.text(i, "type") or "revolute"
-    if text == "revolute" or text == "prismatic":
-        return "prismatic" if text == "prismatic" else "revolute"
+    if kind.lower() in STILL:
+        return None
+    if kind in ("", "revolute", "prismatic"):
+        return "prismatic" if kind == "prismatic" else "revolute"
     raise InputError(
-        f"{table.where(i, 'type')}: unknown joint type '{text}'"
-        f"{did_you_mean(text, ('revolute', 'prismatic', *STILL))}; valid: revolute, prismatic, "
+        f"{table.where(i, 'type')}: unknown joint type '{kind}'"
+        f"{did_you_mean(kind, ('revolute', 'prismatic', *STILL))}; valid: revolute, prismatic, "
         "fixed"
     )
 
