@@ -303,8 +303,13 @@ class _Judged:
 
     def _finding(self, fit: FitToGood, group: Group, p: float, beyond: int) -> FaultyGroup:
         """The group as it errs under the fit without any of the others."""
-        move, chosen = np.abs(_move(fit, group.members)), np.flatnonzero(group.members)
-        column = int(np.argmax(move))
+        # Change (p,) of the parameters in their standard deviations if the members were fitted
+        # along as read; infinite of one that the good ones leave undetermined.
+        _, _, G, c = _changed(fit, group.members & ~fit.good, 1)
+        root, sigma = np.linalg.inv(fit.R), float(np.sqrt(fit.variance))
+        deviation = np.linalg.norm(root, axis=1) * sigma
+        move = np.where(deviation > OPEN, np.inf, np.abs(root @ np.linalg.solve(G, c)) / deviation)
+        chosen, column = np.flatnonzero(group.members), int(np.argmax(move))
         pattern: Pattern = "single" if group.level == "reading" else "scatter"
         own, error = (
             float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, self.off)
@@ -318,18 +323,8 @@ class _Judged:
         return FaultyGroup(
             group.level, group.name, pattern, tuple(chosen.tolist()),
             tuple(self.lines[chosen].tolist()), beyond, error,
-            own / float(np.sqrt(fit.variance)), p, float(move[column]), self.names[column], p_left,
+            own / sigma, p, float(move[column]), self.names[column], p_left,
         )  # fmt: skip
-
-
-def _move(fit: FitToGood, members: BoolArray) -> Array:
-    """Change (p,) of the parameters in their standard deviations if `members` were fitted along as
-    read; infinite of one that the good ones leave undetermined."""
-    _, _, G, c = _changed(fit, members & ~fit.good, 1)
-    root = np.linalg.inv(fit.R)
-    deviation = np.linalg.norm(root, axis=1)
-    moved = root @ np.linalg.solve(G, c) / (deviation * np.sqrt(fit.variance))
-    return np.where(deviation * np.sqrt(fit.variance) > OPEN, np.inf, moved)
 
 
 # The readings of an identification, under the noise that its method found.

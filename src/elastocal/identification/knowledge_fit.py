@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from scipy import special
 
 from elastocal.errors import ElastocalError, InsufficientDataError, option, require
-from elastocal.identification.constrained import Minimum, Reduced
+from elastocal.identification.constrained import Reduced
 from elastocal.identification.knowledge import Constraints, share_of_prior
 from elastocal.identification.least_squares import (
     LEVEL,
@@ -38,54 +38,32 @@ from elastocal.units import Array, BoolArray, IntArray, Progress
 PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
 
 
-@dataclass(frozen=True)
 class KnownFit:
     """A fit at its minimum with what is known, beside rows of noise `sigma`: the linear problem of
-    the step δ (columns,) from there, |e − B δ|² + |lack − P δ|², and its minimum δ = 0."""
+    the step δ (columns,) from there, |e − B δ|² + |lack − P δ|², and its minimum δ = 0.
 
-    fit: Fit
-    known: PriorRows
-    sigma: float
+    `cofactor` is (NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave, of which
+    follows the posterior `covariance` (columns, columns), inequalities left out; `prior_share`
+    (columns,) is the share of each estimate's information that is the prior's, NaN where fixed.
+    """
 
-    @cached_property
-    def reduced(self) -> Reduced:
-        assert self.known.system is not None
-        x, rows = self.fit.x[self.fit.columns], self.fit.r_factor.augmented
-        J, lack = np.vstack([rows[:, :-1], self.known.P]), self.known.target - self.known.P @ x
-        limits = self.known.system.moved(x, np.ones(len(x)))
-        return Reduced(J, np.concatenate([rows[:, -1], lack]), limits)
-
-    @cached_property
-    def best(self) -> Minimum:
-        return self.reduced.minimum(self.known.system)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.reduced.system.names
-
-    @property
-    def objective(self) -> float:
-        return float(self.reduced.t @ self.reduced.t)
+    def __init__(self, fit: Fit, known: PriorRows, sigma: float) -> None:
+        assert known.system is not None
+        self.fit, self.known, self.sigma = fit, known, sigma
+        x, rows = fit.x[fit.columns], fit.r_factor.augmented
+        J, lack = np.vstack([rows[:, :-1], known.P]), known.target - known.P @ x
+        limits = known.system.moved(x, np.ones(len(x)))
+        self.reduced = Reduced(J, np.concatenate([rows[:, -1], lack]), limits)
+        self.names, self.objective = limits.names, float(self.reduced.t @ self.reduced.t)
+        self.best = self.reduced.minimum(known.system)
+        self.cofactor = self.pinned(self.reduced.unit[:, None] * self.reduced.T)
+        self.covariance = sigma**2 * self.cofactor
+        self.prior_share = share_of_prior(self.cofactor, known.P)
 
     @cached_property
     def face(self) -> Array:
         """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
         return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
-
-    @cached_property
-    def cofactor(self) -> Array:
-        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        return self.pinned(self.reduced.unit[:, None] * self.reduced.T)
-
-    @property
-    def covariance(self) -> Array:
-        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
-        return self.sigma**2 * self.cofactor
-
-    @property
-    def prior_share(self) -> Array:
-        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
-        return share_of_prior(self.cofactor, self.known.P)
 
     @property
     def effective(self) -> float:

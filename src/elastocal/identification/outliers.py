@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -195,18 +195,14 @@ ROUNDS = 12
 Found = TypeVar("Found")
 
 
-class BetterHalf(NamedTuple):
+class BetterHalf:
     """How well a fit explains the half of all observations that lies nearest: their mean square,
     over the degrees of freedom of a fit to so many."""
 
-    variance: float
-    dof: float
-
-    @classmethod
-    def of(cls, squared: Array, dof: float, good: BoolArray) -> BetterHalf:
+    def __init__(self, squared: Array, dof: float, good: BoolArray) -> None:
         half = len(squared) // 2 + 1
-        dof = max(dof, 1.0) * half / max(int(good.sum()), 1)
-        return cls(float(np.partition(squared, half - 1)[:half].sum()) / dof, dof)
+        self.dof = max(dof, 1.0) * half / max(int(good.sum()), 1)
+        self.variance = float(np.partition(squared, half - 1)[:half].sum()) / self.dof
 
     def explains_more(self, other: BetterHalf) -> bool:
         """Beyond what chance allows."""
@@ -240,7 +236,7 @@ def until_it_stands(
                 raise
             break  # so few cannot judge the others
         squared, dof, agrees = judged(found, good)
-        visited.append((found, good, BetterHalf.of(squared, dof, good)))
+        visited.append((found, good, BetterHalf(squared, dof, good)))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]

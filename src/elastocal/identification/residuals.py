@@ -422,7 +422,7 @@ def summarise_residuals(
     if not absolute:
         e = e / np.sqrt((e @ e) / f)
     held = np.full(len(e), np.inf) if held_out is None else held_out[free]
-    table = _Table(e / np.sqrt(spare), e**2, spare, held, None if absolute else f)
+    table = _Table(e, spare, held, None if absolute else f)
     judged = [(group, table.judged(*group[1:])) for group in groupings(observed, free)]
     holm = _holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
     found = []
@@ -434,15 +434,12 @@ def summarise_residuals(
     return ResidualSummary(whole, edges, tuple(found), absolute, int((~free).sum()))
 
 
-@dataclass(frozen=True)
 class _Table:
-    """Rows with a residual: z, e², 1 − h, held out, and f where the residuals told the size."""
+    """Rows with a residual e, 1 − h, held out, and f where the residuals told the size."""
 
-    z: Array
-    squared: Array
-    spare: Array
-    held: Array
-    dof: float | None
+    def __init__(self, e: Array, spare: Array, held: Array, dof: float | None) -> None:
+        self.z, self.squared, self.spare = e / np.sqrt(spare), e**2, spare
+        self.held, self.dof = held, dof
 
     def judged(self, code: IntArray, names: NDArray[np.object_]) -> Array:
         """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
