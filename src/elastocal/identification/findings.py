@@ -378,8 +378,11 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     if ratio is None:
         yield _note("noise_not_compared", "" if _lacks_fit(result) else STATE_NOISE)
         return
-    # A mean square varies by (2 + excess kurtosis) / n.
-    told = result.dof / (1 + max(_stated_kurtosis(result), 0.0) / 2)
+    tails, size, kurtosis = result.model.cell.noise.tails, result.observations.size, 0.0
+    if tails is not None:
+        values = (len(result.observations.lead) + len(result.excluded)) * size
+        kurtosis = max(kept_of(tails, values, size).excess_kurtosis, 0.0)
+    told = result.dof / (1 + kurtosis / 2)  # a mean square varies by (2 + excess kurtosis) / n
     low, high = np.sqrt(special.chdtri(told, 1 - np.array(STATED)) / told).tolist()
     single = result.noise.single
     if single is not None and single.above:
@@ -402,14 +405,6 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
         kind = "residual_below_stated_noise"
     chance = {"by_chance_from": low, "by_chance_to": high}
     yield say(kind, doing, ratio=float(ratio), **chance, dof=result.dof)
-
-
-def _stated_kurtosis(result: Calibration) -> float:
-    tails, size = result.model.cell.noise.tails, result.observations.size
-    if tails is None:
-        return 0.0
-    values = (len(result.observations.lead) + len(result.excluded)) * size
-    return kept_of(tails, values, size).excess_kurtosis
 
 
 def _lacking(result: Calibration) -> str:

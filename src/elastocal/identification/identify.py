@@ -6,6 +6,7 @@ stated weights, the published ones.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -126,26 +127,26 @@ def identify(
     outliers = describe(course.every, found.solution, ~found.good)
     result = summarise(course, found, outliers, new_poses, copies)
     body = solved_body(table, float(found.solution.fit.residual.std()))
-    told = (*told, *_disordered(model, table, test), *_fallen(model, table, result.x))
+    told = (*told, *_doubts(model, table, test, result.x))
     result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result, test)))
 
 
-def _fallen(model: Model, table: Measurements, x: Array) -> tuple[str, ...]:
+def _doubts(
+    model: Model, table: Measurements, test: Measurements | None, x: Array
+) -> Iterator[str]:
+    """Moves out of order, where any effect follows the last one, and an arm that lies."""
+    moves = any(effect_of(p.effect).family == "move" for p in model.parameters)
+    if moves or model.cell.model.approach == BY_ORDER:
+        for text in (order_contradicted(one) for one in (table, test) if one is not None):
+            if text:
+                yield f"{text}; effects of the last move are wrong there"
     hangs = table.force.any() and not table.force[:, :2].any() and (table.force[:, 2] <= 0).all()
-    weighs = model.cell.model.link_gravity or bool(hangs)
-    lies = fallen(model, x) if weighs and model.observe != "distance" else None
-    return () if lies is None else (str(lies),)
-
-
-def _disordered(model: Model, *tables: Measurements | None) -> tuple[str, ...]:
-    by_order = model.cell.model.approach == BY_ORDER
-    if not by_order and not any(effect_of(p.effect).family == "move" for p in model.parameters):
-        return ()
-    found = (order_contradicted(table) for table in tables if table is not None)
-    return tuple(f"{text}; effects of the last move are wrong there" for text in found if text)
+    weighs = (model.cell.model.link_gravity or hangs) and model.observe != "distance"
+    if weighs and (lies := fallen(model, x)) is not None:
+        yield str(lies)
 
 
 def _course(
@@ -618,22 +619,17 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
     limits: dict[int, tuple[float, float]] = {}
     while True:
         limits = hardly_shown(found) | limits  # held ones keep what was found of them
-        held = _held(found, limits) if fitted else {}
+        held, fit = {}, found.solution.fit
+        for c in set(limits) & set(fit.columns.tolist()) if fitted else ():
+            p, (low, high), x = fit.problem.model.parameters[c], limits[c], float(fit.x[c])
+            if p.nominal != 0 and low <= p.nominal <= high:
+                held[c] = p.nominal
+            elif not p.lower <= x <= p.upper and low < p.upper and p.lower < high:
+                held[c] = min(max(x, p.lower), p.upper)
         again = _holding(every, found, held, options) if held else None
         if again is None:
             return replace(found, limits=limits)
         found = again
-
-
-def _held(found: MethodResult, limits: dict[int, tuple[float, float]]) -> dict[int, float]:
-    held, fit = {}, found.solution.fit
-    for c in set(limits) & set(fit.columns.tolist()):
-        p, (low, high), x = found.solution.problem.model.parameters[c], limits[c], float(fit.x[c])
-        if p.nominal != 0 and low <= p.nominal <= high:
-            held[c] = p.nominal
-        elif not p.lower <= x <= p.upper and low < p.upper and p.lower < high:
-            held[c] = min(max(x, p.lower), p.upper)
-    return held
 
 
 def _holding(

@@ -335,20 +335,6 @@ class ActiveConstraint:
     multiplier: float
 
 
-# What physics demands of the parameters of a model.
-
-
-def physical_constraints(model: Model) -> Constraints:
-    """Passivity of the arm: the bounds that effects state.
-
-    A spring cannot give energy away, so a compliance matrix K, θ = K M, has xᵀKx ≥ 0.  No effect
-    has coupling terms: its matrix is diagonal, which is semidefinite exactly where its entries are
-    non-negative, and bounds say that (`ParameterSpec.lower`).
-    """
-    finite = (p for p in model.parameters if np.isfinite([p.lower, p.upper]).any())
-    return Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in finite))
-
-
 # Prior knowledge of parameters: data sheets, an earlier calibration, a sister robot.
 
 
@@ -501,7 +487,12 @@ class Knowledge:
         """
         constraints = self.constraints
         if self.physical:
-            constraints = physical_constraints(model) + constraints
+            # A spring cannot give energy away, so a compliance matrix K, θ = K M, has xᵀKx ≥ 0.  No
+            # effect has coupling terms: its matrix is diagonal, which is semidefinite exactly where
+            # its entries are non-negative, and bounds say that (`ParameterSpec.lower`).
+            finite = (p for p in model.parameters if np.isfinite([p.lower, p.upper]).any())
+            own = tuple(Bounds(p.name, p.lower, p.upper) for p in finite)
+            constraints = Constraints(own) + constraints
         try:
             constraints.resolve(model.names)
             if self.prior is not None:

@@ -277,10 +277,16 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     } if len(P) else {}  # fmt: skip
     # Linearised, with the active constraints kept active: directions of the face are orthonormal by
     # the rows of readings and prior together.
+    # The fit's R factor has prior and equalities as further rows: without them a parameter that no
+    # reading shows would leave it singular.  Equalities weigh as much as a parameter's readings do.
+    reduced, A = found.reduced, found.reduced.system.A
+    rows = np.vstack([reduced.J, A / np.linalg.norm(A * reduced.unit, axis=1)[:, None]])
+    r_factor = RFactor.of(rows, np.append(reduced.t, np.zeros(len(A))))
     crossed = held_out_by_parts(problem, found.fit.x, columns, found.face)
     final = replace(
-        solution, fit=_as_fit(found), reduction=_reduction(solution, found), held=crossed
-    )
+        solution, fit=replace(found.fit, r_factor=r_factor),
+        reduction=_reduction(solution, found), held=crossed,
+    )  # fmt: skip
     doubts = _contradiction(before, found, stated)
     return replace(
         before, method="constrained", solution=final, spread=spread,
@@ -317,17 +323,6 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
         f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "
         "names, units and signs of what is stated, and whether the model lacks an effect.",
     )
-
-
-def _as_fit(found: KnownFit) -> Fit:
-    """As the fit of a method; its R factor has prior and equalities as further rows.
-
-    Without them a parameter that no reading shows would leave it singular; equalities weigh as
-    much as the readings of a parameter do.
-    """
-    reduced, A = found.reduced, found.reduced.system.A
-    rows = np.vstack([reduced.J, A / np.linalg.norm(A * reduced.unit, axis=1)[:, None]])
-    return replace(found.fit, r_factor=RFactor.of(rows, np.append(reduced.t, np.zeros(len(A)))))
 
 
 def _reduction(solution: Solution, found: KnownFit) -> Reduction:

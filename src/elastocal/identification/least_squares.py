@@ -9,7 +9,7 @@ its estimates, under different assumptions on the errors.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -427,11 +427,17 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     size, trace, square = np.zeros((3, p))  # Σ aᵀa, tr Γ and tr Γ²
     for Q, e, cluster in parts:
         n, G = n + len(e), G + len(np.unique(cluster))
-        for rows in _blocks(cluster, p):
+        # Clusters of one size, in blocks of bounded memory.
+        of_one_size = ((own, len(own) * p * max(own.shape[1], p)) for own in same_size(cluster))
+        for rows in (b for own, n in of_one_size for b in np.array_split(own, -(-n // ENTRIES))):
             Qc = Q[rows]
             adjusted, determined = _adjusted(Qc, kind)
             lone += cluster[rows[determined][:1, 0]].tolist()
-            alone |= _depends(Qc[determined], V)
+            # A parameter may depend on a direction that one of the clusters determines alone.
+            values, U = np.linalg.eigh(Qc[determined].transpose(0, 2, 1) @ Qc[determined])
+            share = (V @ U) / np.linalg.norm(V, axis=1)[:, None]
+            in_it = (np.abs(share) > DEPENDS) & (1 - values < ALONE)[:, None, :]
+            alone |= in_it.any(axis=(0, 2))
             scores = (e[rows][:, None, :] @ adjusted)[:, 0]
             meat += scores.T @ scores
             a = adjusted @ V.T
@@ -466,13 +472,6 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
 
 
-def _blocks(cluster: IntArray, columns: int) -> Iterator[IntArray]:
-    """Rows (k, size) of clusters of one size, in blocks of bounded memory."""
-    for rows in same_size(cluster):
-        numbers = len(rows) * columns * max(rows.shape[1], columns)
-        yield from np.array_split(rows, -(-numbers // ENTRIES))
-
-
 def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
     """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.
 
@@ -489,11 +488,3 @@ def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
     power = np.where(single, 1.0, gap) ** (-0.5 if kind[-1] == "2" else -1.0)
     A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
     return (A @ Qc if by_row else Qc @ A), determined
-
-
-def _depends(Qc: Array, V: Array) -> NDArray[np.bool_]:
-    """Which parameters (p,) depend on a direction that one of the clusters determines alone."""
-    values, U = np.linalg.eigh(Qc.transpose(0, 2, 1) @ Qc)
-    share = (V @ U) / np.linalg.norm(V, axis=1)[:, None]
-    in_it = (np.abs(share) > DEPENDS) & (1 - values < ALONE)[:, None, :]
-    return np.asarray(in_it.any(axis=(0, 2)))

@@ -26,7 +26,6 @@ from elastocal.identification.start import (
     LinearFits,
     Registration,
     nominal_problem,
-    register,
 )
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
@@ -126,7 +125,7 @@ def _some(table: Measurements) -> Measurements:
 def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
     problem = nominal_problem(model, _some(table))
-    found = register(problem)
+    found = Registration(problem)
     place = found.places(problem.flange, problem.marker)
     distance = np.linalg.norm(problem.points - place, axis=1)
     return found.error, float(np.percentile(distance, MOST))
@@ -321,7 +320,7 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
 def _placed_by(
     model: Model, table: Measurements, rows: IntArray, shift: IntArray | int
 ) -> Registration:
-    return register(nominal_problem(model, _moved(table, rows, shift)))
+    return Registration(nominal_problem(model, _moved(table, rows, shift)))
 
 
 def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:
@@ -580,7 +579,7 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
     problem, row = nominal_problem(model, table), np.arange(n)
     marker, far = table.marker, np.sqrt(special.chdtri(3, FALSE_ALARM / n))
     for _ in range(PASSES):  # base and markers by the names as they should be
-        found = register(replace(problem, marker=marker))
+        found = Registration(replace(problem, marker=marker))
         each = [found.places(problem.flange, np.full(n, m)) for m in range(len(names))]
         places = np.stack(each, axis=1)
         distance = np.linalg.norm(problem.points[:, None] - places, axis=2)

@@ -81,13 +81,10 @@ def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncer
 
     NaN where the result determined nothing.
     """
-    arm = tool.calibrated
-    left = arm.left or NONE_OPEN
-    known, off = [], []
+    arm, known, off = tool.calibrated, [], []
     for first in range(0, len(q), SENSITIVITIES):
         some = slice(first, first + SENSITIVITIES)
-        A = tool.sensitivity([values[some] for values in rows], q[some])
-        at = _moves(arm, left, A)
+        at = _moves(arm, tool.sensitivity([values[some] for values in rows], q[some]))
         known.append(at[0] @ arm.covariance @ at[0].transpose(0, 2, 1))
         off.append(at[1])
     if not off:
@@ -100,14 +97,14 @@ def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncer
         covariance,
         covariance + move @ move.transpose(0, 2, 1) + arm.lacking**2 / 3 * np.eye(3),
         np.sqrt((move**2).sum(axis=(1, 2))),
-        _blamed(left, (move**2).sum(axis=1).mean(axis=0)),
+        _blamed(arm.left or NONE_OPEN, (move**2).sum(axis=1).mean(axis=0)),
     )
 
 
-def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, Array]:
+def _moves(arm: CalibratedArm, A: Array) -> tuple[Array, Array]:
     """A_K (n, r, K), and O S (n, r, D) of A (n, r, parameters) in m per unit; what vanishes but
     for rounding, as the tool's point moves as the measured ones do, is zero."""
-    index = {name: i for i, name in enumerate(arm.model.names)}
+    index, left = {name: i for i, name in enumerate(arm.model.names)}, arm.left or NONE_OPEN
     known = A[..., [index[name] for name in arm.determined]]
     move = A[..., [index[name] for name in left.names]] * left.typical
     off = move - known @ (left.mixing * left.typical) if left.names else move
@@ -119,7 +116,7 @@ def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, A
 def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]:
     """Mean squares in m² of the position error of readings of B (n·size, parameters): by what the
     estimates leave uncertain, and by typical deviations of parameters left open."""
-    known, off = _moves(arm, arm.left or NONE_OPEN, B.reshape(-1, size, B.shape[1])[:, :3])
+    known, off = _moves(arm, B.reshape(-1, size, B.shape[1])[:, :3])
     own = variance_of(known, arm.covariance)
     return float(own.mean()), float((off**2).sum(axis=(1, 2)).mean())
 
@@ -457,7 +454,7 @@ def predicted_error(
         return None
     if not len(weight):
         return None
-    known, off = _moves(arm, left, B[:, :3])
+    known, off = _moves(arm, B[:, :3])
     root = root_of((arm.covariance + arm.covariance.T) / 2)
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each

@@ -69,9 +69,6 @@ class Scales:
     def sigma(self) -> float:
         return float(np.sqrt(self.variance))
 
-    def without(self, g: int) -> Scales:
-        return replace(self, scale=np.where(np.arange(len(self.scale)) == g, 0.0, self.scale))
-
 
 @dataclass(frozen=True)
 class LinearRows:
@@ -238,12 +235,6 @@ class Functions:
         self.std = np.array([model.parameters[c].typical for c in self.columns], dtype=float)
         self.nominal = model.nominal[self.columns]
 
-    def rows(self, factor: RFactor, x: Array) -> LinearRows:
-        """From the R factor of the free ordinary columns and these at x."""
-        rows, away = factor.augmented.copy(), x[self.columns] - self.nominal
-        rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
-        return LinearRows(RFactor(rows, factor.rows), self.std, self.group)
-
 
 def sized_of(model: Model, free: IntArray) -> IntArray:
     """Those of the parameters `free` that deviate from nominal by a size that is known, to either
@@ -403,7 +394,10 @@ class _Search:
         return JointFit(found, reduction, scales, self._rows(problem, found.x).only(kept))
 
     def _rows(self, problem: Problem, x: Array) -> LinearRows:
-        return self.functions.rows(problem.evaluate(x, problem.free).r_factor, x)
+        f, factor = self.functions, problem.evaluate(x, problem.free).r_factor
+        rows, away = factor.augmented.copy(), x[f.columns] - f.nominal
+        rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
+        return LinearRows(RFactor(rows, factor.rows), f.std, f.group)
 
     def crossed(self, fit: JointFit, scales: Scales) -> tuple[Array, Array]:
         """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
@@ -486,7 +480,8 @@ class _Search:
         for g in np.argsort(scales.gain[: len(self.functions.groups)]):
             if not scales.scale[g] or scales.gain[g] > CERTAIN:
                 continue
-            without = scales.without(g)
+            every = np.arange(len(scales.scale))
+            without = replace(scales, scale=np.where(every == g, 0.0, scales.scale))
             there, shown = self.crossed(fit, without), scales.gain[g] > LEAST_GAIN
             if shown and rms_3d(there[0], size) > rms_3d(cross[0], size):
                 continue

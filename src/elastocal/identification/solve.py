@@ -338,7 +338,7 @@ def settle(
         nominal = problem.residual(problem.x0)
     progress("first fit, tied weakly to the start")
     few = _sampled(problem)
-    found = _tied_from(few, problem.x0, _misfit(few), CHOOSING)
+    found = _tied_from(few, problem.x0, CHOOSING)
     progress("choosing the parameters that the data determine")
     more = np.sqrt(len(problem.observations.value) / len(few.observations.value))
     sigma, kept = residual_sigma(found, 0), None
@@ -442,12 +442,12 @@ def tied_fit(problem: Problem, tolerance: float) -> Fit:
     x = problem.x0
     rough = _sampled(problem)
     if rough is not problem:
-        found = _tied_from(rough, x, _misfit(rough), tolerance)
+        found = _tied_from(rough, x, tolerance)
         try:
-            return _tied_from(problem, found.x, residual_sigma(found, 0), tolerance)
+            return _tied_from(problem, found.x, tolerance, residual_sigma(found, 0))
         except ElastocalError:
             pass  # the sample has led where other readings have no equilibrium
-    return _tied_from(problem, x, _misfit(problem), tolerance)
+    return _tied_from(problem, x, tolerance)
 
 
 def _sampled(problem: Problem) -> Problem:
@@ -458,14 +458,13 @@ def _sampled(problem: Problem) -> Problem:
     return replace(problem, observations=part.observations, weights=part.weights)
 
 
-def _misfit(problem: Problem) -> float:
-    residual = problem.weights.apply(problem.residual(problem.x0))
-    return max(float(np.sqrt(np.mean(residual**2))), 1e-12)
-
-
-def _tied_from(problem: Problem, x: Array, sigma: float, tolerance: float) -> Fit:
-    """Tied fits from x until the noise level `sigma` that scales the ties no longer falls."""
+def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None = None) -> Fit:
+    """Tied fits from x until the noise level `sigma` that scales the ties no longer falls; by
+    default it is at first the whole misfit at the start."""
     free, sizes = problem.free, problem.sizes
+    if sigma is None:
+        misfit = problem.weights.apply(problem.residual(problem.x0))
+        sigma = max(float(np.sqrt(np.mean(misfit**2))), 1e-12)
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
         tie = PriorRows.near(problem.x0[free], width / sigma)

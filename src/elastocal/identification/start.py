@@ -71,22 +71,6 @@ RCOND = 1e-6  # a direction the poses do not show stays at zero instead of runni
 
 
 @dataclass(frozen=True)
-class Registration:
-    """T_tracker_base as rotation (3, 3) and translation (3,), `markers` (M, 3) in the flange
-    frame, and the median distance `error` in m of readings from the nominal arm."""
-
-    rotation: Array
-    translation: Array
-    markers: Array
-    error: float
-
-    def places(self, flange: Array, marker: IntArray) -> Array:
-        """Where flanges (n, 4, 4) have each `marker` (n,)."""
-        body = np.einsum("nij,nj->ni", flange[:, :3, :3], self.markers[marker]) + flange[:, :3, 3]
-        return np.asarray(body @ self.rotation.T + self.translation)
-
-
-@dataclass(frozen=True)
 class RegistrationProblem:
     """Find R_b, t_b, m with p_i = R_b (R_i m_c(i) + t_i) + t_b.
 
@@ -113,35 +97,47 @@ def nominal_problem(model: Model, table: Measurements) -> RegistrationProblem:
     )  # fmt: skip
 
 
-def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
-    """Robust alternating registration from several starts; the best by median distance wins.
+class Registration:
+    """Robust alternating registration from several starts; the best by median distance wins:
+    T_tracker_base as rotation (3, 3) and translation (3,), `markers` (M, 3) in the flange frame,
+    and the median distance `error` in m of readings from the nominal arm.
 
     Starts: the base turned as the linear (non-orthogonal) solution says, as a fit with the
     start markers says, and as the 24 rotations of a cube, so that any attitude is near one.
     """
-    n = len(problem.points)
-    if n > SAMPLE:
-        chosen = np.random.default_rng(seed).choice(n, SAMPLE, replace=False)
-        of_rows = ("flange", "points", "marker")
-        problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
-    starts = problem.base_rotation[None]
-    if problem.free_base:
-        linear = LinearFits(problem.flange[None], problem.points, problem.marker).matrix[0]
-        U, _, Vt = np.linalg.svd(linear.T)
-        body = _body_points(problem, problem.start_markers)
-        starts = np.stack([
-            U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt,
-            _rotation_between(body, problem.points, np.ones(len(body))),
-            *Rotation.create_group("O").as_matrix(),
-        ])  # fmt: skip
-    rough = _descended(problem, starts, np.ones((len(starts), len(problem.points))), ROUGH_SWEEPS)
-    # A few sweeps show which starts lead where; the others need not be gone through to the end.
-    nearest = np.argsort(rough[3], kind="stable")[:FINALISTS]
-    rotation, translation, markers, error, _ = _descended(
-        problem, rough[0][nearest], rough[4][nearest], SWEEPS
-    )
-    best = int(np.argmin(error))
-    return Registration(rotation[best], translation[best], markers[best], float(error[best]))
+
+    def __init__(self, problem: RegistrationProblem, seed: int = 0) -> None:
+        n = len(problem.points)
+        if n > SAMPLE:
+            chosen = np.random.default_rng(seed).choice(n, SAMPLE, replace=False)
+            of_rows = ("flange", "points", "marker")
+            problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
+        starts = problem.base_rotation[None]
+        if problem.free_base:
+            linear = LinearFits(problem.flange[None], problem.points, problem.marker).matrix[0]
+            U, _, Vt = np.linalg.svd(linear.T)
+            body = _body_points(problem, problem.start_markers)
+            starts = np.stack([
+                U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt,
+                _rotation_between(body, problem.points, np.ones(len(body))),
+                *Rotation.create_group("O").as_matrix(),
+            ])  # fmt: skip
+        rough = _descended(
+            problem, starts, np.ones((len(starts), len(problem.points))), ROUGH_SWEEPS
+        )
+        # A few sweeps show which starts lead where; the others need not be gone through to the end.
+        nearest = np.argsort(rough[3], kind="stable")[:FINALISTS]
+        rotation, translation, markers, error, _ = _descended(
+            problem, rough[0][nearest], rough[4][nearest], SWEEPS
+        )
+        best = int(np.argmin(error))
+        self.rotation, self.translation = rotation[best], translation[best]
+        self.markers, self.error = markers[best], float(error[best])
+
+    def places(self, flange: Array, marker: IntArray) -> Array:
+        """Where flanges (n, 4, 4) have each `marker` (n,)."""
+        body = np.einsum("nij,nj->ni", flange[:, :3, :3], self.markers[marker]) + flange[:, :3, 3]
+        return np.asarray(body @ self.rotation.T + self.translation)
 
 
 def _descended(
@@ -254,7 +250,7 @@ def start_values(
         np.eye(3) if nominal.base_rotation is None else nominal.base_rotation,
         np.zeros(3) if nominal.base_position is None else nominal.base_position,
     )  # fmt: skip
-    found = register(problem, seed)
+    found = Registration(problem, seed)
     values = dict(zip(("base.x", "base.y", "base.z"), found.translation, strict=True))
     vector = Rotation.from_matrix(found.rotation).as_rotvec()
     values |= dict(zip(("base.rx", "base.ry", "base.rz"), vector, strict=True))
@@ -409,7 +405,11 @@ def _check_units(model: Model, table: Measurements) -> None:
     if reach < SAME or extent < SAME:
         return
     ratio = extent / reach
-    if _looks_like_radians(model, table, ratio, extent):
+    small = ratio >= 3 and "prismatic" not in model.chain.kinds
+    if small and np.abs(table.q).max() <= SMALL_ANGLE and (
+        # The arm hardly moves, and turned back it moves as measured.
+        1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
+    ):  # fmt: skip
         cause = "the joint angles are probably radians in columns named …_deg: rename to …_rad"
     elif ratio > EXTENT_FACTOR:
         cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
@@ -421,13 +421,6 @@ def _check_units(model: Model, table: Measurements) -> None:
         f"{table.source}: the readings extend over {extent * 1e3:.4g} mm, but the nominal arm's "
         f"flange moves over {reach * 1e3:.4g} mm at these joint values; {cause}"
     )
-
-
-def _looks_like_radians(model: Model, table: Measurements, ratio: float, extent: float) -> bool:
-    """Radians read as degrees: the arm hardly moves, and turned back it moves as measured."""
-    if ratio < 3 or "prismatic" in model.chain.kinds or np.abs(table.q).max() > SMALL_ANGLE:
-        return False
-    return 1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
 
 
 def _reach(model: Model, table: Measurements) -> float:
