@@ -471,10 +471,6 @@ class Beside:
         L = self.sum.L
         return [linalg.solve_triangular(L, t, lower=True, trans="T") for t in self.halves]
 
-    def evidence(self, scales: Array, scalings: Sequence[Array]) -> list[float]:
-        """Of each of the columns over none, times its `scalings` (L, k), at the best of these."""
-        return evidence_of_groups(self.left, scales, scalings)
-
     def evidence_instead(self, gone: slice) -> list[float]:
         """Over none, of what is `gone` beside all others of the sum and of each of the columns."""
         S = np.tril(self.sum.covariance[gone, gone])
@@ -519,7 +515,8 @@ def evidence_beside(
     """Log evidence of each component beside the sum, of a smooth one at its best length; or times
     its `scalings`."""
     scalings = scalings or [c.scalings for c in components]
-    return Beside(found, [c.columns for c in components]).evidence(scales, scalings)
+    left = Beside(found, [c.columns for c in components]).left
+    return evidence_of_groups(left, scales, scalings)
 
 
 def imitators(

@@ -29,6 +29,7 @@ from elastocal.diagnosis.hypotheses import (
     grid_of,
     judged_together,
     moments_between,
+    possible,
     recorded,
 )
 from elastocal.diagnosis.noise_floor import NoisyData
@@ -225,7 +226,10 @@ def diagnosis_data_of(
     are without the hypotheses.
     """
     model, observed, blocks = base.model, base.observed, base.blocks
-    loads = _load_hypotheses(base)
+    # The load's own error, whose load point has a tolerance in any case.
+    acting = model.cell.model.torque != "measured"
+    others = CATALOGUE.keys() - {PayloadError.name}
+    loads = possible(model, observed.table, others)[0] if acting else []
     together = (h for h in judged_together(model, observed.table) if not h.driven)
     asked = list({h.key: h for h in (*loads, *together, *hypotheses)}.values())
     if around is None or x is None:
@@ -291,18 +295,6 @@ def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
     drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])
     loading = found[0].packed(np.where(blocks.member < base.n_measured, blocks.member, -1))
     return drift, loading @ loading.transpose(0, 2, 1)
-
-
-def _load_hypotheses(base: Baseline) -> list[Hypothesis]:
-    """The load's own error, whose load point has a tolerance in any case."""
-    effect, model = CATALOGUE[PayloadError.name], base.model
-    acting = recorded(base.observed.table, "load") and model.cell.model.torque != "measured"
-    if not acting or any(p.effect == effect.name for p in model.parameters):
-        return []
-    return [
-        Hypothesis(effect, w, effect.parameters(w, model.chain, model.cell), ())
-        for w in effect.places(model.chain, model.cell)
-    ]
 
 
 # Dependences without a name: any place moves smoothly with anything that was recorded.

@@ -231,7 +231,7 @@ def discriminations_of(
 ENOUGH = 0.97  # probability of the right answer from which no further pose is asked for
 ROUNDS = 3  # of exchange, at most
 WORTH = 1e-3  # relative fall of the error that an exchange is made for
-RANDOM_DRAWS = 32
+RANDOM_DRAWS = 32  # of as many candidates, whose mean a plan is compared with
 
 
 def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -> list[int]:
@@ -259,13 +259,6 @@ def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
     """Probability that the right one of every set is named after the chosen visits."""
     each = [c.probability(c.squared(c.gram(chosen))) for c in tasks]
     return float(np.prod(each))
-
-
-def expected_of_random(tasks: Sequence[Discrimination], n: int, rng: np.random.Generator) -> float:
-    """The same for as many candidates drawn at random: the mean of RANDOM_DRAWS draws."""
-    N = len(tasks[0].pool)
-    picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
-    return float(np.mean([expected(tasks, pick) for pick in picks]))
 
 
 def _best(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, float]:
@@ -440,15 +433,16 @@ def _chosen(
     if not worthwhile:
         nothing = _nothing(sets, suspects, tuple(notes))
         return replace(nothing, pairs=pairs_of(tasks, chosen), inseparable=groups)
-    rng = np.random.default_rng(seed)
+    rng, n = np.random.default_rng(seed), len(chosen)
+    picks = [rng.choice(len(pool), size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
     return ExtraPlan(
         rivals=_names(sets),
         pairs=pairs_of(tasks, chosen),
         plan=measuring_order(pool, chosen, base.observed.table),
-        n_poses=len(chosen),
+        n_poses=n,
         probability_before=covered * expected(tasks, ()),
         probability_after=covered * after,
-        probability_random=covered * expected_of_random(tasks, len(chosen), rng),
+        probability_random=covered * float(np.mean([expected(tasks, pick) for pick in picks])),
         separable=True,
         inseparable=groups,
         advice=(*recording_advice(sets), *notes),
