@@ -13,7 +13,7 @@ from elastocal.identification.least_squares import TOLERANCE
 from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import stated_by_observation, weights_for
-from elastocal.measurements import Measurements, load_states, numbered, visits
+from elastocal.measurements import Measurements, load_states, numbered, ranked, visits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
@@ -245,15 +245,11 @@ def _first_of_each(table: Measurements) -> NDArray[np.bool_]:
     """Rows that are among the first of their configuration, load and marker, as many of each as
     leave MOST_IN_ONE in the configuration."""
     kind = numbered(table.configuration, load_states(table.force), table.marker)
-    count = np.bincount(kind)
-    order = np.argsort(kind, kind="stable")
+    order, at = np.argsort(kind, kind="stable"), ranked(table.configuration)
     rank = np.empty(len(table), dtype=np.int64)
-    rank[order] = np.arange(len(table)) - np.repeat(np.cumsum(count) - count, count)
-    _, at = np.unique(table.configuration, return_inverse=True)
-    at = at.ravel()
-    n_kinds = np.bincount(at[order[np.cumsum(count) - count]])
-    allowed = np.maximum(MOST_IN_ONE // n_kinds, 1)
-    return np.asarray(rank < allowed[at])
+    rank[order] = np.arange(len(table)) - np.searchsorted(kind[order], kind[order])
+    n_kinds = np.bincount(at[np.unique(kind, return_index=True)[1]])
+    return np.asarray(rank < np.maximum(MOST_IN_ONE // n_kinds, 1)[at])
 
 
 # Models that are derived from another one, kept for as long as that one is.

@@ -239,12 +239,12 @@ def _compared(
         arm_with(arm, [n for n, needs in unstated_needs(arm, conditions).items() if not needs])
         for arm in (old, new)
     )
-    own = _own(before.model)
-    determined = [[n for n in arm.determined if n in own] for arm in (old, new)]
+    # The parameters of the arm itself; base and markers are set up anew in each campaign.
+    own = {p.name for p in before.model.parameters if not CATALOGUE[p.effect].registered}
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
-    names, z, V, first_order = _difference(old, new, before, after, determined, table)
+    names, z, V, first_order = _difference(old, new, before, after, own, table)
     if not names:
         raise InsufficientDataError(
             f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
@@ -274,11 +274,6 @@ def _compared(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
         forces, whose, first_order,
     )  # fmt: skip
-
-
-def _own(model: Model) -> set[str]:
-    """Parameters of the arm itself; base and markers are set up anew in each campaign."""
-    return {p.name for p in model.parameters if not CATALOGUE[p.effect].registered}
 
 
 def _tool_model(model: Model) -> Model:
@@ -314,12 +309,11 @@ def _difference(
     new: CalibratedArm,
     before: Valued,
     after: Valued,
-    determined: list[list[str]],
+    own: set[str],
     table: Measurements,
 ) -> tuple[list[str], Array, Array, bool]:
     """Names, z (p,), Cov z (p, p), and whether z was told to first order."""
-    first, second = determined
-    own = _own(before.model)
+    first, second = ([n for n in arm.determined if n in own] for arm in (old, new))
     a, b = before.values, after.values
     held = [n for n in own if n not in first and n not in second]
     if set(first) == set(second) and all(np.isclose(a[n], b[n], rtol=1e-9) for n in held):

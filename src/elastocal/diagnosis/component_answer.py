@@ -18,6 +18,7 @@ from elastocal.diagnosis.component_search import exchanged, imitators, size_of_f
 from elastocal.diagnosis.components import (
     Component,
     FittedSum,
+    Pool,
     presence_cost,
     side_by_side,
 )
@@ -35,8 +36,8 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.effect_search import spans_of
 from elastocal.diagnosis.hypotheses import corrects
-from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.stated_floor import (
     NEW_POSES,
@@ -556,7 +557,7 @@ class SumAnswer:
     @cached_property
     def _present(self) -> Array:
         """Probability (K,) that there is anything at a component's place."""
-        return np.asarray(expit(self.found.earned - self.found.costs))
+        return np.asarray(expit(self.found.earned - Pool(self.found.components).costs))
 
     def _probability(self, k: int) -> float:
         there = float(self._present[k])

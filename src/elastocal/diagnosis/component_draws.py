@@ -31,8 +31,8 @@ from elastocal.diagnosis.components import (
     Pool,
     presence_cost,
 )
+from elastocal.diagnosis.effect_search import spans_of
 from elastocal.diagnosis.evidence import at_scales
-from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import Weighted
 from elastocal.engine.mixed import beside
 from elastocal.units import Array

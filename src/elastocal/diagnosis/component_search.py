@@ -33,7 +33,14 @@ from elastocal.diagnosis.components import (
     presence_cost,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import about
+from elastocal.diagnosis.effect_search import (
+    Item,
+    ModelSet,
+    about,
+    extended,
+    settings_of,
+    spans_of,
+)
 from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together, possible
 from elastocal.diagnosis.lines import (
@@ -44,13 +51,6 @@ from elastocal.diagnosis.lines import (
     ripples,
     sharpened,
     with_scatter,
-)
-from elastocal.diagnosis.model_set import (
-    Item,
-    ModelSet,
-    extended,
-    settings_of,
-    spans_of,
 )
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,

@@ -21,15 +21,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import special
 
+from elastocal.diagnosis.effect_search import spans_of, within_bounds
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import spans_of, within_bounds
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
@@ -38,7 +38,6 @@ from elastocal.diagnosis.noise_floor import (
     fit_noise,
     log_prior,
     posterior,
-    precision_of,
 )
 from elastocal.engine.mixed import Products, Standardised, climb
 from elastocal.model.effects.base import Effect
@@ -162,7 +161,9 @@ class Pool:
         self.sought = np.array([c.sought for c in components])
         self.precision = np.zeros((len(components), len(components)))
         for own in self.kinds:
-            self.precision[np.ix_(own, own)] = precision_of(len(own), ALONE, COMMON)
+            self.precision[np.ix_(own, own)] = np.linalg.inv(
+                ALONE**2 * np.eye(len(own)) + COMMON**2
+            )
 
     @property
     def cost(self) -> float:
@@ -249,6 +250,7 @@ class SumOfComponents:
     components: tuple[Component, ...]
     noise: NoiseValues
     weighted: Weighted
+    _known: dict[int, Across] = field(init=False, default_factory=dict, repr=False)
 
     @property
     def products(self) -> Products:
@@ -301,10 +303,6 @@ class SumOfComponents:
         """V⁻¹ (C, m, m)."""
         root = self.weighted.root
         return root.transpose(0, 2, 1) @ root
-
-    @cached_property
-    def _known(self) -> dict[int, Across]:
-        return {}
 
     def across(self, columns: Sequence[Array]) -> list[Across]:
         """Of each of these columns beside the data's own and the components'; kept, since a search
@@ -450,7 +448,7 @@ def _rows(columns: Array) -> Array:
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
 
-    `earned` (K,) nats of each, `costs` (K,) what it has to earn, the others there; `sums` are those
+    `earned` (K,) nats of each; `sums` are those
     over the rows of the data, which are without their columns, `variances` (Σ k,) their
     coefficients' prior.  `complete` are the components whose kinds have been tried at all their
     places beside it.
@@ -479,10 +477,6 @@ class FittedSum:
             _compressed(plain.masked(c.columns), priors[span], root, HARDLY)
             for c, span in zip(self.components, self.spans, strict=True)
         )
-
-    @property
-    def costs(self) -> Array:
-        return Pool(self.components).costs
 
     @property
     def spans(self) -> tuple[slice, ...]:

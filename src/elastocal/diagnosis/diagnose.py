@@ -26,7 +26,12 @@ from elastocal.diagnosis.diagnosis import (
     StructureTest,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
-from elastocal.diagnosis.effect_search import MANY, ForwardSelection, SelectedEffects
+from elastocal.diagnosis.effect_search import (
+    MANY,
+    ForwardSelection,
+    SelectedEffects,
+    with_likelier_backlash_model,
+)
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import (
     BY_LAST_MOVE,
@@ -37,7 +42,6 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     with_recorded_drivers,
 )
-from elastocal.diagnosis.model_set import with_likelier_backlash_model
 from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.reading_faults import screen_outliers
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, first_steps, noise_floor

@@ -170,9 +170,9 @@ def log_prior_of(stated: bool, joints: int) -> LogPrior:
     The joints' own have a common mean that is itself uncertain.
     """
     own = (
-        precision_of(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
-        precision_of(joints, SHARED_SPREAD, 0.0),
-        precision_of(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
+        _precision(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
+        _precision(joints, SHARED_SPREAD, 0.0),
+        _precision(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
     )
     back = np.linalg.inv(doubled(joints))
     return LogPrior(NoiseValues.usual(joints).logs(), back.T @ linalg.block_diag(*own) @ back)
@@ -190,7 +190,7 @@ def log_prior(stated: bool, noise: NoiseValues) -> float:
     return log_prior_of(stated, len(noise.joint)).penalty(noise.logs())[0]
 
 
-def precision_of(n: int, apart: float, common: float) -> Array:
+def _precision(n: int, apart: float, common: float) -> Array:
     """Inverse of apart² 1 + common² (n, n)."""
     share = common**2 / (apart**2 + n * common**2)
     return np.asarray((np.eye(n) - share) / apart**2)
@@ -211,7 +211,7 @@ class Projection:
     """The data under one noise: V⁻¹ (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
 
     P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
-    likelihood ℓ.
+    likelihood ℓ; `beta_deviation` L⁻¹ (p, p), so that the posterior covariance of β is L⁻ᵀL⁻¹.
     """
 
     inverse: Array
@@ -219,7 +219,7 @@ class Projection:
     u: Array
     beta: Array
     marginal: float
-    factor: Array
+    beta_deviation: Array
 
     @cached_property
     def P(self) -> Array:
@@ -235,11 +235,6 @@ class Projection:
         """
         e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
         return np.asarray(e[..., 0])
-
-    @cached_property
-    def beta_deviation(self) -> Array:
-        """L⁻¹ (p, p): the posterior covariance of β is L⁻ᵀL⁻¹."""
-        return linalg.solve_triangular(self.factor, np.eye(len(self.factor)), lower=True)
 
 
 def _power(blocks: Array, exponent: float) -> Array:
@@ -294,7 +289,7 @@ class Weighted:
         # What does not count has a unit variance of its own.
         diagonal = np.einsum("cii->ci", inverse)
         diagonal[diagonal == 0] = 1.0
-        return Projection(inverse, H, u, at.root * at.b, marginal, at.L / at.root[:, None])
+        return Projection(inverse, H, u, at.root * at.b, marginal, scaled)
 
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:

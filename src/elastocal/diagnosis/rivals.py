@@ -19,9 +19,7 @@ from elastocal.diagnosis.diagnosis_data import (
     diagnosis_data_of,
     generic_blocks,
 )
-from elastocal.diagnosis.evidence import Grams, evidence_of
-from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
-from elastocal.diagnosis.model_set import (
+from elastocal.diagnosis.effect_search import (
     PLAUSIBLE,
     Item,
     distances,
@@ -30,6 +28,8 @@ from elastocal.diagnosis.model_set import (
     spans_of,
     with_items,
 )
+from elastocal.diagnosis.evidence import Grams, evidence_of
+from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.errors import InputError, require

@@ -11,7 +11,6 @@ from scipy import sparse, special
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.diagnosis import (
     FaultyReading,
     Interval,
@@ -21,8 +20,6 @@ from elastocal.diagnosis.diagnosis import (
     StructureTest,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import ModelSet
 from elastocal.diagnosis.noise_floor import (
     JOINT_SPREAD,
     REPEATABILITY,
@@ -340,8 +337,6 @@ def supported_floor(
 
 # Errors on configurations, or blocks of time, left out of the fit, in closed form.
 
-TENTHS = 10  # blocks of time that are left out in turn
-
 
 def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
     """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
@@ -369,14 +364,6 @@ def each_left_out(P: Array, u: Array) -> Array:
     return np.asarray(np.linalg.solve(P, u[..., None])[..., 0])
 
 
-def blocks_of_time(blocks: Blocks, time: Array) -> IntArray:
-    """Which tenth of the campaign (C,) each configuration was first measured in; `time` (N,)."""
-    padded = np.append(time, np.inf)
-    first = padded[blocks.member].min(axis=1)
-    order = np.argsort(np.argsort(first, kind="stable"), kind="stable")
-    return np.asarray(order * TENTHS // len(first))
-
-
 def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
     """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
 
@@ -387,14 +374,6 @@ def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
     used = ~data.left_out.reshape(C, M, size)[:, :, 0]
     part = packed.reshape(C, M, size)[:, :, : min(size, 3)]
     return ((part**2).sum(axis=2) * used).sum(axis=1), used.sum(axis=1)
-
-
-def left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | None:
-    time, cell = dataset.table.time, dataset.base.model.cell
-    known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
-    if time is None or not any("time" in what.effect.needed(cell) for what in known):
-        return None
-    return blocks_of_time(dataset.blocks, time[dataset.lead])
 
 
 def left_out_square(data: NoisyData, noise: NoiseValues, together: IntArray | None = None) -> float:

@@ -25,10 +25,16 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import LARGEST_SET, SelectedEffects
+from elastocal.diagnosis.effect_search import (
+    LARGEST_SET,
+    Item,
+    SelectedEffects,
+    distances,
+    fit_extended,
+    settings_of,
+)
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, distances, fit_extended, settings_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.stated_floor import each_left_out, with_intervals
 from elastocal.identification.noise_summary import BEYOND, single_readings
