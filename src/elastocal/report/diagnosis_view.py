@@ -21,6 +21,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.measurements import by_rows
 from elastocal.report import blocks as say
+from elastocal.report.figures import Residuals, effects_over_joints, unknown_curves, waterfall
 from elastocal.text import printable, some
 
 MOST_CANDIDATES = 8
@@ -61,9 +62,9 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     lines += [("Not separable", say.capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
     yield say.Lines([*lines, *((say.WARNING, say.capital(printable(text))) for text in d.warnings)])
-    yield say.Fold("", lambda: _figures(d, "budget"), figures=("budget", "curves"))
+    yield say.Fold("", lambda: _figures(d), figures=("budget", "curves"))
     shapes = "" if len(d.effects) <= FEW else "Found effects over the joints they act at"
-    yield say.Fold(shapes, lambda: _figures(d, "effects"), figures=("effects",))
+    yield say.Fold(shapes, lambda: effects_over_joints(d), figures=("effects",))
     yield cause_table(d)
     yield added_parameter_table(d)
     yield say.Fold("Place by place", lambda: [place_table(d)], printed=True)
@@ -87,12 +88,7 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
 
 
-def _figures(d: Diagnosis, which: str) -> Iterator[say.Figure]:
-    from elastocal.report.figures import effects_over_joints, unknown_curves, waterfall
-
-    if which == "effects":
-        yield from effects_over_joints(d)
-        return
+def _figures(d: Diagnosis) -> Iterator[say.Figure]:
     if d.budget:
         yield waterfall("budget", *_budget(d))
     if d.curves:
@@ -101,7 +97,6 @@ def _figures(d: Diagnosis, which: str) -> Iterator[say.Figure]:
 
 def _residuals(d: Diagnosis) -> Iterator[say.Block]:
     from elastocal.report.arm_view import residual_arm
-    from elastocal.report.figures import Residuals
 
     base = d.calibrated
     assert base is not None

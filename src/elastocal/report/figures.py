@@ -19,11 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import ElastocalError
 from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import groupings
-from elastocal.identification.result import Calibration
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
@@ -37,6 +35,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
     from matplotlib.figure import SubFigure
 
+    from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
 
 # The colours of a figure by itself; a page has its style sheet's in their place, for light and

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -37,12 +36,10 @@ from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import judgement_view as words
+from elastocal.report.figures import Residuals, uncertainty_map, waterfall
 from elastocal.report.judgement_view import judgement, warnings_beside
 from elastocal.text import listed, printable, some
 from elastocal.units import Array
-
-if TYPE_CHECKING:
-    from elastocal.report.figures import Residuals
 
 Truth = dict[str, float]
 Published = Mapping[str, tuple[float, float]]
@@ -147,8 +144,6 @@ def _key(result: Calibration, budget: ErrorBudget | None) -> say.KeyFigures:
 
 
 def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
-    from elastocal.report.figures import uncertainty_map, waterfall
-
     if budget is not None:
         yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
@@ -156,8 +151,6 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
 
 
 def _residuals(result: Calibration) -> Residuals:
-    from elastocal.report.figures import Residuals
-
     return Residuals(result.model, result.observations, result.residual)
 
 

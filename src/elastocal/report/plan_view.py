@@ -13,6 +13,7 @@ from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name
 from elastocal.report import blocks as say
+from elastocal.report.figures import NO_ENDS, plan_curve, rows_of_dots
 from elastocal.text import listed, printable, some
 
 if TYPE_CHECKING:
@@ -20,12 +21,6 @@ if TYPE_CHECKING:
 
 
 def plan_blocks(plan: Plan) -> Iterator[say.Block]:
-    def curve() -> Iterator[say.Block]:
-        from elastocal.report.figures import plan_curve
-
-        yield curve_table(plan)
-        yield plan_curve(plan)
-
     def arm() -> Iterator[say.Block]:
         from elastocal.report.arm_view import plan_arm
 
@@ -47,7 +42,8 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     yield say.Fold("Why each pose", lambda: [reasons], printed=True)
     yield say.Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
     if plan.curve:
-        yield say.Fold("Number of poses", curve, printed=True, figures=("curve",))
+        both: list[say.Block] = [curve_table(plan), plan_curve(plan)]
+        yield say.Fold("Number of poses", lambda: both, printed=True, figures=("curve",))
     if plan.timed:
         table = timed_table(plan)
         yield say.Fold(table.title, lambda: [table], printed=True)
@@ -75,8 +71,6 @@ def _key(plan: Plan) -> say.KeyFigures:
 
 
 def _gain(found: NextPoses) -> say.Figure:
-    from elastocal.report.figures import NO_ENDS, rows_of_dots
-
     g = found.gain
     names = ("measured so far", "with this batch")
     rows = [

@@ -19,6 +19,7 @@ from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.report import blocks as say
+from elastocal.report.figures import NO_ENDS, rows_of_dots
 from elastocal.report.identification_view import (
     at_new_poses,
     before_and_after,
@@ -128,8 +129,6 @@ def _change_table(c: Comparison) -> say.ShownTable:
 
 
 def _moves(c: Comparison) -> say.Figure:
-    from elastocal.report.figures import NO_ENDS, rows_of_dots
-
     most = sorted(c.changes, key=lambda change: -change.moves)[:MOST_DRAWN]
     rows = [(one.name, one.moves * 1e6, NO_ENDS, say.length(one.moves)) for one in most]
     noise = ("all by noise alone", 1e6 * float(np.sqrt(np.mean(c.chance**2))))
@@ -143,7 +142,6 @@ def _moves(c: Comparison) -> say.Figure:
 
 def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     from elastocal.compensation.compensate import summary
-    from elastocal.report.figures import NO_ENDS, rows_of_dots
 
     table, kinds = c.targets.table, c.chain.kinds
     names = [table.configuration_labels[k] for k in table.configuration]
@@ -221,8 +219,6 @@ def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
 
 
 def readings_blocks(table: Measurements) -> Iterator[say.Block]:
-    from elastocal.report.figures import rows_of_dots
-
     rows = [
         (printable(name), str(len(np.unique(values.astype(str)))), "", "")
         if values.dtype == object
