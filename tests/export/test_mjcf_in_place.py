@@ -42,7 +42,7 @@ def test_both_files_loaded_in_mujoco_differ_by_the_calibration(robot, tmp_path):
     data.qpos[[model.jnt_qposadr[j] for j in arm.joints]] = q[0]
     mujoco.mj_kinematics(model, data)
     T = np.eye(4) if arm.base == "world" else arm.tree.placed(arm.base)
-    end = data.site(flange) if arm.flange_is_site else data.body(flange)
+    end = data.site(flange) if flange in arm.tree.frames else data.body(flange)
     wanted = (T @ nominal_flanges(expected, q[:1])[0])[:3, 3]
     assert np.linalg.norm(end.xpos - wanted) < MICROMETRE
     before = (T @ nominal_flanges(calibrated.model.chain, q[:1])[0])[:3, 3]

@@ -456,7 +456,7 @@ class _MjcfText(XmlFile):
         body, told, T = arm.flange_body, [], np.eye(4)
         sites = {tag.get("name"): tag for tag in self.bodies[body].all("site")}
         extra: dict[str, Array] = {}
-        if arm.flange_is_site:
+        if arm.flange in arm.tree.frames:  # a site
             T = arm.flange_in_body @ error
             if not nothing(error):
                 if arm.flange not in sites:

@@ -257,7 +257,16 @@ def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
         codes = np.array([known.get(marker, 0) for marker in table.marker_names])
         return np.eye(len(known))[codes[table.marker]]
     if name.startswith("level:"):
-        return _levels(arm, table, name.removeprefix("level:"))
+        joint = name.removeprefix("level:")
+        levels, q = arm.cell.model.compliance_levels[joint], table.q[:, joint_index(joint)]
+        distance = np.abs(q[:, None] - np.array(levels))
+        for i in np.flatnonzero(distance.min(axis=1) > LEVEL_TOLERANCE)[:1]:
+            raise InputError(
+                f"{table.source}, line {table.row[i]}: {joint} stands at "
+                f"{np.degrees(q[i]):.3f}°, which is none of its levels in "
+                "[model.compliance_levels]; add the level or drop the row"
+            )
+        return np.eye(len(levels))[distance.argmin(axis=1)]
     if name == "unmoved":
         known_moves = np.ones_like(table.q) if table.direction is None else table.direction
         return (known_moves == 0).astype(np.float64)
@@ -271,22 +280,6 @@ def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
             f"{table.source}: the model needs the column {COLUMNS[name]}, which the table lacks"
         )
     return value[:, None] if value.ndim == 1 else value
-
-
-def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
-    levels = np.array(arm.cell.model.compliance_levels[joint])
-    q = table.q[:, joint_index(joint)]
-    distance = np.abs(q[:, None] - levels[None, :])
-    nearest = distance.argmin(axis=1)
-    off = distance.min(axis=1) > LEVEL_TOLERANCE
-    if off.any():
-        i = int(np.flatnonzero(off)[0])
-        raise InputError(
-            f"{table.source}, line {table.row[i]}: {joint} stands at {np.degrees(q[i]):.3f}°, "
-            "which is none of its levels in [model.compliance_levels]; add the level or drop the "
-            "row"
-        )
-    return np.eye(len(levels))[nearest]
 
 
 def _as_force(load: ArrayLike) -> Array:

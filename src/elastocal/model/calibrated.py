@@ -277,7 +277,19 @@ def read_calibrated(
         <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
     """
     cell = cell_of(cell_path, plugins or None)
-    raw, stated = _read_result(Path(result_path))
+    remedy = "give the file that identify wrote"
+    result = read_json(result_path, "result of identify", MOST_BYTES, remedy)
+    schema = result.get("schema") if isinstance(result, dict) else None
+    told = f"{result_path}: schema is {quoted(schema)}, and {SCHEMA!r} is needed; {remedy}"
+    require(schema == SCHEMA, told)
+    try:
+        stated = checked(_Result, result, result_path)
+    except InputError as error:
+        raise InputError(f"{error}; {ANEW}") from None
+    given = [entry.name for entry in stated.parameters]
+    for name in given:
+        told = f"{result_path}: parameter '{name}' is listed twice; {ANEW}"
+        require(given.count(name) == 1, told)
     held = {entry.name: entry.held for entry in stated.parameters}
     # A cell that lists no markers took them from the table; their names stand in the parameters.
     places = (name.rpartition(".")[0] for name in held)
@@ -291,7 +303,7 @@ def read_calibrated(
         f"{result_path}: covariance of {stated.covariance.size} numbers for {n} names in "
         f"covariance_of; {ANEW}",
     )
-    entries, visits = {entry["name"]: entry for entry in raw}, stated.measured_visits
+    entries, visits = {e["name"]: e for e in result["parameters"]}, stated.measured_visits
     shape = None if visits is None else (len(visits.force), model.chain.n_joints)
     return CalibratedArm(
         model,
@@ -344,23 +356,6 @@ def nominal_flange_rows(chain: Chain) -> list[list[float]]:
     """
     (T,) = rigid.nominal_flanges(chain, np.full((1, chain.n_joints), 0.5))
     return [[round(float(v), 9) + 0.0 for v in row] for row in T[:3]]
-
-
-def _read_result(path: Path) -> tuple[list[dict[str, Any]], _Result]:
-    remedy = "give the file that identify wrote"
-    result = read_json(path, "result of identify", MOST_BYTES, remedy)
-    found = result.get("schema") if isinstance(result, dict) else None
-    require(
-        found == SCHEMA, f"{path}: schema is {quoted(found)}, and {SCHEMA!r} is needed; {remedy}"
-    )
-    try:
-        stated = checked(_Result, result, path)
-    except InputError as error:
-        raise InputError(f"{error}; {ANEW}") from None
-    names = [entry.name for entry in stated.parameters]
-    for name in names:
-        require(names.count(name) == 1, f"{path}: parameter '{name}' is listed twice; {ANEW}")
-    return result["parameters"], stated
 
 
 def _left_open(

@@ -136,7 +136,25 @@ TILT = math.radians(0.75), math.radians(2 * math.pi + 0.01)
 def plausible(chain: Chain, source: object) -> Chain:
     """The chain of the file `source`, with limits that stand for none taken out and notes of what
     is doubtful."""
-    _check_lengths(chain, source)
+    places = [*(f"joint {i}" for i in range(1, chain.n_joints + 1)), "the flange"]
+    ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
+    for place, T in zip(places, ends, strict=True):
+        length = float(np.linalg.norm(T[:3, 3]))
+        require(
+            length <= MAX_LENGTH,
+            f"{source}: {length:g} m before {place} is too long for a link; correct it",
+        )
+    whole = extent(chain)
+    require(
+        whole <= MAX_LENGTH,
+        f"{source}: the links are {whole:g} m long together, which no arm is; if its lengths are "
+        "millimetres, state them in m (DH table: d_mm, a_mm)",
+    )
+    require(
+        whole >= MIN_LENGTH,
+        f"{source}: the links are {whole * 1e3:.3g} mm long together, which no arm is; if its "
+        "lengths are metres, state them so (DH table: d_m, a_m)",
+    )
     for i, body in enumerate(chain.masses, start=1):
         for found, most, told in (
             (body.mass, MAX_MASS, "kg is too heavy"),
@@ -199,28 +217,6 @@ def near_the_arm(chain: Chain) -> Chain:
     flange = chain.flange_placement.copy()
     flange[:3, 3] -= slid
     return replace(chain, joints=tuple(joints), flange_placement=flange, masses=tuple(masses))
-
-
-def _check_lengths(chain: Chain, source: object) -> None:
-    places = [*(f"joint {i}" for i in range(1, chain.n_joints + 1)), "the flange"]
-    ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
-    for place, T in zip(places, ends, strict=True):
-        length = float(np.linalg.norm(T[:3, 3]))
-        require(
-            length <= MAX_LENGTH,
-            f"{source}: {length:g} m before {place} is too long for a link; correct it",
-        )
-    whole = extent(chain)
-    require(
-        whole <= MAX_LENGTH,
-        f"{source}: the links are {whole:g} m long together, which no arm is; if its lengths are "
-        "millimetres, state them in m (DH table: d_mm, a_mm)",
-    )
-    require(
-        whole >= MIN_LENGTH,
-        f"{source}: the links are {whole * 1e3:.3g} mm long together, which no arm is; if its "
-        "lengths are metres, state them so (DH table: d_m, a_m)",
-    )
 
 
 def _limited(joint: Joint, where: str) -> Joint:

@@ -119,10 +119,6 @@ class MjcfArm:
         return self.bodies.index(self.tree.link_of(self.flange)[0])
 
     @property
-    def flange_is_site(self) -> bool:
-        return self.flange in self.tree.frames
-
-    @property
     def flange_in_body(self) -> Array:
         """T_body_flange (4, 4)."""
         return self.tree.link_of(self.flange)[1]
