@@ -35,7 +35,7 @@ from elastocal.model.effects.base import Format
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry, link_ends
+from elastocal.model.effects.placements import LinkGeometry
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
@@ -223,7 +223,7 @@ class ExportNumbers:
 
     def error(self, i: int) -> Array:
         """E (4, 4) of link i (0-based): calibrated = nominal distal frame · E."""
-        nominal = link_ends(self.chain)[i]
+        nominal = self.chain.link_ends[i]
         if np.array_equal(nominal, self.links[i]):
             return np.eye(4)
         return np.asarray(np.linalg.solve(nominal, self.links[i]))

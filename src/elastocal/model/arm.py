@@ -141,8 +141,7 @@ class Arm:
         self.inputs: dict[str, ca.SX] = {}
         self.q_commanded = self.input("q", n)
         self.q = [self.q_commanded[i] for i in range(n)]
-        distal = [joint.placement for joint in chain.joints[1:]] + [chain.flange_placement]
-        self.links = [rigid.constant(T) for T in distal]
+        self.links = [rigid.constant(T) for T in chain.link_ends]
         nominal = cell.model.nominal
         self.T_tracker_base = rigid.transform(
             None if nominal.base_rotation is None else rigid.constant(nominal.base_rotation),

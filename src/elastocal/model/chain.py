@@ -69,6 +69,12 @@ class Chain:
         return len(self.joints)
 
     @property
+    def link_ends(self) -> list[Array]:
+        """Per link the placement (4, 4) of its distal frame in its joint's frame at zero motion:
+        the next joint's, the flange's for the last link."""
+        return [*(joint.placement for joint in self.joints[1:]), self.flange_placement]
+
+    @property
     def kinds(self) -> tuple[JointKind, ...]:
         return tuple(joint.kind for joint in self.joints)
 
@@ -190,8 +196,7 @@ def jaw_told(chain: Chain, moved: str = "") -> list[str]:
 
 def extent(chain: Chain) -> float:
     """Length in m from joint to joint and on to the flange."""
-    ends = [*(joint.placement for joint in chain.joints[1:]), chain.flange_placement]
-    return float(sum(np.linalg.norm(T[:3, 3]) for T in ends))
+    return float(sum(np.linalg.norm(T[:3, 3]) for T in chain.link_ends))
 
 
 def near_the_arm(chain: Chain) -> Chain:

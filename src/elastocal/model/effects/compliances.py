@@ -12,7 +12,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
-from elastocal.model.chain import Chain
+from elastocal.model.chain import Chain, extent
 from elastocal.model.effects.base import (
     STIFFNESS,
     DrivenEffect,
@@ -26,7 +26,7 @@ from elastocal.model.effects.base import (
     turning_joints,
 )
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.effects.placements import SHORTEST, link_ends, transverse_axes
+from elastocal.model.effects.placements import SHORTEST, transverse_axes
 from elastocal.units import Array
 
 
@@ -125,7 +125,7 @@ def weight_torque(chain: Chain, i: int) -> float:
     masses are unknown.
     """
     axis = chain.joints[i].axis
-    ends = [T[:3, 3] for T in link_ends(chain)]
+    ends = [T[:3, 3] for T in chain.link_ends]
     moment, reach = 0.0, 0.0
     for j, body in enumerate(chain.masses[i:], start=i):
         # Only the joint's own link keeps its direction to the axis in every pose.
@@ -158,7 +158,7 @@ USUAL_MASS, OF_ANY_ARM = 30.0, 10.0
 def usual_over_stated_mass(chain: Chain) -> float:
     """What the masses are to be multiplied by; 1 where an arm of this length may have them."""
     mass = sum(body.mass for body in chain.masses)
-    usual = USUAL_MASS * float(sum(np.linalg.norm(T[:3, 3]) for T in link_ends(chain))) ** 3
+    usual = USUAL_MASS * extent(chain) ** 3
     alike = usual <= OF_ANY_ARM * mass and mass <= OF_ANY_ARM * usual
     return 1.0 if alike or mass == 0 else usual / mass
 
@@ -262,7 +262,7 @@ class LinkBending(TiltingEffect):
     def axes(self, place: str, chain: Chain) -> dict[str, Array]:
         """In the frame at the distal end; torsion about the line there from the joint's frame, or
         about the joint's axis where the link has no length."""
-        T = link_ends(chain)[index(place)]
+        T = chain.link_ends[index(place)]
         length = np.linalg.norm(T[:3, 3])
         along = T[:3, 3] / length if length > SHORTEST else chain.joints[index(place)].axis
         along = T[:3, :3].T @ along
@@ -355,7 +355,7 @@ class TorqueTilt(TorqueDriven):
         """Turns about the axes across revolute joints, in the frame at the link's distal end."""
         found: dict[str, tuple[int, Array]] = {}
         i = index(place)
-        ends = {"own": (i, link_ends(chain)[i][:3, :3].T), "next": (i + 1, np.eye(3))}
+        ends = {"own": (i, chain.link_ends[i][:3, :3].T), "next": (i + 1, np.eye(3))}
         for end, (joint, R) in ends.items():
             if joint < chain.n_joints and chain.kinds[joint] == "revolute":
                 for key, axis in zip("xy", transverse_axes(chain.joints[joint].axis), strict=True):

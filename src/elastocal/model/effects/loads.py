@@ -27,7 +27,7 @@ from elastocal.model.effects.base import (
     joints,
     links,
 )
-from elastocal.model.effects.placements import SHORTEST, link_ends, transverse_axes
+from elastocal.model.effects.placements import SHORTEST, transverse_axes
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
 
@@ -234,7 +234,7 @@ class GravityCompensator(Effect):
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         if cell.model.nominal.gravity_compensator is not None:
             return ()
-        length = float(np.linalg.norm(link_ends(chain)[index(place)][:3, 3]))
+        length = float(np.linalg.norm(chain.link_ends[index(place)][:3, 3]))
         a = ANCHOR_SHARE * length if length > SHORTEST else ANCHOR_DEFAULT
         shapes = [NO_LENGTH]
         for share in ARMS:
@@ -382,7 +382,7 @@ HOUSING = 0.1  # m, that even the last link stands out
 def extents(chain: Chain) -> tuple[list[Array], Array]:
     """The way (3,) in m from each joint to its link's end, and the stretched length (joints,) of
     what follows there, a housing at least."""
-    ends = [T[:3, 3] for T in link_ends(chain)]
+    ends = [T[:3, 3] for T in chain.link_ends]
     lengths = np.array([np.linalg.norm(end) for end in ends])
     return ends, np.cumsum(lengths[::-1])[::-1] - lengths + HOUSING
 

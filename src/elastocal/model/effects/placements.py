@@ -71,14 +71,6 @@ class BaseFrame(Effect):
 SHORTEST = 1e-6  # m; a shorter link has neither a length to grow nor a direction of its own
 
 
-def link_ends(chain: Chain) -> list[Array]:
-    """Per link the placement (4, 4) of its distal frame in its joint's frame at zero motion.
-
-    The distal frame is the next joint's, the flange's for the last link.
-    """
-    return [joint.placement for joint in chain.joints[1:]] + [chain.flange_placement]
-
-
 def transverse_axes(axis: Array) -> tuple[Array, Array]:
     """Two unit axes x, y with x × y = axis; the frame's own x and y where the axis is z.
 
@@ -385,7 +377,7 @@ class ThermalExpansion(WarmUp):
         return (cell.model.thermal_driver,)
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        lengths = [np.linalg.norm(T[:3, 3]) for T in link_ends(chain)]
+        lengths = [np.linalg.norm(T[:3, 3]) for T in chain.link_ends]
         long = [link for link, m in zip(links(chain), lengths, strict=True) if m > SHORTEST]
         return (*long, "all")
 
