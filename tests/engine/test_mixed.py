@@ -9,7 +9,7 @@ import pytest
 import statsmodels.formula.api as smf
 from engine.dense import Table, dense, readings
 
-from elastocal.engine.mixed import Expected, LogPrior, fit
+from elastocal.engine.mixed import Expected, LogPrior, MixedFit
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_choice import NoisyReadings, fitted, prior_of_groups
 from elastocal.identification.noise_structure import STRUCTURES, Kind, Readings
@@ -118,7 +118,7 @@ def test_marginal_means_of_oats_as_printed():
     noisy = NoisyReadings(r, NESTED)
     noisy.deviations = [d for d in noisy.deviations if "load" not in d.name]
     assert [d.name for d in noisy.deviations] == NAMES
-    found = fit(noisy.model(), noisy.start(), (1, 2))
+    found = MixedFit(noisy.model(), noisy.start(), (1, 2))
     covariance, dof = found.expected.kenward_roger(found.covariance, np.eye(6))
     printed = np.array(
         [
@@ -162,7 +162,7 @@ def test_shrunk_variances_are_nearer_the_truth_and_their_likelihood_is_an_integr
         noisy = NoisyReadings(r, Kind("groups"))
         prior = prior_of_groups(noisy)
         start = np.exp(prior.mean)
-        each = [fit(noisy.model(p), start) for p in (prior, None)]
+        each = [MixedFit(noisy.model(p), start) for p in (prior, None)]
         shrunk += ((np.log(each[0].theta) - log.ravel()) ** 2).mean()
         plain += ((np.log(each[1].theta) - log.ravel()) ** 2).mean()
     assert shrunk < 0.5 * plain
@@ -170,7 +170,7 @@ def test_shrunk_variances_are_nearer_the_truth_and_their_likelihood_is_an_integr
     noisy = NoisyReadings(groups(4, 12, 0.0, 0.0, 1)[0], Kind("groups"))
     mean, precision = np.tile(MEAN, 4), np.diag(np.full(12, 1e8))
     precision[0, 0] = 1 / 0.5
-    found = fit(noisy.model(LogPrior(mean, precision)), np.exp(mean))
+    found = MixedFit(noisy.model(LogPrior(mean, precision)), np.exp(mean))
     nodes, weights = np.polynomial.hermite_e.hermegauss(60)
     at = [np.exp(mean + np.sqrt(0.5) * z * (np.arange(12) == 0)) for z in nodes]
     values = np.array([noisy.model().state(theta).log_likelihood for theta in at])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from elastocal.identification.smooth_fit import LinearRows, Scales
+from elastocal.identification.smooth_fit import LinearRows, Posterior, Scales
 from elastocal.identification.weighted_problem import RFactor
 
 ROWS, FREE, SHRUNK = 80, 4, 15
@@ -40,7 +40,7 @@ def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]
 def test_the_posterior_is_that_of_ridge_regression(kept):
     B, e = drawn(0)
     scales = Scales(np.array([1.0, 0.3, 0.0]), 0.2, np.zeros(3))
-    found = linear(B, e).only(kept).posterior(scales)
+    found = Posterior(linear(B, e).only(kept), scales)
     own = np.flatnonzero(scales.scale[GROUP] > 0)
     assert np.array_equal(found.own, own)
     chosen = np.concatenate([kept, FREE + own])

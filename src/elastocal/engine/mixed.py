@@ -322,16 +322,54 @@ UNSEEN = 1e-5  # curvature of ℓ in its logarithm below which a variance is as 
 FLAT, NEAR = 1.0, 0.1  # curvature and slope in it below which it may be none
 
 
-@dataclass(frozen=True)
 class MixedFit:
-    """θ (K,) at the maximum, and whether the search ended.
+    """θ (K,) at the maximum of the restricted likelihood (times the prior of log θ), searched from
+    `start` (K,) until a step promises less than `enough` of −2ℓ, and whether the search ended.
 
-    `log_likelihood` is the restricted one, with a prior the marginal one by Laplace's method.
+    Variances that `may_vanish` are zero where the likelihood does not miss them.  `log_likelihood`
+    is the restricted one, with a prior the marginal one by Laplace's method.
     """
 
-    model: Mixed
-    theta: Array
-    converged: bool
+    def __init__(
+        self, model: Mixed, start: Array, may_vanish: Sequence[int] = (), enough: float = ENOUGH
+    ) -> None:
+        t = np.log(start)
+        lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
+
+        @lru_cache(KEPT)
+        def known(logarithms: bytes) -> tuple[float, Array, Array]:
+            t = np.frombuffer(logarithms)
+            try:
+                return model.objective(t)
+            except np.linalg.LinAlgError:
+                return np.inf, np.zeros(len(t)), np.eye(len(t))
+
+        def evaluated(t: Array) -> tuple[float, Array, Array]:
+            return known(t.tobytes())
+
+        def ridged(t: Array) -> tuple[float, Array, Array]:
+            value, slope, information = evaluated(t)
+            ridge = 1e-9 * max(float(np.diag(information).max()), 1e-3)
+            return value, slope, information + ridge * np.eye(len(t))
+
+        # Those that the columns could explain all of say nothing: they are none.
+        told = np.diag(evaluated(t)[2]) > LEAST_TOLD
+        held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
+        for _ in range(ROUNDS):
+            t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
+            before, (t, ended) = t, climb(ridged, t, lower, upper, enough, STEPS)
+            value, slope, information = evaluated(t)
+            falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
+            gone: list[int] = []
+            for k in may_vanish:
+                without = t.copy()
+                without[[*gone, k]] = -np.inf
+                if falling[k] and evaluated(without)[0] <= value + FINE:
+                    gone.append(k)
+            if not gone and (ended or np.array_equal(t, before)):
+                break
+            held = np.append(held, gone).astype(np.int64)
+        self.model, self.theta, self.converged = model, np.exp(t), ended
 
     @cached_property
     def state(self) -> State:
@@ -374,53 +412,6 @@ class MixedFit:
         log_dets = [float(np.linalg.slogdet(part)[1]) for part in (prior.precision, H)]
         off = prior.penalty(np.log(self.theta[:k]))[0]
         return found - 0.5 * off + 0.5 * (log_dets[0] - log_dets[1])
-
-
-def fit(
-    model: Mixed, start: Array, may_vanish: Sequence[int] = (), enough: float = ENOUGH
-) -> MixedFit:
-    """Maximise the restricted likelihood (times the prior of log θ) from θ = `start` (K,), until a
-    step promises less than `enough` of −2ℓ.
-
-    Variances that `may_vanish` are zero where the likelihood does not miss them.
-    """
-    t = np.log(start)
-    lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
-
-    @lru_cache(KEPT)
-    def known(logarithms: bytes) -> tuple[float, Array, Array]:
-        t = np.frombuffer(logarithms)
-        try:
-            return model.objective(t)
-        except np.linalg.LinAlgError:
-            return np.inf, np.zeros(len(t)), np.eye(len(t))
-
-    def evaluated(t: Array) -> tuple[float, Array, Array]:
-        return known(t.tobytes())
-
-    def ridged(t: Array) -> tuple[float, Array, Array]:
-        value, slope, information = evaluated(t)
-        ridge = 1e-9 * max(float(np.diag(information).max()), 1e-3)
-        return value, slope, information + ridge * np.eye(len(t))
-
-    # Those that the columns could explain all of say nothing: they are none.
-    told = np.diag(evaluated(t)[2]) > LEAST_TOLD
-    held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
-    for _ in range(ROUNDS):
-        t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
-        before, (t, ended) = t, climb(ridged, t, lower, upper, enough, STEPS)
-        value, slope, information = evaluated(t)
-        falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
-        gone: list[int] = []
-        for k in may_vanish:
-            without = t.copy()
-            without[[*gone, k]] = -np.inf
-            if falling[k] and evaluated(without)[0] <= value + FINE:
-                gone.append(k)
-        if not gone and (ended or np.array_equal(t, before)):
-            break
-        held = np.append(held, gone).astype(np.int64)
-    return MixedFit(model, np.exp(t), ended)
 
 
 def lower_inverse(R: Array, out: Array | None = None) -> Array:

@@ -69,17 +69,20 @@ ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "
 WEAK, BEYOND, UNREAD = "weak", "beyond", "unread"
 
 _good, _note, _care, _poor = (partial(made, s) for s in ("good", "note", "care", "poor"))
-# These come from the solver and stay when a result is judged anew.
-OF_SOLUTION = ("ill_conditioned", "beyond_bound", "exchanged_markers")
 
 
-def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) -> Calibration:
+def judged(
+    result: Calibration, solution: Solution | None = None, whole: Measurements | None = None
+) -> Calibration:
     """The same result with its findings, the overall one ("trust") first.
 
-    `of_solution` are those that only the solver can tell; by default the result's own are kept.
+    Some only the `solution` and the `whole` table can tell; without them those of the result stay.
     """
-    if of_solution is None:
-        of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
+    of_solution = result.findings
+    if solution is not None and whole is not None:
+        of_solution = (
+            *_conditioning(result, solution), *_bounds(result), *_exchanged(result, whole)
+        )  # fmt: skip
     compared = tuple(_against_stated_noise(result))
     fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
     noise = (*compared, *_repeats(result, fits))
@@ -708,12 +711,6 @@ def _test(result: Calibration) -> Iterator[Finding]:
 
 
 # What only the solver can tell.
-
-
-def of_solution(
-    result: Calibration, solution: Solution, whole: Measurements
-) -> tuple[Finding, ...]:
-    return (*_conditioning(result, solution), *_bounds(result), *_exchanged(result, whole))
 
 
 def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:

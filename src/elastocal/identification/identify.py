@@ -17,7 +17,7 @@ from scipy import sparse
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import judged, of_solution
+from elastocal.identification.findings import judged
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
@@ -62,7 +62,7 @@ from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.solve import (
     Solution,
     bent,
-    chosen_again,
+    choose,
     fit_kept,
     posed,
     residual_sigma,
@@ -125,13 +125,10 @@ def identify(
     found = run_method(course)
     progress("intervals and held-out residuals")
     outliers = describe(course.every, found.solution, ~found.good)
-    result = summarise(course, found, outliers, new_poses, copies)
+    result = summarise(course, found, outliers, new_poses, copies, test)
     body = solved_body(table, float(found.solution.fit.residual.std()))
     told = (*told, *_doubts(model, table, test, result.x))
-    result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
-    if test is None:
-        return result
-    return judged(replace(result, test=_test_errors(model, result, test)))
+    return replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
 
 
 def _doubts(
@@ -237,7 +234,7 @@ NOT_SHOWN = "held: the readings do not show the smooth function that it is part 
 
 def summarise(
     course: Course, found: MethodResult, faulty: tuple[Outlier, ...], new_poses: NewPoses | None,
-    copies: tuple[int, ...],
+    copies: tuple[int, ...], test: Measurements | None,
 ) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
@@ -284,9 +281,9 @@ def summarise(
         new_poses or over_the_workspace(model.cell, model, observed.table),
         np.random.default_rng(0), _unchecked(result),
     )  # fmt: skip
-    result = replace(result, predicted=predicted)
-    whole = every.problem.observations.table
-    result = judged(result, of_solution(result, solution, whole))
+    errors = None if test is None else _test_errors(model, result, test)
+    result = replace(result, predicted=predicted, test=errors)
+    result = judged(result, solution, every.problem.observations.table)
     told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
@@ -453,8 +450,10 @@ def _adapted(
             solution, more = start, start.reduction
         else:
             # Weights that make light of what is noisy may show more than those of the first fit.
-            heavy = noise.kind not in FIRST and left > 0
-            more = chosen_again(solution) if heavy else start.reduction
+            more = start.reduction
+            if noise.kind not in FIRST and left > 0:
+                fit, sigma = solution.fit, residual_sigma(solution.fit, len(kept))
+                more = choose(fit.problem, fit.of_free, sigma, more.threshold)
         if others or len(more.kept) > len(kept):
             fewer = None if others else (solution, noise, now, readings)
             start, sure = replace(start, reduction=more), False

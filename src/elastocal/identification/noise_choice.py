@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse, special
 
-from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts, fit
+from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
@@ -214,11 +214,14 @@ def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
 # A kind of noise fitted to readings.
 
 
-@dataclass(frozen=True)
 class Fitted(MixedFit):
     """A kind of noise fitted to readings."""
 
-    noisy: NoisyReadings
+    def __init__(
+        self, noisy: NoisyReadings, prior: LogPrior | None, start: Array, enough: float
+    ) -> None:
+        super().__init__(noisy.model(prior), start, noisy.may_vanish, enough)
+        self.noisy = noisy
 
     @property
     def own(self) -> Array:
@@ -284,8 +287,7 @@ def fitted(
         prior = prior_of_groups(noisy)
         if like is None or like.noisy.structure.names != noisy.structure.names:
             start[: noisy.own] = np.exp(prior.mean)
-    found = fit(noisy.model(prior), start, noisy.may_vanish, enough)
-    return Fitted(found.model, found.theta, found.converged, noisy)
+    return Fitted(noisy, prior, start, enough)
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.

@@ -328,19 +328,17 @@ class Options:
         return "ols" if self.weights == "none" else "wls"
 
 
-Refit = Callable[[BoolArray], Solution]  # of these observations
-
-
 @dataclass(frozen=True)
 class Course:
     """What a method starts from: fits to all observations, and to those that are not `faulty` (N,);
-    `refit` makes another such.  They know nothing of smooth functions among the parameters `free`.
+    `refit` makes another such, of those it is given.  They know nothing of smooth functions among
+    the parameters `free`.
     """
 
     every: Solution
     sound: Solution
     faulty: BoolArray
     free: IntArray
-    refit: Refit
+    refit: Callable[[BoolArray], Solution]
     options: Options
     progress: Progress

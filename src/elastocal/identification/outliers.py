@@ -447,23 +447,6 @@ def deleted(P: Array, u: Array, own: Array, apart: Array) -> tuple[Array, Array,
     return d[..., 0], axes, np.maximum(left, 0.0)
 
 
-def unexplained_readings(
-    found: NoiseFit, readings: Readings, good: BoolArray, level: float
-) -> BoolArray:
-    """Readings (N,) that the noise does not explain, at `level` for the whole table (Bonferroni).
-
-    `found` was estimated from the `good` readings (N,).  Each component of a reading's error is
-    compared with t on the degrees of freedom behind its noise; a reading that was fitted has a part
-    in the variance it is measured with, and is left out there as well.
-    """
-    own, dof = own_noise(found.fit, readings)
-    t = prediction_errors(found, readings, good, own)
-    squared, outside = np.minimum(t**2, dof * (1 - 1e-12)), np.maximum(dof - 1, 1.0)
-    t = np.where(good[:, None], np.sqrt(squared * outside / (dof - squared)), np.abs(t))
-    dof = np.where(good[:, None], outside, dof)
-    return np.asarray((t > rejection_point(t.size, dof, level)).any(axis=1))
-
-
 def prediction_errors(found: NoiseFit, readings: Readings, good: BoolArray, own: Array) -> Array:
     """Errors (N, size) of predicting each reading from the `good` ones (N,) that are not it, over
     their deviations; `own` (N, size, size) is the noise of single readings."""
@@ -508,11 +491,19 @@ def settle(
         return noise
 
     def judged(found: NoiseFit, chosen: BoolArray) -> tuple[Array, float, BoolArray]:
+        own, behind = own_noise(found.fit, readings)
         if not precision:
-            precision.append(np.asarray(np.linalg.inv(own_noise(found.fit, readings)[0])))
+            precision.append(np.asarray(np.linalg.inv(own)))
         r = readings.e - readings.B @ found.x
-        agrees = ~unexplained_readings(found, readings, chosen, FALSE_ALARM)
         dof = readings.size * int(chosen.sum()) - readings.n_parameters
+        # Each component's error is compared with t on the degrees of freedom behind its noise; a
+        # reading that was fitted has a part in the variance it is measured with, and is left out
+        # there as well.
+        t = prediction_errors(found, readings, chosen, own)
+        squared, outside = np.minimum(t**2, behind * (1 - 1e-12)), np.maximum(behind - 1, 1.0)
+        left_out, inside = np.sqrt(squared * outside / (behind - squared)), chosen[:, None]
+        point = rejection_point(t.size, np.where(inside, outside, behind))
+        agrees = np.asarray(~(np.where(inside, left_out, np.abs(t)) > point).any(axis=1))
         return np.einsum("ni,nij,nj->n", r, precision[0], r), dof, agrees
 
     try:

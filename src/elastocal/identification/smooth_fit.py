@@ -146,16 +146,7 @@ class LinearRows:
         gain = at.left_out([np.flatnonzero(mine) for mine in own.T])
         return Scales(np.exp(2 * theta[1:]), float(np.exp(2 * theta[0])), gain)
 
-    def posterior(self, scales: Scales) -> Posterior:
-        k, std = self.ordinary, np.sqrt(scales.scale / scales.variance)[self.group] * self.std
-        own = np.flatnonzero(std > 0)
-        P = np.eye(len(own), k + len(own), k) / std[own, None]
-        rows = self.factor.of_columns(np.append(np.arange(k), k + own))
-        prior = RFactor(np.column_stack([P, np.zeros(len(own))]), 0)
-        return Posterior(rows.merged(prior), own, P)
 
-
-@dataclass(frozen=True)
 class Posterior:
     """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
 
@@ -163,9 +154,13 @@ class Posterior:
     shrunk ones counted from nominal; `own` index those that take part.
     """
 
-    r_factor: RFactor
-    own: IntArray
-    P: Array
+    def __init__(self, linear: LinearRows, scales: Scales) -> None:
+        k, std = linear.ordinary, np.sqrt(scales.scale / scales.variance)[linear.group] * linear.std
+        self.own = own = np.flatnonzero(std > 0)
+        self.P = np.eye(len(own), k + len(own), k) / std[own, None]
+        prior = RFactor(np.column_stack([self.P, np.zeros(len(own))]), 0)
+        rows = linear.factor.of_columns(np.append(np.arange(k), k + own))
+        self.r_factor = rows.merged(prior)
 
     @cached_property
     def half(self) -> Array:
@@ -263,7 +258,7 @@ class JointFit:
 
     @cached_property
     def posterior(self) -> Posterior:
-        return self.linear.posterior(self.scales)
+        return Posterior(self.linear, self.scales)
 
     def whitened(self, part: Part) -> tuple[Array, Array]:
         """Q (rows, columns), whose squares are by how much of the noise the fit varies at the
@@ -377,14 +372,14 @@ class _Search:
         free = self._rows(problem, x)
         scales = free.only(np.searchsorted(own.free, reduction.kept)).scales(scales)
         if choosing:
-            before, marginal = reduction.kept, free.posterior(scales).marginal
+            before, marginal = reduction.kept, Posterior(free, scales).marginal
             reduction = choose(own, marginal, scales.sigma, WORTH_A_COLUMN)
             if not np.array_equal(before, reduction.kept):
                 x = reduction.shifted(x, own.x0)
                 free = self._rows(problem, x)
         reduction = reduction.seen(own.free, free.factor.R, own.sizes)
         kept = np.searchsorted(own.free, reduction.kept)
-        prior = free.only(kept).posterior(scales)
+        prior = Posterior(free.only(kept), scales)
         columns = np.append(reduction.kept, f.columns[prior.own])
         known = PriorRows(prior.P, prior.P @ self.model.nominal[columns])
         found = least_squares(
@@ -403,7 +398,7 @@ class _Search:
         """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
         where there is none), and leverage (rows,) of each, by the model linearised at the fit with
         functions of these `scales`."""
-        found, f, posterior = fit.found, self.functions, fit.linear.posterior(scales)
+        found, f, posterior = fit.found, self.functions, Posterior(fit.linear, scales)
         columns, x = np.append(fit.reduction.kept, f.columns[posterior.own]), found.x.copy()
         x[f.columns] = f.nominal
         x[columns] += posterior.step  # of functions from nominal

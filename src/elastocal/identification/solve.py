@@ -176,13 +176,6 @@ def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) 
     )
 
 
-def chosen_again(solution: Solution) -> Reduction:
-    """The choice by the weights and at the values that the solution has come to."""
-    found, threshold = solution.fit, solution.reduction.threshold
-    sigma = residual_sigma(found, len(found.columns))
-    return choose(solution.problem, found.of_free, sigma, threshold)
-
-
 def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:
     """Fit of the kept parameters, the others held at the start; their share moves over first."""
     start, kept = x.copy(), chosen.kept
