@@ -13,12 +13,12 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
-from elastocal.diagnosis.component_draws import drawn
 from elastocal.diagnosis.component_search import exchanged, imitators, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
     FittedSum,
     Pool,
+    drawn,
     presence_cost,
     side_by_side,
 )

@@ -33,14 +33,7 @@ from elastocal.diagnosis.components import (
     presence_cost,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import (
-    Item,
-    ModelSet,
-    about,
-    extended,
-    settings_of,
-    spans_of,
-)
+from elastocal.diagnosis.effect_search import Item, ModelSet, about, extended, settings_of, spans_of
 from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together, possible
 from elastocal.diagnosis.lines import (
@@ -52,12 +45,7 @@ from elastocal.diagnosis.lines import (
     sharpened,
     with_scatter,
 )
-from elastocal.diagnosis.noise_floor import (
-    NoiseValues,
-    NoisyData,
-    posterior,
-    project,
-)
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
 from elastocal.diagnosis.stated_floor import scatter_beyond
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index

@@ -18,13 +18,7 @@ from elastocal.config import read_toml
 from elastocal.diagnosis.baseline import fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
-from elastocal.diagnosis.diagnosis import (
-    SMALLEST_P,
-    Diagnosis,
-    FoundEffect,
-    Gap,
-    StructureTest,
-)
+from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
 from elastocal.diagnosis.effect_search import (
     MANY,

@@ -10,12 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import (
-    Baseline,
-    Blocks,
-    from_centre,
-    prior_deviations,
-)
+from elastocal.diagnosis.baseline import Baseline, Blocks, from_centre, prior_deviations
 from elastocal.diagnosis.hypotheses import (
     KEPT,
     NO_SETTINGS,

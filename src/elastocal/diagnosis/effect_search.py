@@ -470,21 +470,20 @@ class SelectedEffects:
 FAR = 2e-4
 
 
-def is_far(dataset: DiagnosisData, chosen: ModelSet) -> bool:
-    used = ~dataset.data.left_out
-    signals = (signal_of(dataset, chosen, k)[used] for k in _direct(chosen))
-    return any((signal**2).mean() > FAR**2 for signal in signals)
-
-
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
-    """The data about the nonlinear fit with the set's known effects in the model.
+    """The data about the nonlinear fit with the set's known effects in the model, where one of them
+    is large; else as they are.
 
     The residual is that of the fitted parameters alone: what the effects explain is put back, so
     that sets with and without them are judged on the same footing.
     """
-    items = [chosen.items[k] for k in _direct(chosen)]
-    fitted = fit_extended(dataset, chosen, items)
-    return about(dataset, fitted, [i.what for i in items if isinstance(i.what, Hypothesis)])
+    used, whats = ~dataset.data.left_out, [item.what for item in chosen.items]
+    direct = {k: h for k, h in enumerate(whats) if isinstance(h, Hypothesis) and not h.driven}
+    signals = (signal_of(dataset, chosen, k)[used] for k in direct)
+    if not any((signal**2).mean() > FAR**2 for signal in signals):
+        return dataset
+    fitted = fit_extended(dataset, chosen, [chosen.items[k] for k in direct])
+    return about(dataset, fitted, list(direct.values()))
 
 
 def about(
@@ -518,14 +517,6 @@ def about(
         other_backlash=dataset.other_backlash,
         data=replace(about_fit.data, r=r, left_out=dataset.data.left_out),
     )  # fmt: skip
-
-
-def _direct(chosen: ModelSet) -> list[int]:
-    return [
-        k
-        for k, item in enumerate(chosen.items)
-        if isinstance(item.what, Hypothesis) and not item.what.driven
-    ]
 
 
 FLIPS = 199
@@ -614,8 +605,8 @@ class ForwardSelection:
             current, scanned = best, self._scan(best)
             slots.append(slot)
             p_values.append(p)
-            if is_far(self.dataset, current):
-                self.dataset = relinearised(self.dataset, current)
+            if (anew := relinearised(self.dataset, current)) is not self.dataset:
+                self.dataset = anew
                 self._forget()
                 current = fit_set(self.dataset, current.items, current.noise)
                 scanned = self._scan(current)

@@ -25,11 +25,7 @@ from elastocal.diagnosis.extra_poses import load_forces
 from elastocal.errors import InsufficientDataError, option
 from elastocal.errors import require as check
 from elastocal.identification.identify import identify
-from elastocal.identification.prediction import (
-    PredictedError,
-    over_the_workspace,
-    predicted_error,
-)
+from elastocal.identification.prediction import PredictedError, over_the_workspace, predicted_error
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model

@@ -200,7 +200,8 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
         scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
         one, other = _unordered(nearest(scaled)[0]).T
         pairs.append((one, other))
-        rho = np.array([_correlation(z, *p, limit) for p in pairs])
+        rho = np.array([(z[i] * z[k]).mean() for i, k in pairs]) / (z**2).mean()
+        rho[rho * np.sqrt([len(i) for i, _ in pairs]) <= limit] = 0.0  # no more than chance
         share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)
         out[j] = share * float((z**2).mean()) / float(h[known, j].mean())
     return out
@@ -211,12 +212,6 @@ def _next_to(x: Array) -> tuple[IntArray, IntArray]:
     drawn = np.random.default_rng(len(x)).permutation(len(x))
     order = drawn[np.argsort(x[drawn], kind="stable")]
     return order[:-1], order[1:]
-
-
-def _correlation(z: Array, one: IntArray, other: IntArray, limit: float) -> float:
-    """Correlation of z (n,) between neighbours; 0 below `limit` standard deviations of chance."""
-    rho = float((z[one] * z[other]).mean() / (z**2).mean())
-    return rho if rho * np.sqrt(len(one)) > limit else 0.0
 
 
 # The floor that is supported: by repeats where there are some, else by what neighbours do not
