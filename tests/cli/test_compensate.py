@@ -66,7 +66,7 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
     assert "Next: Run commands.csv and measure some. 95 % of the targets" in told
     sets = [v for name, value in TRUTH.items() for v in ("--set", f"{name}={value}")]
     elastocal("simulate", folder / "cell.toml", out, "-o", seen, "--no-noise", *sets)
-    rows = csv.DictReader(seen.open())
+    rows = csv.DictReader(seen.read_text().splitlines())
     x = [float(row["x_m"]) for row in rows if row["marker"] == "[bold]M2"]
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
 
