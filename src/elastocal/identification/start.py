@@ -445,7 +445,7 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
     free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)
     if not len(free):
         raise InputError(
-            f"{model.cell.path or model.cell.name}: nothing is left to identify; choose "
+            f"{model.cell.source}: nothing is left to identify; choose "
             f"effects with parameters in [model] effects, or hold fewer by {option('fixed')}"
         )
     return free

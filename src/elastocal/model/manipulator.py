@@ -126,7 +126,7 @@ class Model(ByValue):
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by what it is made of; another process derives the functions again."""
-        plugins = Carried(self.cell.path or Path(self.cell.name), self.cell.plugins)  # run first
+        plugins = Carried(Path(self.cell.source), self.cell.plugins)  # run first
         made_of = plugins, self.chain, self.cell, self._extra, self._symbolic.backend
         return _arrived, made_of, {"_markers_stated": self._markers_stated}
 

@@ -117,7 +117,7 @@ def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
     read = cell if isinstance(cell, Cell) else read_cell(cell)
     load_installed()
     if plugins is not None or any(each.name not in CATALOGUE for each in read.model.effects):
-        load_named(read.path or Path(read.name), read.plugins, bool(plugins), fresh)
+        load_named(Path(read.source), read.plugins, bool(plugins), fresh)
     if fresh:
         read.check(known_effects=tuple(CATALOGUE))
     return read
