@@ -388,17 +388,8 @@ def import_files(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
     joined = None if log is None else joining.join(points, log, table.join)
-    if log is not None and joined is not None:  # those that have joint values, and what it says
-        rows = np.flatnonzero(joined.row >= 0)
-        pose = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
-        own, theirs, stems = points.take(rows), log.take(joined.row[rows]), joint_stems(log.numbers)
-        q = {stem: joined.q[rows, j] for j, stem in enumerate(stems)}
-        points = replace(
-            own,
-            numbers=theirs.numbers | own.numbers | q,
-            units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
-            texts=pose | own.texts,
-        )
+    if log is not None and joined is not None:
+        points = _with_joint_values(points, log, joined)
     columns, kinds, doubts = assemble(where, points, table)
     # Numbers with the digits that read back exactly.
     cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
@@ -414,10 +405,7 @@ def import_files(
             text=text,
         )
     except InputError as error:
-        named = re.search(r"line (\d+)", str(error))
-        row = int(named[1]) - 2 if named else -1
-        meant = f" (from {points.where(row)})" if 0 <= row < len(points) else ""
-        raise InputError(f"{error}{meant}") from None
+        raise _with_its_place(error, points) from None
     fit, refused = (
         against_cell(cell, measured, columns, spherical) if cell is not None else (None, "")
     )
@@ -428,6 +416,28 @@ def import_files(
         warnings.append(fit.warning)
     return Imported(
         tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
+    )
+
+
+def _with_joint_values(points: Records, log: Records, joined: Joined) -> Records:
+    """The points that found joint values, with these and what else the log says there."""
+    rows = np.flatnonzero(joined.row >= 0)
+    pose = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
+    own, theirs, stems = points.take(rows), log.take(joined.row[rows]), joint_stems(log.numbers)
+    return replace(
+        own,
+        numbers=theirs.numbers | own.numbers | {s: joined.q[rows, j] for j, s in enumerate(stems)},
+        units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
+        texts=pose | own.texts,
+    )
+
+
+def _with_its_place(error: InputError, points: Records) -> InputError:
+    """What is wrong with a line of the table, and where that line came from."""
+    named = re.search(r"line (\d+)", str(error))
+    row = int(named[1]) - 2 if named else -1
+    return InputError(
+        f"{error} (from {points.where(row)})" if 0 <= row < len(points) else str(error)
     )
 
 
