@@ -205,6 +205,9 @@ def write_summary(runs: tuple[Run, ...]) -> None:
 
 
 def main(chosen: list[str]) -> None:
+    keys = [run.key for run in RUNS]
+    if unknown := sorted({*chosen} - {*keys}):
+        sys.exit(f"no such run: {', '.join(unknown)}; there are {', '.join(keys)}")
     data = prepare()
     OUT.mkdir(exist_ok=True)
     print(f"\nErrors in mm: 3-D rms, of the length for cables.\n\n{SUMMARY}")
