@@ -9,7 +9,7 @@ from scipy import stats
 
 from elastocal.identification.least_squares import orthogonal
 from elastocal.identification.noise_choice import estimate_noise
-from elastocal.identification.noise_structure import Readings, VisitRecord
+from elastocal.identification.noise_structure import Deviation, Readings, VisitRecord
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
 
@@ -84,3 +84,11 @@ def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
         assert (((p < level).sum(axis=0)) <= most).all()
         assert stats.binom.sf(most, len(p), level) < 2e-3
     assert ((p > 0.5).mean(axis=0) > 0.3).all()
+
+
+def test_a_place_without_a_reading_shares_nothing():
+    """As that of a pose which is only planned beside a drift that the cell states."""
+    unit, loading = np.zeros((3, 1), dtype=int), np.arange(1.0, 10.0).reshape(3, 1, 3, 1)
+    found = Deviation("time", "time", unit, loading).packed(np.array([[0, -1], [1, 2]]))
+    assert found[0, :3, 0].tolist() == [1, 2, 3] and not found[0, 3:].any()
+    assert found[1, :, 0].tolist() == [4, 5, 6, 7, 8, 9]

@@ -528,9 +528,10 @@ class Deviation:
         return float((own**2).sum() + waves) / len(self.unit)
 
     def packed(self, members: IntArray) -> Array:
-        """Loadings (C, M·size, units·r) of the readings `members` (C, M) on the units of each
-        cluster."""
-        unit = self.unit[members]
+        """Loadings (C, M·size, units·r) of the readings `members` (C, M), −1 for none, on the units
+        of each cluster."""
+        here = members >= 0
+        unit = np.where(here[..., None], self.unit[members], -1)
         loading = np.where((unit >= 0)[..., None, None], self.loading[members], 0.0)
         C, M, m, size, _ = loading.shape
         local = ranked_within(unit.reshape(C, -1)).reshape(C, M, m)
