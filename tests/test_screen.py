@@ -82,6 +82,10 @@ def fault():
     raise KeyError("held")
 
 
+def ended_file():
+    raise EOFError("No data left in file")
+
+
 @pytest.mark.parametrize(
     ("raised", "code", "told"),
     [
@@ -89,6 +93,7 @@ def fault():
         (overflow, 1, "data.csv: .*too large or too small"),
         (memory, 1, "data.csv: memory ends"),
         (fault, 70, "data.csv: not foreseen: KeyError: 'held' at .*Please report"),
+        (ended_file, 70, "data.csv: not foreseen: EOFError: No data left in file"),
     ],
 )
 def test_what_a_library_raises_is_a_sentence_with_the_files(raised, code, told, capsys):

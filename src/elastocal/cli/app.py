@@ -157,7 +157,7 @@ def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool 
         complain(f"{error.filename or 'standard output'}: {error.strerror or error}")
         return 2
     # An interrupt may have been turned by a library into an error of its own.
-    if interrupted or not isinstance(error, Exception) or isinstance(error, typer.Abort | EOFError):
+    if interrupted or not isinstance(error, Exception) or isinstance(error, typer.Abort):
         return INTERRUPTED
     if hasattr(error, "show"):  # of typer's own: a usage error
         error.show(told := StringIO())
