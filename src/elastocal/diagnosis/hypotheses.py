@@ -36,7 +36,7 @@ from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import BY_ORDER, Backlash, GearSpectrum, Hysteresis
 from elastocal.model.effects.placements import ThermalExpansion
 from elastocal.model.effects.smooth import JointCurve
-from elastocal.model.evaluate import BatchFunction
+from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, rows_needed, subset
 from elastocal.units import Array, BoolArray, IntArray
@@ -675,7 +675,7 @@ def compute_columns(
     whole = replace(cell, model=spec)
     extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
     key = "columns", spec.effects
-    full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra))
+    full = made_once(base.model, key, lambda: Model.assembled(chain, whole, extra, ONCE))
     at = dict(zip(base.model.names, base.x, strict=True)) | (found or {})
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
     observed = observe(table, full.observe)

@@ -156,10 +156,11 @@ def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -
 # evaluated by the same engine.
 
 BACKENDS = ("auto", "numpy")
+ONCE = "once"  # as "auto", of a function that is asked once: the program's own, no user's
 VARIABLE = "ELASTOCAL_BACKEND"
 # A row takes CasADi 4 ns per instruction and numpy 0.15, which pays 0.3 µs per instruction and
-# block beside (one core of a 2023 server).
-FEW = 77  # rows of a block
+# block beside (one core of a 2023 server), and 6 µs per instruction before the first one.
+FEW, FEW_ONCE = 77, 1500  # rows of a block
 
 
 def checked(name: str, source: str) -> str:
@@ -207,7 +208,8 @@ class BatchFunction:
     def __init__(
         self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
     ) -> None:
-        self._asked = None if backend is None else checked(backend, "backend")
+        self._most = FEW_ONCE if backend == ONCE else FEW
+        self._asked = None if backend is None or backend == ONCE else checked(backend, "backend")
         self._function = f = ca.Function("rows", list(inputs), list(outputs))
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
@@ -224,7 +226,7 @@ class BatchFunction:
         arrays, n = self._rows(inputs)
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
-        few = n <= FEW * -(-n // max(chunk, 1)) and dtype == np.float64
+        few = n <= self._most * -(-n // max(chunk, 1)) and dtype == np.float64
         if few and chosen_backend(self._asked) == "auto":
             # It takes rows side by side, and what is the same in all of them once.
             found = self._function.call([ca.DM(a.T if a.ndim == 2 else a) for a in arrays])
