@@ -18,6 +18,7 @@ import importlib
 import json
 import logging
 import math
+import os
 import re
 import shutil
 import signal
@@ -27,11 +28,9 @@ import threading
 import time
 import tomllib
 import traceback
-import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from contextlib import closing, contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -451,6 +450,8 @@ ANSWER = 10.0  # s in which a scheduler answers
 MOST_PEM_BYTES = 1_000_000
 TRIES = 3  # of a task whose process dies
 DIED = "its worker process died {} times (out of memory, killed, or crashed in a library)"
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")  # in each process
+IGNORING = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # of workers: Ctrl-C is for us
 
 
 class ClusterLostError(ElastocalError):
@@ -459,94 +460,94 @@ class ClusterLostError(ElastocalError):
     exit_code = 1
 
 
-def run_local(study: Study, tasks: Sequence[Row], jobs: int | None, stop: StudyStop) -> Lines:
-    """Lines of results as joblib has them, none twice; none new begins once `stop` is asked for.
+class Processes:
+    """joblib's, by default one per core, for so many tasks at most; where one alone is asked for it
+    is this process, for a debugger."""
+
+    name = "this machine"
+
+    def __init__(self, jobs: int | None = None, most: int = MAX_TASKS) -> None:
+        from joblib.externals import loky
+
+        jobs = jobs or loky.cpu_count()
+        env = {name: os.environ.get(name, "1") for name in ONE_THREAD}
+        # The processes, started anew where one of them died.
+        self._pool = None if jobs == 1 else lambda: loky.get_reusable_executor(
+            min(jobs, most), initializer=IGNORING, env=env)  # fmt: skip
+        self.room = lambda: jobs
+
+    def submit(self, *call: Any) -> Future[Row]:
+        if self._pool is not None:
+            found: Future[Row] = self._pool().submit(*call)
+            return found
+        done = Future[Row]()
+        done.set_result(call[0](*call[1:]))
+        return done
+
+    def end(self, running: bool) -> None:
+        if running and self._pool is not None:
+            self._pool().shutdown(kill_workers=True)
+
+
+class Cluster:
+    """Dask's workers.  No task waits at one: what is out is what is waited for on Ctrl-C."""
+
+    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
+        self._client, self._tell = client, tell
+        self.name = f"the scheduler at {client.scheduler.address}"
+        # No call may answer for another one.
+        self.submit = client.get_executor(pure=False).submit
+
+    def room(self) -> int:
+        # Without a limit a scheduler that goes away while it is asked is waited for for ever.
+        threads = sum(self._client.nthreads(callback_timeout=6 * ANSWER).values())
+        if not threads:
+            self._tell("the cluster has no worker; waiting for one")
+        return max(threads, 1)
+
+    def end(self, running: bool) -> None:
+        self._client.close()
+
+
+def lines_of(
+    study: Study, tasks: Iterable[Row], stop: StudyStop, workers: Processes | Cluster
+) -> Lines:
+    """The tasks' lines of results as they come; none begins once `stop` is asked for.
 
     Where a process dies joblib ends them all: what ran is repeated, one task after the other, so
-    that it is known whose process dies each time.
+    that it is known whose process dies each time.  Dask gives the tasks of a dead worker to
+    another, and gives up a task that killed more than distributed.scheduler.allowed-failures.
     """
-    import joblib
-
-    jobs = max(min(jobs or joblib.cpu_count(), len(tasks)), 1)
-    waiting, died, out = deque(tasks), Counter[int](), dict[int, Row]()
-
-    def handed_out(most: int) -> Iterator[Any]:
-        while waiting and most and not stop.asked:
-            task, most = waiting.popleft(), most - 1
-            out[task["task"]] = task
-            yield joblib.delayed(execute)(study.sources, task)
-
-    ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
-    with joblib.parallel_config("loky", initializer=ignore):
-        while waiting and not stop.asked:
-            suspect = died[waiting[0]["task"]] > 0
-            pool = joblib.Parallel(
-                max(jobs, 2) if suspect else jobs, return_as="generator_unordered",
-                pre_dispatch="n_jobs", batch_size=1,
-            )  # fmt: skip
-            lines = pool(handed_out(1 if suspect else len(waiting)))
-            try:
-                for line in lines:
-                    del out[line["task"]]
-                    yield line
-            except BrokenProcessPool:
-                while out:
-                    number, task = out.popitem()
-                    died[number] += 1
-                    if died[number] < TRIES:
+    waiting, out, died = deque(tasks), dict[Future[Row], Row](), Counter[int]()
+    try:
+        while out or (waiting and not stop.asked):
+            room = workers.room() if waiting and not stop.asked else 0
+            while waiting and len(out) < (1 if died[waiting[0]["task"]] else room):
+                task = waiting.popleft()
+                out[workers.submit(execute, study.sources, task)] = task
+            for future in wait(out, return_when=FIRST_COMPLETED).done:
+                task = out.pop(future)
+                try:
+                    yield future.result()
+                except BrokenExecutor:
+                    died[task["task"]] += 1
+                    if died[task["task"]] < TRIES:
                         waiting.appendleft(task)
                     else:
                         yield line_of(task, error=DIED.format(TRIES))
-            finally:
-                with warnings.catch_warnings(action="ignore"):  # joblib's, of tasks ended early
-                    lines.close()
-
-
-def run_on_cluster(
-    client: Any, study: Study, tasks: Sequence[Row], stop: StudyStop,
-    tell: Callable[[str], None],
-) -> Lines:  # fmt: skip
-    """The same of a Dask cluster's workers, which gives the tasks of a dead one to another, and
-    gives up a task that killed more than it allows (distributed.scheduler.allowed-failures).
-
-    No task waits at a worker: what is out is what is waited for on Ctrl-C.
-    """
-    from distributed import as_completed
-
-    waiting, out, ended = deque(tasks), dict[Any, Row](), as_completed(loop=client.loop)
-
-    def hand_out() -> None:
-        # Without a limit a scheduler that goes away while it is asked is waited for for ever.
-        threads = sum(client.nthreads(callback_timeout=6 * ANSWER).values())
-        if not threads:
-            tell("the cluster has no worker; waiting for one")
-        while waiting and not stop.asked and len(out) < max(threads, 1):
-            task = waiting.popleft()
-            # No other call may answer for this one.
-            future = client.submit(execute, study.sources, task, pure=False)
-            out[future] = task
-            ended.add(future)
-
-    try:
-        hand_out()
-        for future in ended:
-            task = out.pop(future)
-            try:
-                yield future.result()
-            except (CancelledError, OSError):
-                raise
-            except Exception as error:  # execute() returns what a task raises
-                deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
-                told = f"the worker could not run it: {type(error).__name__}: {error}"
-                yield line_of(task, error=told if deaths is None else DIED.format(deaths + 1))
-            hand_out()
+                except (CancelledError, OSError):
+                    raise
+                except Exception as error:  # execute() returns what a task raises
+                    deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
+                    told = f"the worker could not run it: {type(error).__name__}: {error}"
+                    yield line_of(task, error=told if deaths is None else DIED.format(deaths + 1))
     except (CancelledError, OSError):
         raise ClusterLostError(
-            f"the scheduler at {client.scheduler.address} went away or cancelled the tasks; "
-            "what was done is kept, and the same command goes on with the rest"
+            f"{workers.name} went away or cancelled the tasks; what was done is kept, and the same "
+            "command goes on with the rest"
         ) from None
     finally:
-        client.close()
+        workers.end(bool(out))
 
 
 def _security(
@@ -652,10 +653,10 @@ def run_study(
         there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
         left = [task for task in wanted if task["task"] not in there]
-        runner = partial(run_local, study, left, jobs, stop)
+        workers: Processes | Cluster = Processes(jobs, len(left))
         if cluster is not None and left:
             # Before results are discarded: one that cannot be reached must not cost them.
-            runner = partial(run_on_cluster, connect(cluster, **way), study, left, stop, tell)
+            workers = Cluster(connect(cluster, **way), tell)
         for name in OURS if restart else ():
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
@@ -665,7 +666,7 @@ def run_study(
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
         progress(total, ended, failed)
         try:
-            with closing(runner()) as lines:
+            with closing(lines_of(study, left, stop, workers)) as lines:
                 for line in lines:
                     stop.check()
                     add_line(folder, line)

@@ -9,12 +9,13 @@ from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
 from elastocal.studies import (
+    Cluster,
     ClusterLostError,
     StudyStop,
     _security,
     connect,
+    lines_of,
     read_results,
-    run_on_cluster,
 )
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
@@ -73,8 +74,8 @@ def marked(tmp_path, lethal=None, count=12, sleep=0.02):
 
 
 def at(address):
-    client = connect(address)
-    return lambda study: lambda tasks: run_on_cluster(client, study, tasks, StudyStop(), print)
+    workers = Cluster(connect(address), print)
+    return lambda study: lambda tasks: lines_of(study, tasks, StudyStop(), workers)
 
 
 def begun(marks):
