@@ -1,6 +1,8 @@
-"""Rotation vectors: log against scipy, near no turn and near half a turn too."""
+"""Rotation vectors: log against scipy, near no turn and near half a turn too; reach of an arm."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -10,11 +12,24 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from elastocal.model import rigid
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.rigid import reach_of
 
 _R = ca.SX.sym("R", 3, 3)
 _log = ca.Function("log", [_R], [rigid.vector_from_rotation(_R)])
 
 NEAR_ZERO = [0.0, 1e-300, 1e-20, 1e-15, 1e-12, 1e-8, 1e-4]
+
+
+def test_slides_alone_reach_as_far_as_all_of_them_go() -> None:
+    """The first one's travel counts where no joint turns; before one that turns it does not."""
+    place = np.eye(4)
+    place[:3, 3] = 0.0, 0.0, 0.1
+    joints = [Joint(f"joint{i}", "prismatic", place, np.eye(3)[0], 0.0, 2.0) for i in range(4)]
+    slides = reach_of(Chain("gantry", tuple(joints), np.eye(4)))
+    assert 6.2 < slides < np.hypot(8.0, 0.3)
+    turning = replace(joints[1], kind="revolute", axis=np.array([0.0, 0.0, 1.0]))
+    assert reach_of(Chain("rail", (joints[0], turning, *joints[2:]), np.eye(4))) < 4.1
 
 
 def log(R: np.ndarray) -> np.ndarray:

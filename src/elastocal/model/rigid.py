@@ -123,9 +123,11 @@ def reach_of(chain: Chain) -> float:
     turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
     first = turning[0] if turning else 0
     q[:, :first] = (low + high)[:first] / 2
-    symbol = ca.SX.sym("q", chain.n_joints)
-    frames = nominal_frames(chain, symbol, ca.SX.eye(4))
-    reach = ca.norm_2(frames[-1][:3, 3] - frames[first][:3, 3])
+    symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
+    frames = [base, *nominal_frames(chain, symbol, base)]
+    # A slide, where none turns, starts from where it stands at zero.
+    start = point(frames[first], chain.joints[first].placement[:3, 3])
+    reach = ca.norm_2(frames[-1][:3, 3] - start)
     return float(BatchFunction([symbol], [reach])(q)[0].max())
 
 
