@@ -21,7 +21,7 @@ from elastocal.files import atomic_write
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.planning.bodies import cell_bodies, hull, mesh_hull, outward, skeleton, urdf_bodies
+from elastocal.planning.bodies import cell_bodies, hull, outward, skeleton, urdf_bodies
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks as say
@@ -100,24 +100,17 @@ def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
 
     Round shapes become inscribed polyhedra.  Raises InputError for a mesh that cannot be read.
     """
-    R, p = solid.placement[:3, :3], solid.placement[:3, 3]
-    if solid.shape == "mesh":
-        points, faces = mesh_hull(solid)
-        return points @ R.T + p, faces
-    angle = np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)
-    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(MERIDIANS)])
-    if solid.shape == "cylinder":
-        half = np.array([0.0, 0.0, float(solid.size[1]) / 2])
-        ends = [float(solid.size[0]) * ring + side * half for side in (-1, 1)]
-        return outward(np.vstack(ends) @ R.T + p)
     centres, radius = hull(solid)
     if not radius:
         return outward(centres)
-    # Points of the unit sphere: poles, and rings of which one is the equator.
-    height = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 2 * PARALLELS + 1))[1:-1]
-    rings = [ring * np.sqrt(1 - h * h) + [0.0, 0.0, h] for h in height]
-    ball = np.vstack([*rings, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]]) @ R.T
-    return outward((centres[:, None] + radius * ball).reshape(-1, 3))
+    angle = np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(MERIDIANS)])
+    # Heights on the unit sphere: poles, and rings of which one is the equator.
+    heights = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 2 * PARALLELS + 1))
+    heights = np.zeros(1) if solid.shape == "cylinder" else heights
+    around = np.vstack([ring * np.sqrt(1 - h * h) + [0.0, 0.0, h] for h in heights])
+    around = radius * around @ solid.placement[:3, :3].T
+    return outward((centres[:, None] + around).reshape(-1, 3))
 
 
 ARROW = 0.12  # length of a long arrow over the reach of what is drawn

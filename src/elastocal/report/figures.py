@@ -23,6 +23,7 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import groupings
 from elastocal.identification.weighted_problem import least_norm
+from elastocal.model.effects.base import index
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.model.rigid import nominal_flanges
@@ -152,11 +153,13 @@ NO_ENDS = (math.nan, math.nan)
 
 
 def rows_of_dots(
-    name: str, title: str, rows: Sequence[tuple[str, float, tuple[float, float], str]], axis: str,
-    caption: str = "", line: tuple[str, float] | None = None, lengths: bool = False,
+    name: str, title: str, rows: say.Steps, axis: str, caption: str = "", line: say.Floor = None,
+    lengths: bool = True, told: bool = True,
 ) -> say.Figure:  # fmt: skip
-    """Rows (name, value, both ends of its interval or NaN, text), a dot each, and a dashed line at
-    a value that has a name.  `lengths`: values in µm, which may span decades."""
+    """Rows (name, value, both ends of its interval or NaN), a dot each, and a dashed line at a
+    value that has a name.  `lengths`: values in m, which may span decades, written beside the dots
+    where `told`."""
+    scale = 1e6 if lengths else 1.0
     # On two lines, cut where a name is longer.
     wrapped = [
         textwrap.wrap(say.typeset(say.short_name(n, 2 * LONGEST)), LONGEST) for n, *_ in rows
@@ -165,21 +168,24 @@ def rows_of_dots(
     lines = [name.count("\n") for name in names]
     at = np.cumsum([0.0, *(1 + 0.4 * (a + b) for a, b in pairwise(lines))])
     dashed = line if line is not None and math.isfinite(line[1]) else None
-    known = [value for _, value, *_ in rows] + ([dashed[1]] if dashed else [])
-    known = [v for v in known if math.isfinite(v)]
+    known = [value for _, value, _ in rows] + ([dashed[1]] if dashed else [])
+    known = [scale * v for v in known if math.isfinite(v)]
 
     def draw(figure: Drawing) -> None:
         axes = figure.subplots()
-        for y, (_, value, ends, text) in zip(at, rows, strict=True):
-            axes.plot(ends, [y, y], color=SERIES[0], linewidth=2.0)
-            axes.plot([value], [y], "o", color=SERIES[0], markersize=7)
-            axes.annotate(say.typeset(text), (np.nanmax([value, ends[1]]), y), (7, 0), va="center",
+        for y, (_, value, ends) in zip(at, rows, strict=True):
+            low, x, high = scale * np.array([ends[0], value, ends[1]])
+            axes.plot([low, high], [y, y], color=SERIES[0], linewidth=2.0)
+            axes.plot([x], [y], "o", color=SERIES[0], markersize=7)
+            text = say.length(value) if lengths and told else ""
+            axes.annotate(text, (np.nanmax([x, high]), y), (7, 0), va="center",
                           textcoords="offset points", fontsize=9)  # fmt: skip
         axes.set_yticks(at, names, fontsize=9.5)
         axes.set_ylim(at[-1] + 0.6, -0.9)
         if dashed:
-            told = f"{dashed[0]} ({say.length(dashed[1] * 1e-6)})"
-            axes.axvline(dashed[1], color=SERIES[1], linestyle="--", linewidth=1.2, label=told)
+            label = f"{dashed[0]} ({say.length(dashed[1])})"
+            at_line = scale * dashed[1]
+            axes.axvline(at_line, color=SERIES[1], linestyle="--", linewidth=1.2, label=label)
             figure.legend(loc="outside upper right")
         _scaled(axes, known, lengths)
         axes.set_xlabel(axis)
@@ -206,15 +212,13 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
 
 
 def waterfall(name: str, steps: say.Steps, floor: say.Floor) -> say.Figure:
-    rows = [(n, v * 1e6, (low * 1e6, high * 1e6), say.length(v)) for n, v, (low, high) in steps]
     caption = (
         "Held-out 3-D rms error with its 95 % interval, as the model gains one part after the "
         "other. "
     )
     caption += "The noise level is unknown." if floor is None else "Dashed: the noise level."
-    line = None if floor is None else (floor[0], floor[1] * 1e6)
     title = "Error budget, step by step"
-    return rows_of_dots(name, title, rows, "held-out rms error", caption, line, lengths=True)
+    return rows_of_dots(name, title, steps, "held-out rms error", caption, floor)
 
 
 # Panels of points, lines and bands
@@ -378,29 +382,23 @@ def unknown_curves(d: Diagnosis) -> say.Figure:
     return panelled("curves", title, panels, caption, 0.5 + 2.1 * -(-len(panels) // across), across)
 
 
-MOST_SHAPES = 6
+MOST_SHAPES, NO_COLUMNS = 6, np.zeros((0, 0))
 
 
-# A found effect of a joint, reading by reading: name, kind of joint, its place q (N,), in rad or m
-# its motion with the residual left and without it (N,), from where it came (N,), 0 where unknown.
-EffectShape = tuple[str, str, Array, Array, Array, Array]
-
-
-def effect_shapes(d: Diagnosis) -> list[EffectShape]:
-    """Of every named effect at a joint whose offset the model has.
+def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
+    """Every named effect at a joint whose offset the model has, reading by reading.
 
     With b = ∂p/∂q_j of a reading, bᵀr/bᵀb is the joint's motion that explains most of r: of the
     effect, and of the effect with the residual that is left where it and all other parameters are
     fitted (a component-plus-residual plot; to first order).
     """
-    base, found = d.calibrated, list[EffectShape]()
+    base, panels = d.calibrated, list[Panel]()
     if base is None or base.planned:
-        return []
+        return
     model, observed = base.model, base.observed
     wanted = [f for f in d.effects if f"{f.where}.offset" in model.names and f.parameters]
-    B = model.regressor(observed.table, base.x, observations=observed).B if wanted else None
+    B = model.regressor(observed.table, base.x, observations=observed).B if wanted else NO_COLUMNS
     for f in wanted[:MOST_SHAPES]:
-        assert B is not None
         more = model.cell.model.with_effect(f.effect, f.where, f.settings)
         new = {p.name: p.value for p in f.parameters}
         values = dict(zip(model.names, base.x, strict=True)) | new
@@ -416,31 +414,27 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
         size = (b**2).sum(axis=1)
         good = size > 0.1 * np.median(size)
         seen, explained = (
-            (b * v.reshape(b.shape)).sum(axis=1)[good] / size[good] for v in (moved + left, moved)
+            1e6 * (b * v.reshape(b.shape)).sum(axis=1)[good] / size[good]
+            for v in (moved + left, moved)
         )
-        joint, table = int(f.where.removeprefix("joint")) - 1, observed.table
-        lead = observed.lead[good]
-        side = np.zeros(len(lead)) if table.approach is None else table.approach[lead, joint]
-        kind = model.chain.kinds[joint]
-        found.append((say.effect_at(f), kind, table.q[lead, joint], seen, explained, side))
-    return found
-
-
-def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
-    panels = []
-    for name, kind, at, seen, explained, side in effect_shapes(d):
-        (q, unit), series = _in_unit(kind, at), list[Series]()
-        sides = np.unique(np.sign(side))
+        joint, table, lead = index(f.where), observed.table, observed.lead[good]
+        kind, series = model.chain.kinds[joint], list[Series]()
+        q, unit = _in_unit(kind, table.q[lead, joint])
+        # From where the joint came, 0 where that is not known.
+        came = np.zeros(len(lead))
+        if table.approach is not None:
+            came = np.sign(table.approach[lead, joint])
+        sides = np.unique(came)
         for k, one in enumerate(sides):
-            own = np.sign(side) == one
+            own = came == one
             told = "" if len(sides) == 1 else f" ({'from below' if one > 0 else 'from above'})"
             series += [
-                Series("dots", q[own], 1e6 * seen[own], SERIES[k], f"readings{told}", 1.8),
-                Series("_", q[own], 1e6 * explained[own], SERIES[k], f"effect{told}", 9),
+                Series("dots", q[own], seen[own], SERIES[k], f"readings{told}", 1.8),
+                Series("_", q[own], explained[own], SERIES[k], f"effect{told}", 9),
             ]
-        height = reach(1e6 * np.concatenate([seen, explained]))
-        motion = "µrad" if kind == "revolute" else "µm"
-        panels.append(Panel(f"joint in {unit}", f"motion in {motion}", series, height, name))
+        height = reach(np.concatenate([seen, explained]))
+        motion = f"motion in {'µrad' if kind == 'revolute' else 'µm'}"
+        panels.append(Panel(f"joint in {unit}", motion, series, height, say.effect_at(f)))
     caption = (
         "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
         "each reading when all is fitted."

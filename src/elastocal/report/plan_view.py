@@ -74,13 +74,13 @@ def _gain(found: NextPoses) -> say.Figure:
     g = found.gain
     names = ("measured so far", "with this batch")
     rows = [
-        (f"{name}{model}", value * 1e6, NO_ENDS, say.length(value))
+        (f"{name}{model}", value, NO_ENDS)
         for model, values in (("", (g.before, g.after)),
                               (", if the model is right", (g.model_before, g.model_after)))
         for name, value in zip(names, values, strict=True) if math.isfinite(value)
     ]  # fmt: skip
     axis = "rms error at the test poses"
-    return rows_of_dots("gain", "Error before and after the batch", rows, axis, lengths=True)
+    return rows_of_dots("gain", "Error before and after the batch", rows, axis)
 
 
 TOLD = 2  # parameters that a pose serves, in the table

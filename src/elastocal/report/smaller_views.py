@@ -130,11 +130,11 @@ def _change_table(c: Comparison) -> say.ShownTable:
 
 def _moves(c: Comparison) -> say.Figure:
     most = sorted(c.changes, key=lambda change: -change.moves)[:MOST_DRAWN]
-    rows = [(one.name, one.moves * 1e6, NO_ENDS, say.length(one.moves)) for one in most]
-    noise = ("all by noise alone", 1e6 * float(np.sqrt(np.mean(c.chance**2))))
+    rows = [(one.name, one.moves, NO_ENDS) for one in most]
+    noise = ("all by noise alone", float(np.sqrt(np.mean(c.chance**2))))
     caption = "The largest changes by what each alone moves the tool, rms over the poses."
     title = "How far each change moves the tool"
-    return rows_of_dots("moved", title, rows, "tool moved, rms", caption, noise, lengths=True)
+    return rows_of_dots("moved", title, rows, "tool moved, rms", caption, noise)
 
 
 # Commands
@@ -146,10 +146,8 @@ def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     table, kinds = c.targets.table, c.chain.kinds
     names = [table.configuration_labels[k] for k in table.configuration]
     axis = "error at the nominal command"
-    dots = [
-        (names[i], float(c.before[i]) * 1e6, NO_ENDS, "")
-        for i in np.flatnonzero(c.reached)[:MOST_ROWS]
-    ]
+    reached = np.flatnonzero(c.reached)[:MOST_ROWS]
+    dots = [(names[i], float(c.before[i]), NO_ENDS) for i in reached]
     q, std, rows = in_file_units(c.q, kinds), c.uncertainty.std * 1e6, []
     for i, status in enumerate(c.status[:MOST_ROWS]):
         numbers = [f"{v:.4f}" if np.isfinite(v) else "–" for v in q[i]]
@@ -161,7 +159,7 @@ def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     commands = say.ShownTable(heads, rows, (0, len(heads) - 1), note=note)
     yield from compensation_blocks({"commands": summary(c, kinds, commands=False)})
     yield say.Fold(
-        "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, lengths=True)],
+        "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, told=False)],
         figures=("errors",),
     )  # fmt: skip
     yield say.Fold("Commands", lambda: [commands])
@@ -230,11 +228,13 @@ def readings_blocks(table: Measurements) -> Iterator[say.Block]:
     q = in_file_units(table.q, table.kinds)
     ends = [(float(v.min()), float(v.max())) if len(v) else (0.0, 0.0) for v in q.T]
     dots = [
-        (name, (a + b) / 2, (a, b), "")
+        (name, (a + b) / 2, (a, b))
         for name, (a, b) in zip(joint_columns(table.kinds), ends, strict=True)
     ]
     axis, title = "middle and ends of the values, in ° or mm", "Where each joint stood"
-    yield say.Fold("", lambda: [rows_of_dots("joints", title, dots, axis)], figures=("joints",))
+    yield say.Fold(
+        "", lambda: [rows_of_dots("joints", title, dots, axis, lengths=False)], figures=("joints",)
+    )
 
 
 # The calibrated arm in a file
