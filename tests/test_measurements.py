@@ -227,7 +227,7 @@ def test_without_configurations_only_identical_rows_are_duplicates(read, refusal
         (table(ROW).replace("\n", "\r").encode(), "carriage return"),
         (HEADER.encode() + b"\n" + b"1" * 70_000, "line 2: longer than 64 KiB"),
         (HEADER.encode() + b"\n1,2,3,4,\0005\n", "line 2: NUL"),
-        (HEADER.encode() + b"\n" * 20_000, "blank lines"),
+        (HEADER.encode() + b"\n" * 20_000, "has a header but no rows"),
         (table("\ufeff" + ROW).encode(), "is not a number"),
     ],
 )

@@ -13,7 +13,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from itertools import islice
@@ -23,7 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO
 import numpy as np
 
 from elastocal.errors import InputError
-from elastocal.files import atomic_write, check_size, decoded, open_input
+from elastocal.files import atomic_write, decoded, open_input
 from elastocal.text import (
     cell_meaning,
     cell_text,
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
 # The lines of a CSV file: bounded, checked and counted.
 
 MAX_LINE = 64 * 1024
-MAX_BLANK_LINES = 10_000
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
 ROWS_AT_ONCE = 10_000
@@ -57,104 +55,85 @@ THOUSANDS = re.compile(r"[+-]?[0-9]+([.,' ][0-9]{3})*[.,][0-9]+")
 Row = tuple[int, list[str]]  # number of the line, its cells
 
 
-class CsvLines:
-    """An open CSV file: `header` and `delimiter` from its first line, and `rows`, the others.
+def csv_lines(
+    source: str, handle: BinaryIO, what: str = "table", comments: bool = False
+) -> tuple[tuple[str, ...], bool, Iterator[Row]]:
+    """The header of an open CSV file, whether decimal commas may be used, and its other lines, each
+    with as many cells as the header.
 
     `comments`: lines that begin with # are passed over, and so are lines of empty cells.
     """
+    number = 0
 
-    def __init__(
-        self, source: str, handle: BinaryIO, what: str = "table", comments: bool = False
-    ) -> None:
-        self.source, self.what, self.comments = source, what, comments
-        self._handle, self._number = handle, 0
-        line = self._line()
-        while comments and line and self._says_nothing(line):
-            line = self._line()
-        if not line:
-            raise InputError(f"{source}: empty file; the first line names the columns")
-        if line.startswith(UTF16):
+    def refused(told: str) -> InputError:
+        return InputError(f"{source}, line {number}: {told}")
+
+    def says_nothing(line: bytes, blank: bytes) -> bool:
+        bare = line.removeprefix(b"\xef\xbb\xbf").strip(blank + b',;"' * comments)
+        return not bare or (comments and bare.startswith(b"#"))
+
+    def next_line() -> bytes:
+        nonlocal number
+        number += 1
+        line = handle.readline(MAX_LINE + 1)
+        if line.startswith(UTF16) and number == 1:
             raise InputError(f"{source}: is UTF-16; save the table as CSV in UTF-8")
-        if line.startswith(ARCHIVE):
+        if line.startswith(ARCHIVE) and number == 1:
             raise InputError(f"{source}: is a workbook or archive; export the sheet as CSV")
-        text = self._decoded(line).removeprefix("\ufeff").rstrip("\r\n")
-        if not text.strip():
-            raise InputError(f"{source}: line 1 is blank; the first line must name the columns")
-        self.delimiter = max(DELIMITERS, key=text.count)
-        self.header = tuple(name.strip() for name in self._cells(text))
-
-    def rows(self) -> Iterator[Row]:
-        """All data lines, each with as many cells as the header."""
-        blank = b" \r\n" if self.delimiter == "\t" else b" \t\r\n"
-        blanks = rows = 0
-        while line := self._line():
-            if not line.strip(blank) or (self.comments and self._says_nothing(line)):
-                blanks += 1
-                if blanks > MAX_BLANK_LINES:
-                    raise self._refused(
-                        f"more than {MAX_BLANK_LINES} blank lines; this is no {self.what}"
-                    )
-                continue
-            rows += 1
-            if rows > MAX_ROWS:
-                raise InputError(
-                    f"{self.source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
-                )
-            yield self._number, self._checked(self._decoded(line).rstrip("\r\n"))
-        if not rows:
-            raise InputError(f"{self.source}: has a header but no rows; add them below it")
-
-    def _refused(self, what: str) -> InputError:
-        return InputError(f"{self.source}, line {self._number}: {what}")
-
-    def _says_nothing(self, line: bytes) -> bool:
-        """Whether a line is a comment, or has empty cells alone."""
-        bare = line.removeprefix(b"\xef\xbb\xbf").strip(b' \t\r\n,;"')
-        return not bare or bare.startswith(b"#")
-
-    def _checked(self, text: str) -> list[str]:
-        cells = self._cells(text) if '"' in text else text.split(self.delimiter)
-        expected = len(self.header)
-        if len(cells) != expected:
-            commas = len(cells) > expected and self.delimiter == ","
-            hint = "where decimals are written with a comma, separate the columns by ';'"
-            raise InputError(
-                f"{self.source}: line {self._number} has {len(cells)} fields, header has "
-                f"{expected}; {hint if commas else 'correct the line'}"
-            )
-        return cells
-
-    def _cells(self, text: str) -> list[str]:
-        """The cells of one line.  Raises InputError where quotes do not close or are stray."""
-        try:
-            return next(
-                csv.reader([text], delimiter=self.delimiter, strict=True, skipinitialspace=True)
-            )
-        except csv.Error:
-            raise self._refused(
-                f"quotation marks do not match in {quoted(text)}; close them on the same line"
-            ) from None
-
-    def _line(self) -> bytes:
-        self._number += 1
-        line = self._handle.readline(MAX_LINE + 1)
-        if b"\0" in line and not line.startswith((*UTF16, ARCHIVE)):
-            raise self._refused(
-                "NUL bytes, so this is no UTF-8 text; save the table as CSV in UTF-8"
-            )
+        if b"\0" in line:
+            raise refused("NUL bytes, so this is no UTF-8 text; save the table as CSV in UTF-8")
         if len(line) > MAX_LINE:
-            raise self._refused(f"longer than {MAX_LINE // 1024} KiB; this is no {self.what}")
+            raise refused(f"longer than {MAX_LINE // 1024} KiB; this is no {what}")
         # A lone CR would end a line for some readers and not for others.
         if b"\r" in line and b"\r" in line.removesuffix(b"\n").removesuffix(b"\r"):
-            raise self._refused(
+            raise refused(
                 "a carriage return inside the line; save the table with ordinary line ends (LF or "
                 "CRLF)"
             )
         return line
 
-    def _decoded(self, line: bytes) -> str:
+    def text(line: bytes) -> str:
         remedy = "save the table as CSV in UTF-8"
-        return decoded(self.source, line, remedy, codec="utf-8", line=self._number)
+        return decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n")
+
+    def split(line: str) -> list[str]:
+        if '"' not in line:
+            return line.split(delimiter)
+        try:
+            return next(csv.reader([line], delimiter=delimiter, strict=True, skipinitialspace=True))
+        except csv.Error:
+            raise refused(
+                f"quotation marks do not match in {quoted(line)}; close them on the same line"
+            ) from None
+
+    def rows() -> Iterator[Row]:
+        blank, rows = b" \r\n" if delimiter == "\t" else b" \t\r\n", 0
+        while line := next_line():
+            if says_nothing(line, blank):
+                continue
+            rows, cells = rows + 1, split(text(line))
+            if len(cells) != len(header):
+                commas = len(cells) > len(header) and delimiter == ","
+                hint = "where decimals are written with a comma, separate the columns by ';'"
+                raise InputError(
+                    f"{source}: line {number} has {len(cells)} fields, header has "
+                    f"{len(header)}; {hint if commas else 'correct the line'}"
+                )
+            yield number, cells
+        if not rows:
+            raise InputError(f"{source}: has a header but no rows; add them below it")
+
+    line = next_line()
+    while comments and line and says_nothing(line, b" \t\r\n"):
+        line = next_line()
+    if not line:
+        raise InputError(f"{source}: empty file; the first line names the columns")
+    first = text(line).removeprefix("\ufeff")
+    if not first.strip():
+        raise InputError(f"{source}: line 1 is blank; the first line must name the columns")
+    delimiter = max(DELIMITERS, key=first.count)
+    header = tuple(name.strip() for name in split(first))
+    return header, delimiter != ",", rows()
 
 
 def first_bad_cell(
@@ -380,7 +359,11 @@ def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> s
             f"column {quoted(text)}: the unit {unit} is not taken here; write "
             f"{' or '.join(ways[stem])}"
         )
-    meant = _meant(stem if unit in OTHER_UNITS else text)
+    name = (stem if unit in OTHER_UNITS else text).lower()
+    called = (
+        found.expand(own) for way, own in CALLED.items() if (found := re.fullmatch(way, name))
+    )
+    meant = next(called, "")
     valid = [way for way in ways.get(meant, []) if way.endswith(f"_{unit}")] or ways.get(meant, [])
     hint = f" (did you mean '{valid[0]}'?)" if valid and not {*ways[meant]} & {*header} else ""
     hint = hint or did_you_mean(text, [way for own in ways.values() for way in own])
@@ -388,13 +371,6 @@ def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> s
         f"unknown column {quoted(text)}{hint}; correct the name, or start "
         "it with '#', '_' or 'note' to have it ignored"
     )
-
-
-def _meant(name: str) -> str:
-    for pattern, stem in CALLED.items():
-        if found := re.fullmatch(pattern, name.lower()):
-            return found.expand(stem)
-    return ""
 
 
 # What a table holds
@@ -509,9 +485,8 @@ def read_table(
         table = _read(source, "row", list(frame.columns), enumerate(texts, start=1), choose, False)
     else:
         with open_input(path, what, most) if text is None else BytesIO(text.encode()) as handle:
-            lines = CsvLines(source, handle, what, comments)
-            commas = lines.delimiter != ","
-            table = _read(source, "line", lines.header, lines.rows(), choose, commas)
+            header, commas, rows = csv_lines(source, handle, what, comments)
+            table = _read(source, "line", header, rows, choose, commas)
     table.check_labels()
     return table
 
@@ -531,6 +506,10 @@ def _read(
     marks: dict[str, str] = {}
     while some := list(islice(rows, ROWS_AT_ONCE)):
         found += [number for number, _ in some]
+        if len(found) > MAX_ROWS:
+            raise InputError(
+                f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
+            )
         for cells in (cells for _, cells in some if not "".join(cells).isascii()):
             for i in columns:  # of numbers alone: labels stay as they are written
                 cells[i] = plain_minus(cells[i])
@@ -561,19 +540,9 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
     """What a Parquet file holds, where pandas finds an engine to read it."""
     import pandas as pd
 
-    rows = unpacked = 0
     with open_input(source, what, MOST_BYTES) as handle:
         if handle.read(4) != b"PAR1":
             raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
-    with suppress(Exception):  # missing or damaged, which its reader says
-        from pyarrow.parquet import ParquetFile
-
-        facts = ParquetFile(source).metadata
-        groups = [facts.row_group(i) for i in range(facts.num_row_groups)]
-        rows, unpacked = facts.num_rows, sum(group.total_byte_size for group in groups)
-    if rows > MAX_ROWS:
-        raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out")
-    check_size(source, what, unpacked, MOST_BYTES)
     try:
         frame = pd.read_parquet(source)
     except ImportError:
