@@ -235,12 +235,7 @@ def load(sources: Sources) -> ModuleType:
             module = module_from_spec(spec)
             sys.modules[name] = module  # dataclasses and pickle look a class's module up there
             _here = sources.digest, folder, module
-            # No bytecode in the user's folder: it would be left, half written, by a kill.
-            before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
-            try:
-                calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
-            finally:
-                sys.dont_write_bytecode = before
+            calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
         return _here[2]
 
 
@@ -400,16 +395,6 @@ def result_lines(folder: Path) -> list[Row]:
         )
         found[index] = line
     return [found[index] for index in sorted(found)]
-
-
-def write_statement(folder: Path, study: Study) -> None:
-    statement = {
-        "schema": SCHEMA, "title": study.title, "seed": study.sources.seed,
-        "options": dict(study.options), "tasks": len(study.tasks),
-        "columns": dict(study.sources.columns), "sources": study.sources.digests,
-        "elastocal": __version__,
-    }  # fmt: skip
-    atomic_write(folder / STATEMENT, json_text(statement) + "\n")
 
 
 def statement_of(folder: Path) -> dict[str, Any]:
@@ -661,7 +646,13 @@ def run_study(
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
             atomic_write(folder / RESULTS, "".join(map(as_text, kept)))
-        write_statement(folder, study)
+        statement = {
+            "schema": SCHEMA, "title": study.title, "seed": study.sources.seed,
+            "options": dict(study.options), "tasks": len(study.tasks),
+            "columns": dict(study.sources.columns), "sources": study.sources.digests,
+            "elastocal": __version__,
+        }  # fmt: skip
+        atomic_write(folder / STATEMENT, json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
         progress(total, ended, failed)

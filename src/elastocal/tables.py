@@ -13,6 +13,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from itertools import islice
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO
 import numpy as np
 
 from elastocal.errors import InputError
-from elastocal.files import atomic_write, decoded, open_input
+from elastocal.files import atomic_write, check_size, decoded, open_input
 from elastocal.text import (
     cell_meaning,
     cell_text,
@@ -540,9 +541,17 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
     """What a Parquet file holds, where pandas finds an engine to read it."""
     import pandas as pd
 
+    unpacked = 0
     with open_input(source, what, MOST_BYTES) as handle:
         if handle.read(4) != b"PAR1":
             raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
+    with suppress(Exception):  # missing or damaged, which its reader says
+        from pyarrow.parquet import ParquetFile
+
+        facts = ParquetFile(source).metadata
+        groups = map(facts.row_group, range(facts.num_row_groups))
+        unpacked = sum(group.total_byte_size for group in groups)
+    check_size(source, what, unpacked, MOST_BYTES)
     try:
         frame = pd.read_parquet(source)
     except ImportError:

@@ -8,6 +8,7 @@ Signature and docstring are the one place where an option is declared, for the c
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -292,15 +293,11 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
 def _wish(record: Any, key: str, value: Any) -> Any:
     """A value as a record of the cell takes it.  Raises InputError that names the option."""
-    from elastocal.config import fields_of
-
     try:
         return getattr(record(**{key: value}), key)
     except InputError as error:
-        told = str(error).replace(f"{record.__name__}: {key}", option(key), 1)
-        for known in fields_of(record)[key]:
-            told = told.replace(f"key design.{known.name}", option(key))
-        raise InputError(told) from None
+        named = rf"{record.__name__}: {key}|key design\.{key}(_\w+)?"
+        raise InputError(re.sub(named, lambda _: option(key), str(error))) from None
 
 
 def _plain(value: Any) -> Any:

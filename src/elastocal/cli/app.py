@@ -79,11 +79,18 @@ class InOrder(TyperGroup):
     def main(self, *args: Any, **extra: Any) -> Any:
         """As inherited; but however it ends, one message says why, with names escaped."""
         standalone = extra.pop("standalone_mode", True)
-        extra["standalone_mode"] = False
+        words = (args[0] if args else extra.get("args")) or sys.argv[1:]
         try:
-            words = (args[0] if args else extra.get("args")) or sys.argv[1:]
-            _refuse_empty(words)
-            code = 0 if self._helped(words) else super().main(*args, **extra)
+            # An empty argument is what a shell's unset variable leaves: as a path it would mean the
+            # folder where one is.
+            for before, word in pairwise(["", *words]):
+                place = f" after {before}" if before else ""
+                require(
+                    bool(word) or before == "--backend",  # empty like its variable: none is chosen
+                    f"an empty argument{place} says nothing; give a value, or leave it out",
+                )
+            how = extra | {"standalone_mode": False}
+            code = 0 if self._helped(words) else super().main(*args, **how)
         except (Exception, KeyboardInterrupt) as error:
             code = _ended(error)
         if code == INTERRUPTED:
@@ -101,17 +108,6 @@ class InOrder(TyperGroup):
         with suppress(typer.Exit):
             self.commands[words[0]].make_context(words[0], [words[1]], parent=above)
         return True
-
-
-def _refuse_empty(words: Sequence[str]) -> None:
-    """Raises InputError for an empty argument, as a shell's unset variable leaves it: as a path it
-    would mean the folder where one is."""
-    for before, word in pairwise(["", *words]):
-        if not word and before != "--backend":  # empty like its variable: none is chosen
-            place = f" after {before}" if before else ""
-            raise InputError(
-                f"an empty argument{place} says nothing; give a value, or leave it out"
-            )
 
 
 app = typer.Typer(
