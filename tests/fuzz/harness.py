@@ -63,7 +63,7 @@ def load_everything() -> None:
     for module in pkgutil.walk_packages(elastocal.__path__, "elastocal."):
         if not module.name.endswith("__main__"):
             importlib.import_module(module.name)
-    for name in ("cvxpy", "clarabel", "matplotlib.pyplot", "plotly.graph_objects", "pandas",
+    for name in ("matplotlib.pyplot", "plotly.graph_objects", "pandas",
                  "scipy.optimize", "scipy.stats", "pinocchio", "rich.progress", "rich.table",
                  "mujoco", "pyarrow.parquet"):  # fmt: skip
         with suppress(ImportError):  # an optional one; commands say so themselves

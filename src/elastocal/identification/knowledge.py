@@ -54,15 +54,14 @@ class Matrix:
     def at(self, x: Array) -> Array:
         return self.constant + np.tensordot(x, self.slopes, axes=1)
 
-    def balanced(self, whole: bool = False) -> Matrix:
-        """The same inequality with diagonal entries that change by about 1 per unit of x; `whole`:
-        and are themselves at most about 1 at x = 0."""
-        largest = np.abs(np.diagonal(self.slopes, axis1=1, axis2=2)).max(axis=0, initial=0.0)
-        if whole:
-            largest = np.maximum(largest, np.abs(np.diag(self.constant)))
+    def moved(self, centre: Array, unit: Array) -> Matrix:
+        """M of z, where x = centre + unit · z, with diagonal entries that change by about 1 per
+        unit of z."""
+        constant, slopes = self.at(centre), self.slopes * unit[:, None, None]
+        largest = np.abs(np.diagonal(slopes, axis1=1, axis2=2)).max(axis=0, initial=0.0)
         d = 1 / np.sqrt(np.where(largest > 0, largest, 1.0))
         both = np.outer(d, d)
-        return Matrix(self.label, self.constant * both, self.slopes * both, self.balance * d)
+        return Matrix(self.label, constant * both, slopes * both, self.balance * d)
 
     def shortfall(self, x: Array) -> float:
         """How far the smallest eigenvalue of M(x) lies below zero; 0 where M(x) ⪰ 0."""
@@ -83,13 +82,10 @@ class System:
 
     def moved(self, centre: Array, unit: Array) -> System:
         """The same constraints on z, where x = centre + unit · z (unit positive)."""
-        matrices = tuple(
-            Matrix(m.label, m.at(centre), m.slopes * unit[:, None, None], m.balance).balanced()
-            for m in self.matrices
-        )
         return replace(
             self, lower=(self.lower - centre) / unit, upper=(self.upper - centre) / unit,
-            A=self.A * unit, b=self.b - self.A @ centre, matrices=matrices,
+            A=self.A * unit, b=self.b - self.A @ centre,
+            matrices=tuple(m.moved(centre, unit) for m in self.matrices),
         )  # fmt: skip
 
     def restricted(self, columns: NDArray[np.int64], x: Array) -> System:
