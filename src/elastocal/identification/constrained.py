@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 import numpy as np
 import scipy
@@ -213,9 +213,8 @@ class Reduced:
             name, value = stated.names[i], float((stated.lower if low else stated.upper)[i])
             price = 2 * float(self.sides[k] * bounds[k] / self.unit[i])
             label = f"{name} {'>=' if low else '<='} {value:.6g}"
-            active.append(
-                ActiveConstraint(label, "lower" if low else "upper", (name,), value, price)
-            )
+            side: Literal["lower", "upper"] = "lower" if low else "upper"
+            active.append(ActiveConstraint(label, side, (name,), value, price))
         holding = [self.rows[touched]]
         for matrix, of_x, Z in zip(self.matrices, limits.matrices, matrices, strict=True):
             # M and its price Z share eigenvectors and M Z = 0, so that the negative eigenvalues of
@@ -223,13 +222,9 @@ class Reduced:
             values, vectors = np.linalg.eigh(matrix.at(u) - Z)
             N = vectors[:, values <= ON_BOUND]
             if N.shape[1]:
-                of, price = (
-                    names(np.abs(of_x.slopes).sum(axis=(1, 2))),
-                    matrix.balance**2 @ Z.diagonal(),
-                )
-                active.append(
-                    ActiveConstraint(matrix.label, "semidefinite", of, 0.0, 2 * float(price))
-                )
+                of = names(np.abs(of_x.slopes).sum(axis=(1, 2)))
+                price = 2 * float(matrix.balance**2 @ Z.diagonal())
+                active.append(ActiveConstraint(matrix.label, "semidefinite", of, 0.0, price))
             i, j = np.tril_indices(N.shape[1])
             holding.append((N.T @ matrix.slopes @ N)[:, i, j].T)
         return Minimum(x, float(left @ left), tuple(active), u, np.vstack(holding))
