@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from rich.table import Table
 from rich.text import Text
 
-from elastocal.cli.app import reporting_errors
+from elastocal.cli.app import Told, reading
 from elastocal.screen import complain, safe_console
 from elastocal.text import printable
 
@@ -96,13 +96,18 @@ def ended_file():
         (ended_file, 70, "data.csv: not foreseen: EOFError: No data left in file"),
     ],
 )
-def test_what_a_library_raises_is_a_sentence_with_the_files(raised, code, told, capsys):
+def test_what_a_library_raises_is_a_sentence_with_the_files(
+    raised, code, told, capsys, monkeypatch
+):
     import re
 
     import typer
+    from typer.core import TyperGroup
 
+    monkeypatch.setattr(TyperGroup, "invoke", lambda *_: raised())
+    reading[:] = ["data.csv"]
     with pytest.raises(typer.Exit) as ended:
-        reporting_errors(lambda data: raised())(data="data.csv")
+        Told(name="elastocal").invoke(None)
     error = capsys.readouterr().err
     assert ended.value.exit_code == code
     assert re.search(told, error) and error.count("\n") == 1 and "Traceback" not in error

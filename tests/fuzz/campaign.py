@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
+import typer
 from golden import runner
 from golden.door import equal_noise
 from golden.goldens import ARM, CAMPAIGN, GOLDENS
 
-from elastocal.cli.app import VERBS
+from elastocal.cli.main import app
 
+VERBS = tuple(typer.main.get_command(app).commands)
 IGNORED = shutil.ignore_patterns("__pycache__")
 # The options that name a file to write.
 WRITES = ("-o", "--report", "--certificate", "--residuals", "--truth", "--plan", "--cell-out",

@@ -26,8 +26,6 @@ sys.path[:0] = [str(Path(__file__).parents[2] / "src"), str(Path(__file__).paren
 
 from fuzz import campaign, harness, kills, mutations  # noqa: E402
 
-from elastocal.cli.app import VERBS  # noqa: E402
-
 Done = tuple[str, str]  # exit code or harm, what broke
 
 
@@ -71,7 +69,7 @@ def case(folder: Path, verbs: list[str], show: bool, seed: int) -> list[Done]:
     rng, place = Random(seed), folder / str(seed)
     work = place / "a" / "b" / "c"  # what `..` names stays within the case
     shutil.copytree(folder / "campaign", work)
-    verb = rng.choice(verbs or sorted(VERBS))
+    verb = rng.choice(verbs or sorted(campaign.VERBS))
     command = rng.choice([c for c in campaign.COMMANDS if c.verb == verb])
     words, inputs = command.words, command.inputs(work)
     done = mutations.spoil(rng.choice(inputs), rng) if inputs and rng.random() < 0.75 else ""

@@ -10,10 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from fuzz.campaign import COMMANDS
+from fuzz.campaign import COMMANDS, VERBS
 from fuzz.harness import complaints, malformed, run, seen
-
-from elastocal.cli.app import VERBS
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="forks, limits of Linux")
 

@@ -52,13 +52,6 @@ if TYPE_CHECKING:
 
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
-# The order of the work, in which --help lists the verbs.
-VERBS = (
-    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "next",
-    "compensate", "export", "compare", "study", "demo",
-)  # fmt: skip
-
-
 HELP = ["-h", "--help"]
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
@@ -66,19 +59,13 @@ READ = (
     "cell", "data", "result", "targets", "files", "folder", "test", "covariance", "knowledge",
     "augment", "mapping", "robot", "old", "new",
 )  # fmt: skip
+reading: list[object] = []  # what these are of the command that runs
 
 
-class InOrder(TyperGroup):
-    """Commands in the order of the work, not of their registration."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Names of the commands; one that VERBS does not know comes last."""
-        known = super().list_commands(ctx)
-        return sorted(known, key=lambda name: VERBS.index(name) if name in VERBS else len(VERBS))
+class Told(TyperGroup):
+    """A group of commands that, however it ends, says why in one message, with names escaped."""
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """As inherited; but however it ends, one message says why, with names escaped."""
-        standalone = extra.pop("standalone_mode", True)
         words = (args[0] if args else extra.get("args")) or sys.argv[1:]
         try:
             # An empty argument is what a shell's unset variable leaves: as a path it would mean the
@@ -95,9 +82,21 @@ class InOrder(TyperGroup):
             code = _ended(error)
         if code == INTERRUPTED:
             complain("interrupted")
-        if not standalone:
-            return code
         sys.exit(code or 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        """What the user can act on is turned into a message and an exit code, never a traceback;
+        nothing of it is left to typer, which takes an EOFError for an interrupt."""
+        before = len(interrupts)  # of an earlier command in this process
+        try:
+            with options_as_flags(), warnings.catch_warnings():
+                # numpy's, of overflows: what comes of them is judged where a number must be one.
+                warnings.simplefilter("ignore", RuntimeWarning)
+                return super().invoke(ctx)
+        except (Exception, KeyboardInterrupt) as error:
+            if isinstance(error, typer.Exit | typer.Abort) or hasattr(error, "show"):
+                raise  # typer's own, as a usage error
+            raise typer.Exit(_ended(error, reading, len(interrupts) > before)) from None
 
     def _helped(self, words: Sequence[str]) -> bool:
         """Whether `words` are VERB --help, which is then shown.  As inherited it would wait for the
@@ -111,33 +110,13 @@ class InOrder(TyperGroup):
 
 
 app = typer.Typer(
-    cls=InOrder,
+    cls=Told,
     help="Calibrate industrial robot arms and explain what is left over.",
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": HELP, "max_content_width": 100},
 )
-
-
-def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
-    """Turn what the user can act on into a message and an exit code, never a traceback."""
-
-    @functools.wraps(command)
-    def run(*args: Any, **kwargs: Any) -> None:
-        before = len(interrupts)  # of an earlier command in this process
-        try:
-            with options_as_flags(), warnings.catch_warnings():
-                # numpy's, of overflows: what comes of them is judged where a number must be one.
-                warnings.simplefilter("ignore", RuntimeWarning)
-                command(*args, **kwargs)
-        except (Exception, KeyboardInterrupt) as error:
-            if isinstance(error, typer.Exit | typer.Abort) or hasattr(error, "show"):
-                raise  # typer's own, as a usage error
-            read = [kwargs.get(name) for name in READ]
-            raise typer.Exit(_ended(error, read, len(interrupts) > before)) from None
-
-    return run
 
 
 def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool = False) -> int:
@@ -319,6 +298,7 @@ def command(
 
         @functools.wraps(function)
         def run(**given: Any) -> None:
+            reading[:] = [given.get(name) for name in READ]
             if "run" in own:
                 given["run"] = Run(**{n: given.pop(n) for n in flags.split()})
             if "asked" in own:
@@ -334,7 +314,7 @@ def command(
         run.__doc__ = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")[0]
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in parameters}
-        return app.command(*name, **how)(reporting_errors(run))
+        return app.command(*name, **how)(run)
 
     return register
 

@@ -20,7 +20,7 @@ from elastocal import __version__
 
 # Importing a command registers it.
 from elastocal.cli import measuring, using  # noqa: F401
-from elastocal.cli.app import app, reporting_errors
+from elastocal.cli.app import app
 from elastocal.screen import close_streams, complain, prepare_streams, say
 
 # New containers between two searches for garbage in cycles.  Python's own 700 has every import and
@@ -35,7 +35,6 @@ def _show_version(wanted: bool) -> None:
 
 
 @app.callback()
-@reporting_errors
 def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")

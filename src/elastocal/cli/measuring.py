@@ -1,4 +1,4 @@
-"""Verbs up to the measurements: init, effects, design, simulate, demo, import."""
+"""Verbs up to the measurements: init, effects, design, simulate, import."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from elastocal.cli.app import (
     Output,
     ReportFile,
     Run,
-    Seed,
     command,
     files_of,
     named_numbers,
@@ -319,7 +318,7 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     return written
 
 
-# simulate and demo: measurements of a plan that were never made; the example.
+# simulate: measurements of a plan that were never made.
 
 
 @command(
@@ -375,42 +374,6 @@ def simulate(
     run.answer(
         lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
     )
-
-
-@command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
-def demo(
-    folder: Output = Path("demo_out"),
-    seed: Seed = 2013,
-    *,
-    run: Run,
-) -> None:
-    """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
-
-    Example: elastocal demo -o demo_out
-
-    Args:
-        folder: Folder for the example's files, data, result and report.
-    """
-    from elastocal.demo.example import run_demo
-    from elastocal.files import together
-    from elastocal.report.renderers import print_report, write_page
-
-    result, report = folder / "result.json", folder / "report.html"
-    with run.progress() as progress:
-        done = run_demo(folder, seed, progress)
-        inputs = [done.cell, done.plan, done.data]
-        with together():
-            done.result.save(result)
-            write_page(done.result, report, inputs, repeated(), seed, truth=done.truth,
-                       published=done.published)  # fmt: skip
-    if run.answer(
-        lambda: done.result.to_json() | {"truth": done.truth},
-        lambda screen: print_report(screen, done.result, details=False, truth=done.truth),
-    ):
-        say(
-            f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
-            f"Report to open: {report.absolute()}"
-        )
 
 
 # import: tracker exports and joint logs → the measurement table.

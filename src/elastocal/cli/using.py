@@ -1,4 +1,4 @@
-"""Verbs that use measurements and results: identify … export; and studies."""
+"""Verbs that use measurements and results: identify … compare; studies, and the example."""
 
 from __future__ import annotations
 
@@ -261,76 +261,6 @@ def next_command(
         say(f"{output} not written")
 
 
-# compare: what has changed since the last calibration.
-
-
-@command(short_help="What has changed since the last calibration?")
-def compare(
-    cell: Path,
-    old: Path,
-    new: Annotated[Path | None, typer.Argument()] = None,
-    cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
-    output: JsonFile = None,
-    report: ReportFile = None,
-    load: FORCE | None = None,
-    level: float = 0.05,
-    poses: Annotated[int, typer.Option(min=2, max=100_000)] = 300,
-    seed: Seed = 0,
-    *,
-    run: Run,
-) -> None:
-    """What has changed between two calibrations: by parameter, and how far the tool moved.
-
-    Example: elastocal compare cell.toml january.json june.json --report changes.html
-
-    Args:
-        cell: Cell file (TOML) of both.
-        old: Result of identify (JSON), the earlier one.
-        new: Result of identify (JSON), the later one.
-        cell_of_old: Cell file of both, in the old order OLD NEW.
-        load: Force in N at the load point (tracker's axes); default: the measured loads.
-        level: Probability of any finding if nothing has changed.
-        poses: Random poses.
-    """
-    from elastocal.diagnosis.changes import compare as compared
-    from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.renderers import print_report, write_page
-    from elastocal.saving import save_published
-
-    if old_order := new is None:
-        cell, old, new = _in_old_order(cell, old, cell_of_old)
-    run.writes((output, ".json"), (report, PAGES))
-    inputs = run.reads(cell, old, new)
-    with run.progress() as progress:
-        progress("reading")
-        arms = [read_calibrated(cell, path, run.plugins) for path in (old, new)]
-        if old_order:
-            complain(f"the cell comes first now: elastocal compare {cell} {old} {new}")
-        run.reads(cell=arms[0].model.cell)
-        progress("comparing")
-        found = compared(*arms, load=load, level=level, poses=poses, seed=seed)
-    run.write(
-        (output, partial(save_published, found)),
-        (report, lambda path: write_page(found, path, inputs, repeated(), seed)),
-    )
-    run.answer(found.to_json, lambda screen: print_report(screen, found))
-
-
-def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
-    """Cell and both results where the cell does not come first, as it once did not."""
-    if old.suffix.lower() == ".toml":
-        raise InputError(
-            f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
-        )
-    known = old.parent / "cell.toml" if cell is None else cell
-    if cell is None and not known.is_file():
-        raise InputError(
-            f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL "
-            f"{old} {new}"
-        )
-    return known, old, new
-
-
 # compensate and export: what a result is for.
 
 
@@ -497,6 +427,76 @@ def export(
     )
 
 
+# compare: what has changed since the last calibration.
+
+
+@command(short_help="What has changed since the last calibration?")
+def compare(
+    cell: Path,
+    old: Path,
+    new: Annotated[Path | None, typer.Argument()] = None,
+    cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
+    output: JsonFile = None,
+    report: ReportFile = None,
+    load: FORCE | None = None,
+    level: float = 0.05,
+    poses: Annotated[int, typer.Option(min=2, max=100_000)] = 300,
+    seed: Seed = 0,
+    *,
+    run: Run,
+) -> None:
+    """What has changed between two calibrations: by parameter, and how far the tool moved.
+
+    Example: elastocal compare cell.toml january.json june.json --report changes.html
+
+    Args:
+        cell: Cell file (TOML) of both.
+        old: Result of identify (JSON), the earlier one.
+        new: Result of identify (JSON), the later one.
+        cell_of_old: Cell file of both, in the old order OLD NEW.
+        load: Force in N at the load point (tracker's axes); default: the measured loads.
+        level: Probability of any finding if nothing has changed.
+        poses: Random poses.
+    """
+    from elastocal.diagnosis.changes import compare as compared
+    from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.renderers import print_report, write_page
+    from elastocal.saving import save_published
+
+    if old_order := new is None:
+        cell, old, new = _in_old_order(cell, old, cell_of_old)
+    run.writes((output, ".json"), (report, PAGES))
+    inputs = run.reads(cell, old, new)
+    with run.progress() as progress:
+        progress("reading")
+        arms = [read_calibrated(cell, path, run.plugins) for path in (old, new)]
+        if old_order:
+            complain(f"the cell comes first now: elastocal compare {cell} {old} {new}")
+        run.reads(cell=arms[0].model.cell)
+        progress("comparing")
+        found = compared(*arms, load=load, level=level, poses=poses, seed=seed)
+    run.write(
+        (output, partial(save_published, found)),
+        (report, lambda path: write_page(found, path, inputs, repeated(), seed)),
+    )
+    run.answer(found.to_json, lambda screen: print_report(screen, found))
+
+
+def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
+    """Cell and both results where the cell does not come first, as it once did not."""
+    if old.suffix.lower() == ".toml":
+        raise InputError(
+            f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
+        )
+    known = old.parent / "cell.toml" if cell is None else cell
+    if cell is None and not known.is_file():
+        raise InputError(
+            f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL "
+            f"{old} {new}"
+        )
+    return known, old, new
+
+
 # study: a scripted study, on the local cores or on a Dask cluster.
 
 EVERY = 10.0  # s between plain lines of progress
@@ -606,3 +606,42 @@ def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
         tell(text + (f", {failed} failed" if failed else ""))
 
     return show
+
+
+# demo: the example.
+
+
+@command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
+def demo(
+    folder: Output = Path("demo_out"),
+    seed: Seed = 2013,
+    *,
+    run: Run,
+) -> None:
+    """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
+
+    Example: elastocal demo -o demo_out
+
+    Args:
+        folder: Folder for the example's files, data, result and report.
+    """
+    from elastocal.demo.example import run_demo
+    from elastocal.files import together
+    from elastocal.report.renderers import print_report, write_page
+
+    result, report = folder / "result.json", folder / "report.html"
+    with run.progress() as progress:
+        done = run_demo(folder, seed, progress)
+        inputs = [done.cell, done.plan, done.data]
+        with together():
+            done.result.save(result)
+            write_page(done.result, report, inputs, repeated(), seed, truth=done.truth,
+                       published=done.published)  # fmt: skip
+    if run.answer(
+        lambda: done.result.to_json() | {"truth": done.truth},
+        lambda screen: print_report(screen, done.result, details=False, truth=done.truth),
+    ):
+        say(
+            f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
+            f"Report to open: {report.absolute()}"
+        )
