@@ -8,7 +8,7 @@ import pytest
 import statsmodels.api as sm
 from scipy import integrate, stats
 
-from elastocal.identification.outliers import HUBER, L1, covariance_of, huber, majority
+from elastocal.identification.outliers import HUBER, L1, HuberFit, majority
 
 
 @pytest.mark.parametrize("size", range(1, 7))
@@ -35,10 +35,10 @@ def test_estimate_scale_and_covariance_are_those_of_statsmodels():
     y = B @ (rng.normal(size=4) / unit) + 0.1 * rng.standard_t(2.5, size=120)
     theirs = sm.RLM(y, B / unit, M=sm.robust.norms.HuberT(1.345))
     reference = theirs.fit(cov="H1", tol=1e-13, maxiter=2000)
-    found = huber(B, y, 1, c=1.345)
+    found = HuberFit(B, y, 1, c=1.345)
     np.testing.assert_allclose(found.x * unit, reference.params, rtol=1e-8)
     assert found.scale == pytest.approx(reference.scale, rel=1e-8)
-    scaled = covariance_of(found).matrix * np.outer(unit, unit)
+    scaled = found.covariance().matrix * np.outer(unit, unit)
     np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
 
 
@@ -51,7 +51,7 @@ def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
     lengths = [cp.norm(y[k : k + size] - B[k : k + size] @ x) for k in range(0, len(y), size)]
     problem = cp.Problem(cp.Minimize(cp.sum(cp.hstack(lengths))))
     problem.solve(solver=cp.CLARABEL)
-    found = huber(B, y, size, L1)
+    found = HuberFit(B, y, size, L1)
     total = np.linalg.norm(found.residual.reshape(-1, size), axis=1).sum()
     assert total <= problem.value * (1 + 1e-6)
     np.testing.assert_allclose(found.x, x.value, atol=1e-4)

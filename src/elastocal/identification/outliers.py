@@ -65,7 +65,7 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
     some = np.arange(n) if n <= ENOUGH else rng.choice(n, ENOUGH, replace=False)
     near, own, m, few = B[some], e[some], len(some), min(-(-p // size) + 1, len(some))
     products = near.transpose(0, 2, 1) @ np.concatenate([near, own[..., None]], axis=2)
-    products, flat = products.reshape(m, p * (p + 1)), B.reshape(n * size, p)
+    products = products.reshape(m, p * (p + 1))
 
     def squares(weight: Array, variance: Array) -> Array:
         """Squared lengths (starts, m) beside the fits with these weights (starts, m)."""
@@ -73,12 +73,6 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
         summed[:, np.arange(p), np.arange(p)] += variance[:, None]
         z = np.linalg.solve(summed[..., :p], summed[..., p:])[..., 0]
         return np.asarray(((own[..., None] - near @ z.T) ** 2).sum(axis=1).T)
-
-    def of_all(weight: Array, variance: float) -> Array:
-        """The same (n,) of all observations, with weights (n,)."""
-        weighted = flat * np.repeat(weight, size)[:, None]
-        z = np.linalg.solve(weighted.T @ flat + variance * np.eye(p), weighted.T @ e.ravel())
-        return np.asarray(((e - B @ z) ** 2).sum(axis=1))
 
     starts = int(np.clip(MOST_NUMBERS / (m * p * p + 1), FINALISTS, STARTS))
     subsets = rng.random((starts, m)).argpartition(few - 1, axis=1)[:, :few]
@@ -94,19 +88,17 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
             q, variance, cost, nearest = q[best], variance[best], cost[best], nearest[best]
         weight = (q <= nearest.max(axis=1)[:, None]).astype(float)
     k = int(np.argmin(cost))
-    s2, told = float(variance[k]), np.zeros(n)
-    told[some] = weight[k]
-    squared = of_all(told, s2)
+    s2, good = float(variance[k]), np.isin(np.arange(n), some[weight[k] > 0])
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
     limit = special.chdtri(size, INSIDE)
     cut = special.chdtr(size + 2, limit) / (1 - INSIDE)
-    good = squared <= limit * s2
-    for _ in range(MOST_SWEEPS):
-        squared = of_all(good.astype(float), s2)
-        rows = size * int(good.sum())
-        s2 = max(float(squared[good].sum()) / (cut * max(rows - p, rows / 2)), TINY)
+    for sweep in range(1 + MOST_SWEEPS):
+        squared = (FitToGood(B, e, good, s2).e ** 2).sum(axis=1)
+        if sweep:
+            rows = size * int(good.sum())
+            s2 = max(float(squared[good].sum()) / (cut * max(rows - p, rows / 2)), TINY)
         updated = squared <= limit * s2
-        if np.array_equal(updated, good) or updated.sum() <= n // 2:
+        if sweep and (np.array_equal(updated, good) or updated.sum() <= n // 2):
             break
         good = updated
     far = squared > special.chdtri(size, FALSE_ALARM / n) * s2
@@ -126,13 +118,9 @@ class Outlier:
 
 def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
     """Runs of faulty lines, (first, last), bridging gaps of up to `gap` lines."""
-    runs: list[tuple[int, int]] = []
-    for line in sorted(lines):
-        if runs and line - runs[-1][1] <= gap:
-            runs[-1] = (runs[-1][0], line)
-        else:
-            runs.append((line, line))
-    return runs
+    ordered = np.sort(np.array(lines, dtype=np.int64))
+    runs = np.split(ordered, np.flatnonzero(np.diff(ordered) > gap) + 1)
+    return [(int(run[0]), int(run[-1])) for run in runs if len(run)]
 
 
 def named_runs(lines: list[int]) -> list[str]:
@@ -154,8 +142,8 @@ class FitToGood:
     """
 
     def __init__(self, B: Array, y: Array, good: BoolArray, variance: float) -> None:
-        p, self.good = B.shape[2], good
-        rows = np.vstack([B[good].reshape(-1, p), np.sqrt(variance) * np.eye(p)])
+        self.good = good
+        rows = np.vstack([*B[good], np.sqrt(variance) * np.eye(B.shape[2])])
         self.R = np.asarray(np.linalg.qr(rows, mode="r"))
         self.T = self.coordinates(B)
         fitted = np.einsum("nij,ni->j", self.T[good], y[good])
@@ -170,8 +158,8 @@ class FitToGood:
 
     def coordinates(self, B: Array) -> Array:
         """T of further observations."""
-        flat = B.reshape(-1, B.shape[2])
-        return np.asarray(linalg.solve_triangular(self.R, flat.T, trans="T").T).reshape(B.shape)
+        flat = np.concatenate(B).T
+        return np.asarray(linalg.solve_triangular(self.R, flat, trans="T").T).reshape(B.shape)
 
     def p_values(self, T: Array, e: Array, good: BoolArray) -> Array:
         """p-value (n,) of each error e (n, size), as if its observation had been left out of the
@@ -193,28 +181,29 @@ class FitToGood:
 
 ROUNDS = 12
 Found = TypeVar("Found")
+# A fit, the observations (n,) it is of, and their `better_half`.
+Stand = tuple[Found, BoolArray, tuple[float, float]]
 
 
-class BetterHalf:
-    """How well a fit explains the half of all observations that lies nearest: their mean square,
-    over the degrees of freedom of a fit to so many."""
+def better_half(squared: Array, dof: float, good: BoolArray) -> tuple[float, float]:
+    """Mean square of the half of all observations that lies nearest, and the degrees of freedom of
+    a fit to so many."""
+    half = len(squared) // 2 + 1
+    own = max(dof, 1.0) * half / max(int(good.sum()), 1)
+    return float(np.partition(squared, half - 1)[:half].sum()) / own, own
 
-    def __init__(self, squared: Array, dof: float, good: BoolArray) -> None:
-        half = len(squared) // 2 + 1
-        self.dof = max(dof, 1.0) * half / max(int(good.sum()), 1)
-        self.variance = float(np.partition(squared, half - 1)[:half].sum()) / self.dof
 
-    def explains_more(self, other: BetterHalf) -> bool:
-        """Beyond what chance allows."""
-        limit = special.fdtri(other.dof, self.dof, 1 - FALSE_ALARM)
-        return bool(other.variance > limit * self.variance)
+def explains_more(one: Stand, other: Stand) -> bool:
+    """Whether its better half is nearer than the other's, beyond what chance allows."""
+    (variance, dof), (larger, others) = one[2], other[2]
+    return bool(larger > special.fdtri(others, dof, 1 - FALSE_ALARM) * variance)
 
 
 def until_it_stands(
     good: BoolArray,
     fitted: Callable[[BoolArray], Found],
     judged: Callable[[Found, BoolArray], tuple[Array, float, BoolArray]],
-) -> tuple[Found, BoolArray, BetterHalf]:
+) -> Stand[Found]:
     """Fit and good observations (n,) that agree with each other, starting from `good`.
 
     `fitted` fits to the good ones and `judged` gives squared errors (n,) beside a fit, its degrees
@@ -227,7 +216,7 @@ def until_it_stands(
     Raises ElastocalError where the first fit fails.
     """
     ended = False
-    visited: list[tuple[Found, BoolArray, BetterHalf]] = []
+    visited: list[Stand[Found]] = []
     for _ in range(ROUNDS):
         try:
             found = fitted(good)
@@ -236,15 +225,15 @@ def until_it_stands(
                 raise
             break  # so few cannot judge the others
         squared, dof, agrees = judged(found, good)
-        visited.append((found, good, BetterHalf(squared, dof, good)))
+        visited.append((found, good, better_half(squared, dof, good)))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]
         again = next((k for k, mask in enumerate(masks) if np.array_equal(mask, agrees)), None)
         ended = again is not None
         good = np.logical_or.reduce(masks[again:]) if ended else agrees
-    last, best = visited[-1], min(visited, key=lambda one: one[2].variance)
-    return best if best[2].explains_more(last[2]) else last
+    last, best = visited[-1], min(visited, key=lambda one: one[2][0])
+    return best if explains_more(best, last) else last
 
 
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
@@ -274,7 +263,7 @@ def find_faulty(solution: Solution) -> BoolArray:
     rows = B.reshape(-1, B.shape[2])
     if len(rows) >= 4 * np.linalg.matrix_rank(rows / np.maximum(np.abs(rows).max(axis=0), TINY)):
         starts.append(majority(B, y))
-    good, variance = starts[0]
+    variance = starts[0][1]
 
     def fitted(good: BoolArray) -> FitToGood:
         nonlocal B, y, variance
@@ -294,8 +283,8 @@ def find_faulty(solution: Solution) -> BoolArray:
         return (fit.e**2).sum(axis=1), fit.dof, agrees
 
     ends = []
-    for start in starts:
-        good, variance = start
+    for good, at_first in starts:
+        variance = at_first
         with suppress(ElastocalError):  # so far out the arm has no equilibrium
             ends.append(until_it_stands(good, fitted, judged))
     faulty = np.zeros(n, dtype=bool)
@@ -303,7 +292,7 @@ def find_faulty(solution: Solution) -> BoolArray:
         return faulty
     # What all parameters say against so many is noise that readings share, or a missing effect.
     last = ends[-1] if (~ends[-1][1]).mean() <= FEW else ends[0]
-    fit, good, _ = last if last[2].explains_more(ends[0][2]) else ends[0]
+    fit, good, _ = last if explains_more(last, ends[0]) else ends[0]
     faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
@@ -352,20 +341,14 @@ def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[O
     if not faulty.any():
         return ()
     observed, error = solution.problem.observations, solution.problem.residual(fitted.fit.x)
-    length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
-    squared = (solution.problem.weights.apply(error).reshape(-1, observed.size) ** 2).sum(axis=1)
-    sigma = median_scale(np.sqrt(squared[~faulty]), observed.size)
-    table = observed.table
-    return tuple(
-        Outlier(
-            int(table.row[observed.lead[k]]),
-            table.configuration_labels[table.configuration[observed.lead[k]]],
-            table.marker_names[table.marker[observed.lead[k]]],
-            float(length[k]),
-            float(np.sqrt(squared[k]) / sigma),
-        )
-        for k in np.flatnonzero(faulty)
-    )
+    table, lead, size = observed.table, observed.lead[faulty], observed.size
+    length = np.linalg.norm(error.reshape(-1, size)[faulty, :3], axis=1)
+    off = np.linalg.norm(solution.problem.weights.apply(error).reshape(-1, size), axis=1)
+    ratio = off[faulty] / median_scale(off[~faulty], size)
+    labels = (table.configuration_labels[c] for c in table.configuration[lead])
+    markers = (table.marker_names[m] for m in table.marker[lead])
+    lines = table.row[lead].tolist()
+    return tuple(map(Outlier, lines, labels, markers, length.tolist(), ratio.tolist()))
 
 
 def rejection_point(values: int, dof: ArrayLike = np.inf, level: float = FALSE_ALARM) -> Array:
@@ -523,42 +506,60 @@ def settle(
 #     huber   c of 95 % efficiency
 #     l1      c near 0, the least sum of Euclidean lengths
 #
-# The weights solve Σ B_iᵀ Ψ(e_i/σ) = 0, Ψ(r) = ψ(|r|) r/|r|; they are no inverse variances.
-
-# c of Huber's loss by the rows of an observation, 1 to 6: 95 % efficient.  Under normal noise d
-# follows χ(size), and with J = ∂Ψ/∂r symmetry gives E J = a·I and E ΨΨᵀ = b·I,
+# The weights ψ/d solve Σ B_iᵀ Ψ(e_i/σ) = 0, Ψ(r) = ψ(|r|) r/|r|.  They are no inverse variances: a
+# weight is small because that residual came out large, not because its variance was known to be.
+# The covariance follows from ψ and ψ′.  The derivative J = ∂Ψ/∂r has the eigenvalue ψ′ along the
+# error and ψ/d across it (size − 1 times); for errors that are symmetric in direction E J = a I and
+# E ΨΨᵀ = b I, and expanding the sum gives
 #
-#     a = E[ψ′/size + (1 − 1/size) ψ(d)/d],    b = E ψ²/size,    efficiency a²/b
+#     a = E[ψ′ + (size − 1) ψ/d]/size,    b = E ψ²/size,
+#     x̂ − x ≈ (BᵀB)⁻¹ Bᵀ (σ/a) Ψ,         cov x̂ = σ² (b/a²) (BᵀB)⁻¹
 #
-# (Huber 1981, section 7.6, for size 1; Maronna 1976 for vectors), found by quadrature.
+# (Huber 1981, sections 7.6 and 7.10, per row; Maronna 1976 for vectors): that of least squares
+# whose residuals are (σ/a) Ψ.  Under normal noise d follows χ(size), and the efficiency is a²/b.
 
+# c by the rows of an observation, 1 to 6: 95 % efficient under normal noise, by quadrature.
 HUBER = (1.344997509, 1.501141084, 1.627987920, 1.731072513, 1.812018420, 1.869337729)
 L1 = 1e-4  # far below any standard deviation
 TOLERANCE = 1e-11  # of the step |B δx| in units of the scale
 MAX_ITER = 5000
 
 
-@dataclass(frozen=True)
-class RobustEstimate:
-    """x = V z (p,) of y (rows,) ≈ B x, B x = Q z with orthonormal Q, so that the parameters' units
-    do not matter; residual (rows,), scale σ, and c of the loss."""
+class HuberFit:
+    """M-estimate x = V z (p,) of y (n·size,) ≈ B x, from least squares on, `scale` σ the MAD about
+    zero of every residual anew (Huber 1981, section 7.8), no less than rounding of y lets it be; c
+    by default of 95 % efficiency.
 
-    Q: Array
-    V: Array
-    residual: Array
-    size: int
-    c: float
-    z: Array
-    scale: float
+    B x = Q z with orthonormal Q, so that the parameters' units do not matter.  It has one solution,
+    and resists errors in y but not at leverage points.  `distance` (n,) is |e_i|/σ.
+    """
+
+    def __init__(self, B: Array, y: Array, size: int, c: float | None = None) -> None:
+        self.size, self.c = size, HUBER[size - 1] if c is None else c
+        self.Q, self.V = Q, _ = orthogonal(B)
+        self.z = step = Q.T @ y
+        self.scale, eps = np.inf, float(np.finfo(float).eps)
+        floor = eps * float(np.sqrt(np.mean(y**2))) + TINY
+        for _ in range(MAX_ITER):
+            self.residual, before = y - Q @ self.z, self.scale
+            length = np.linalg.norm(self.residual.reshape(-1, size), axis=1)
+            self.scale = max(median_scale(length, size), floor)
+            self.distance, still = length / self.scale, TOLERANCE * self.scale
+            # Or there are no more digits in z.
+            ended = np.linalg.norm(step) <= max(still, 4 * eps * float(np.linalg.norm(self.z)))
+            if ended and abs(self.scale - before) <= still:
+                break
+            weighted = Q.T * np.repeat(self.weights(self.c), size)
+            step = linalg.solve(weighted @ Q, weighted @ self.residual, assume_a="pos")
+            self.z = self.z + step
 
     @property
     def x(self) -> Array:
         return self.V @ self.z
 
-    @property
-    def distance(self) -> Array:
-        """|e_i|/σ (n,)."""
-        return np.linalg.norm(self.residual.reshape(-1, self.size), axis=1) / self.scale
+    def weights(self, c: float) -> Array:
+        """ψ(d)/d (n,)."""
+        return c / np.maximum(self.distance, c)
 
     @property
     def smooth_c(self) -> float:
@@ -572,83 +573,35 @@ class RobustEstimate:
         h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3) * (1.5 / (2 * np.pi)) ** (1 / 3)
         return max(self.c, float(np.quantile(kept, min(2 * h, 0.98)))) if self.c == L1 else self.c
 
-    def weights(self, c: float) -> Array:
-        """ψ(d)/d (n,)."""
-        return c / np.maximum(self.distance, c)
+    def covariance(self, cluster: IntArray | None = None) -> Covariance:
+        """Covariance (p, p) of x̂.
 
+        Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
+        small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less p
+        as dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of
+        (σ/a) Ψ.
 
-def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstimate:
-    """M-estimate of y (n·size,) ≈ B x, from least squares on, σ the MAD about zero of every
-    residual anew (Huber 1981, section 7.8), no less than rounding of y lets it be; by default of
-    95 % efficiency.
-
-    It has one solution, and resists errors in y but not at leverage points.
-    """
-    (Q, V), c = orthogonal(B), HUBER[size - 1] if c is None else c
-    eps = np.finfo(float).eps
-    floor = float(eps * np.sqrt(np.mean(y**2)) + TINY)
-
-    def at(z: Array) -> RobustEstimate:
-        r = y - Q @ z
-        scale = median_scale(np.linalg.norm(r.reshape(-1, size), axis=1), size)
-        return RobustEstimate(Q, V, r, size, c, z, max(scale, floor))
-
-    found = at(Q.T @ y)
-    for _ in range(MAX_ITER):
-        weighted, before = Q.T * np.repeat(found.weights(c), size), found.scale
-        step = linalg.solve(weighted @ Q, weighted @ found.residual, assume_a="pos")
-        found, moved = at(found.z + step), float(np.linalg.norm(step))
-        still = moved <= 4 * eps * np.linalg.norm(found.z)  # no more digits in z
-        same = abs(found.scale - before) <= TOLERANCE * found.scale
-        if (moved <= TOLERANCE * found.scale or still) and same:
-            break
-    return found
-
-
-# Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
-#
-# With r_i = e_i/σ and u = r/|r| the derivative of an observation's score is
-#
-#     J_i = ∂Ψ/∂r = ψ′(d_i) u uᵀ + (ψ(d_i)/d_i)(I − u uᵀ),      d_i = |r_i|,
-#
-# eigenvalue ψ′ along the error and ψ/d across it (size − 1 times; for size 1 only ψ′).  For errors
-# that are symmetric in direction E J = a I, E ΨΨᵀ = b I, and expanding Σ B_iᵀ Ψ(e_i/σ) = 0 gives
-#
-#     x̂ − x ≈ (BᵀB)⁻¹ Bᵀ (σ/a) Ψ,    cov x̂ = σ² (b/a²) (BᵀB)⁻¹
-#
-# (Huber 1981, sections 7.6 and 7.10, per row; Maronna 1976): that of least squares whose residuals
-# are (σ/a) Ψ.  The weights ψ/d as inverse variances would be wrong: a weight is small because that
-# residual came out large, not because its variance was known to be.
-
-
-def covariance_of(found: RobustEstimate, cluster: IntArray | None = None) -> Covariance:
-    """Covariance (p, p) of x̂ of y ≈ B x.
-
-    Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
-    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less p as
-    dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of (σ/a) Ψ.
-
-    Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster alone
-    determines a combination of the parameters.
-    """
-    rows, p, size, d = len(found.residual), len(found.z), found.size, found.distance
-    c = found.smooth_c
-    along, across, psi = (d <= c).astype(float), found.weights(c), np.minimum(d, c)
-    a = float(np.mean(along + (size - 1) * across)) / size
-    if not a > 0:
-        raise InsufficientDataError(
-            "so many readings lie far from the fit that its covariance cannot be determined; use "
-            "the default method, or look for the cause of the outliers"
-        )
-    if cluster is not None:
-        pseudo = np.repeat(across, size) * found.residual / a
-        return clustered([(found.Q, pseudo, np.repeat(cluster, size))], found.V, "CR3")
-    square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
-    k = 1 + p / rows * (square - a**2) / a**2
-    variance = (k * found.scale / a) ** 2 * float(psi @ psi) / (rows - p)
-    name = "l1" if found.c == L1 else "huber"
-    text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
-    return Covariance("H1", variance * found.V @ found.V.T, np.full(p, float(rows - p)), text)
+        Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster
+        alone determines a combination of the parameters.
+        """
+        rows, p, size, c = len(self.residual), len(self.z), self.size, self.smooth_c
+        d, across = self.distance, self.weights(c)
+        along, psi = (d <= c).astype(float), np.minimum(d, c)
+        a = float(np.mean(along + (size - 1) * across)) / size
+        if not a > 0:
+            raise InsufficientDataError(
+                "so many readings lie far from the fit that its covariance cannot be determined; "
+                "use the default method, or look for the cause of the outliers"
+            )
+        if cluster is not None:
+            pseudo = np.repeat(across, size) * self.residual / a
+            return clustered([(self.Q, pseudo, np.repeat(cluster, size))], self.V, "CR3")
+        square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
+        k = 1 + p / rows * (square - a**2) / a**2
+        variance = (k * self.scale / a) ** 2 * float(psi @ psi) / (rows - p)
+        name = "l1" if self.c == L1 else "huber"
+        text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
+        return Covariance("H1", variance * self.V @ self.V.T, np.full(p, float(rows - p)), text)
 
 
 # Robust fit of the nonlinear model: linear robust steps on the exact B.
@@ -686,7 +639,7 @@ def robust_result(
     while True:
         at = problem.model.regressor(observed.table, x, kept, observed)
         c = None if method == "huber" else L1
-        found = huber(weights.apply(at.B), weights.apply(at.residual), observed.size, c)
+        found = HuberFit(weights.apply(at.B), weights.apply(at.residual), observed.size, c)
         converged = bool(np.linalg.norm(found.z) <= STILL * found.scale * np.sqrt(len(kept)))
         if converged or steps == MOST_MOVES:
             break
@@ -699,13 +652,12 @@ def robust_result(
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
     root = np.sqrt(np.repeat(np.minimum(found.weights(found.c), 1e6), observed.size))
-    whiten = sparse.csr_array(sparse.diags_array(root))
-    if weights.whiten is not None:
-        whiten = sparse.csr_array(whiten @ weights.whiten)
+    own = sparse.eye_array(len(root)) if weights.whiten is None else weights.whiten
+    whiten = sparse.csr_array(sparse.diags_array(root) @ own)
     heldout = held_out_residual(
         fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
     )
     solution = replace(sound, fit=fit)
     solution = replace(solution, held=(heldout, solution.crossed[1]))
     cluster = None if intervals == "auto" else observed.configuration
-    return MethodResult(method, solution, covariance_of(found, cluster), None, good)
+    return MethodResult(method, solution, found.covariance(cluster), None, good)
