@@ -678,7 +678,7 @@ class Calibration(scrutiny.FoundFit, Result):
             "load_point_um": microns(self.load_point_error),
             "measured_visits": measured_visits(observed).to_json(),
             "measured_poses": _json(self.shown),
-            "open": _json(self.left),
+            "open": self.left,
             "noise": self.noise.to_json(),
             "tails": None,
             "cell_noise": {

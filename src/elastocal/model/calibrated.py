@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict, PlainValidator
+from pydantic import PlainValidator
 from pydantic_core import PydanticCustomError
 
 from elastocal.above import Saved, checked_arguments
@@ -75,13 +75,6 @@ class OpenParameters:
     mixing: Matrix = keyed("shares, a row for each parameter of covariance_of", required=True)
     typical: Matrix = keyed("a number for each of its names", required=True)
     redundant: Many[str] = keyed("a list of names", default=())
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON-ready; numbers in SI units."""
-        return {
-            "names": list(self.names), "typical": self.typical.tolist(),
-            "mixing": self.mixing.tolist(), "redundant": list(self.redundant),
-        }  # fmt: skip
 
 
 @record
@@ -323,20 +316,17 @@ def read_calibrated(
 NONE = np.zeros(0)
 
 
-class _Stated(Table):
-    """What a reader needs of a table in the result; more may stand beside it."""
-
-    model_config = Table.model_config | ConfigDict(extra="ignore")
+# What a reader needs of the result; more may stand beside it.
 
 
-class _Entry(_Stated):
+class _Entry(Table, extra="ignore"):
     name: str = key("a name", ...)
     held: float = key("a number", ...)
     dof: float | None = key("a number")
     combined_with: list[str] | None = key("a list of names")
 
 
-class _Result(_Stated):
+class _Result(Table, extra="ignore"):
     parameters: list[_Entry] = key("a list of parameters", ...)
     nominal_flange: Annotated[Array, _array(4)] | None = key("3 rows of 4 numbers")
     covariance_of: list[str] = key("a list of names", [])
@@ -441,8 +431,7 @@ def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[st
 
 
 def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
-    cell = calibrated.model.cell
-    spec = cell.model
+    spec = calibrated.model.cell.model
     spec = replace(
         spec,
         effects=tuple(choice for choice in spec.effects if choice.name in names),
@@ -450,7 +439,7 @@ def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
         observe="position",
         torque="computed",
     )
-    model = Model.assembled(calibrated.model.chain, replace(cell, model=spec))
+    model = calibrated.model.specified(spec)
     return Valued(model, calibrated.x_of(model))
 
 

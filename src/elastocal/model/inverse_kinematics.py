@@ -162,10 +162,7 @@ def _in_null_space(J: Array, v: Array) -> Array:
     return np.asarray(v - (np.linalg.pinv(J, rcond=1e-6) @ (J @ v[..., None]))[..., 0])
 
 
-# Inverse kinematics: joints that bring a point of the flange to its target.
-#
-# From many starts over the joint ranges (scrambled Sobol points) to the minima of the error; all
-# targets and starts are one batch, with derivatives from CasADi.
+# From many starts over the joint ranges (scrambled Sobol points), with all targets as one batch.
 
 ROUNDS = (1, 1, 2, 4)  # starts per posture told; the later ones for targets missed by the first
 PULLED = 4  # of them, how many are moved within their null space
@@ -211,9 +208,8 @@ def inverse_kinematics(
     `limits`: lower and upper (n,) rad or m, infinite where there is none; `rotation` (3, 3) or
     (T, 3, 3) of the flange in the data frame, None for any; `point` (3,) m in the flange frame;
     `near` (n,): the posture to stay near, by default the middle of the ranges; `postures`: K, a
-    power of two.  Where joints or
-    the free rotation leave a choice, the first posture is moved to the nearest one; the others
-    stand where the solver met them, so that there is a choice.
+    power of two.  Where joints or the free rotation leave a choice, the first posture is moved to
+    the nearest one; the others stand where the solver met them, so that there is a choice.
     """
     from scipy.stats import qmc  # slow to import, seldom asked for
 

@@ -256,9 +256,10 @@ class Model(ByValue):
 
     def with_effects(self, effects: tuple[EffectChoice, ...]) -> Model:
         """The same arm with another choice of effects."""
-        return self._with(replace(self.cell.model, effects=effects))
+        return self.specified(replace(self.cell.model, effects=effects))
 
-    def _with(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
+    def specified(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
+        """The same arm with all of another [model]."""
         cell = replace(self.cell, model=spec)
         return Model.assembled(self.chain, cell, extra, self._symbolic.backend)
 
@@ -268,7 +269,7 @@ class Model(ByValue):
         spec = self.cell.model
         nominal = replace(spec.nominal, base_position=None, base_rotation=None)
         spec = replace(spec, effects=(), observe="position", nominal=nominal, link_gravity=False)
-        return self._with(spec)
+        return self.specified(spec)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -323,7 +324,7 @@ class Model(ByValue):
         observe = "position" if spec.observe == "deflection" else spec.observe
         spec = replace(spec, effects=placed, observe=observe, link_gravity=False)
         motion = JointMotion()
-        return self._with(spec, [(motion, w) for w in motion.places(self.chain, self.cell)])
+        return self.specified(spec, [(motion, w) for w in motion.places(self.chain, self.cell)])
 
     @checked_arguments
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:

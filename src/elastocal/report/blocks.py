@@ -104,7 +104,7 @@ class ShownTable:
 
 @dataclass(frozen=True)
 class Figure:
-    """What `draw` puts on matplotlib's figure of `width` by `height` inches.
+    """What `draw` puts on matplotlib's figure, `height` inches high.
 
     `name` is what `plot` calls it, `title` says what it shows to those who cannot see it.  With a
     `space` (arm_view.Space) it is the arm, which a page lets be turned.
@@ -115,7 +115,6 @@ class Figure:
     draw: Callable[[Any], None]
     height: float
     caption: str = ""
-    width: float = 5.6
     space: Any = None
 
 
@@ -199,29 +198,20 @@ def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
     return *with_uncertainty(shown, display(half, unit)[0]), text
 
 
-def with_ends(value: float, low: float, high: float) -> tuple[str, str]:
-    """Value and interval with the digits that `resolution` allows: "0.000", "[0.000, 0.013]"."""
-    size = resolution(value, low, high)
-    ends = ("∞" if v == math.inf else "-∞" if v == -math.inf else rounded_alike(v, size)
-            for v in (low, high))  # fmt: skip
-    return rounded_alike(value, size), f"[{', '.join(ends)}]"
+def with_ends(value: float, low: float, high: float) -> tuple[str, str, float]:
+    """Value, interval and the half width whose digits both have: "0.000", "[0.000, 0.013]", 0.015.
 
-
-def resolution(value: float, low: float, high: float) -> float:
-    """The half width whose digits a lopsided interval is shown with, 0 where both ends are open.
-
-    Its shorter side gets two digits, unless that is empty, without an end, or below a tenth of
-    the longer.
+    The interval's shorter side gets two digits, unless that is empty, without an end, or below a
+    tenth of the longer; the half width is 0 where both ends are open.
     """
-    sides = [side for side in (value - low, high - value) if 0 < side < math.inf]
-    if not sides:
-        return 0.0
-    return 1.5 * 10.0 ** math.floor(math.log10(max(min(sides), max(sides) / 10)))
-
-
-def rounded_alike(value: float, half: float) -> str:
-    """`value` with the digits that `half` allows: a true value beside its estimate."""
-    return with_uncertainty(value, half)[0]
+    sides, half = [side for side in (value - low, high - value) if 0 < side < math.inf], 0.0
+    if sides:
+        half = 1.5 * 10.0 ** math.floor(math.log10(max(min(sides), max(sides) / 10)))
+    shown, *ends = (
+        "∞" if v == math.inf else "-∞" if v == -math.inf else with_uncertainty(v, half)[0]
+        for v in (value, low, high)
+    )
+    return shown, f"[{', '.join(ends)}]", half
 
 
 def plain(value: float) -> str:
@@ -306,9 +296,7 @@ def sentence(text: str) -> str:
 MOST_FAULTY = 100  # rows of the table of outliers
 
 
-def outlier_blocks(
-    title: str, found: Sequence[tuple[Any, float, float]]
-) -> list[ShownTable | Sentence]:
+def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> list[Block]:
     """Readings beyond the noise: each with its line and names, its error in m, and that over the
     noise."""
     rows = [
@@ -318,8 +306,8 @@ def outlier_blocks(
     ]  # fmt: skip
     heads = ("line", "configuration", "marker", "error", "error / noise")
     more = len(found) - len(rows)
-    blocks: list[ShownTable | Sentence] = [ShownTable(heads, rows, (1, 2), title=title)]
-    return [*blocks, Sentence(f"and {more} more", soft=True)] if more else blocks
+    left_out = [Sentence(f"and {more} more", soft=True)] if more else []
+    return [ShownTable(heads, rows, (1, 2), title=title), *left_out]
 
 
 # Steps (name, held-out rms in m, its 95 % interval), and name and size of what noise leaves.

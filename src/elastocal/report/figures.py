@@ -84,6 +84,7 @@ _STYLE: dict[str, Any] = {
     "path.simplify": False,
 }
 LAYOUT: Any = "constrained"  # half of what drawing takes
+WIDTH = 5.6  # inches
 
 
 def style() -> AbstractContextManager[None]:
@@ -100,7 +101,7 @@ def figure_of(block: say.Figure, place: SubFigure | None = None) -> Drawing | Su
     from matplotlib.figure import Figure as Drawing
 
     with style():
-        figure: Any = place or Drawing(figsize=(block.width, block.height), layout=LAYOUT)
+        figure: Any = place or Drawing(figsize=(WIDTH, block.height), layout=LAYOUT)
         block.draw(figure)
         # What is made when drawing is made in this style.
         figure.get_figure(root=True).draw_without_rendering()
@@ -111,7 +112,7 @@ def svg(block: say.Figure) -> str:
     from matplotlib.figure import Figure as Drawing
 
     with style():
-        figure = Drawing(figsize=(block.width, block.height), layout=LAYOUT)
+        figure = Drawing(figsize=(WIDTH, block.height), layout=LAYOUT)
         block.draw(figure)
         text = rendered(figure)
     text = text[text.index("<svg") :]
@@ -119,7 +120,7 @@ def svg(block: say.Figure) -> str:
     head = (
         '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" '
         rf'viewBox="\1" role="img" aria-label="{block.title}" '
-        f'style="max-width:{block.width * 96:.0f}px">'
+        f'style="max-width:{WIDTH * 96:.0f}px">'
     )
     text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", head, text, count=1)
     for colour, variable in _VARIABLES.items():
@@ -581,30 +582,27 @@ class Residuals:
 
         Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
         """
-        rows: list[tuple[str, ...]] = []
-
-        def add(name: str, sizes: Array, mean: str, largest: str, unit: str = "µm") -> None:
-            rms = say.significant(float(np.sqrt((sizes**2).mean())))
-            rows.append((name, str(len(sizes)), mean, rms, largest, unit))
-
+        # Names with values (n,) that have a sign, or with vectors (n, components), in their unit.
+        found: list[tuple[str, Array, str]] = [
+            *zip(self.components, self.value.T, self.units, strict=True)
+        ]
         groups = {0: "direction"}
-        for name, unit, value in zip(self.components, self.units, self.value.T, strict=True):
-            largest = float(value[np.argmax(np.abs(value))])
-            add(name, value, say.signed(float(value.mean())), say.signed(largest), unit)
         every = np.ones(len(self.observed.value), dtype=bool)
         for by, code, names in groupings(self.observed, every):
-            if by == "component":
-                continue
-            groups[len(rows)] = by
-            for k, name in enumerate(names[:MOST_CONFIGURATIONS]):
-                own = self.lengths[code[:: self.observed.size] == k]
-                sizes, mean = np.linalg.norm(own, axis=1), float(np.linalg.norm(own.mean(axis=0)))
-                add(
-                    printable(name),
-                    sizes,
-                    say.significant(mean),
-                    say.significant(float(sizes.max())),
-                )
+            if by != "component":
+                groups[len(found)] = by
+                own = code[:: self.observed.size]
+                found += [(printable(name), self.lengths[own == k], "µm")
+                          for k, name in enumerate(names[:MOST_CONFIGURATIONS])]  # fmt: skip
+        rows = []
+        for name, values, unit in found:
+            signed = values.ndim == 1
+            sizes = np.abs(values) if signed else np.linalg.norm(values, axis=1)
+            told = say.signed if signed else say.significant
+            mean = values.mean() if signed else np.linalg.norm(values.mean(axis=0))
+            largest = float(values[sizes.argmax()] if signed else sizes.max())
+            rms = say.significant(float(np.sqrt((sizes**2).mean())))
+            rows.append((name, str(len(sizes)), told(float(mean)), rms, told(largest), unit))
         heads = ("readings of", "number", "mean", "rms", "largest", "unit")
         return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 

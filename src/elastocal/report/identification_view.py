@@ -500,13 +500,13 @@ def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str,
         return "–", "–", say.display(0.0, e.unit)[1], known
     if is_lopsided(e.value, e.ci95):
         shown, low, high = (say.display(number, e.unit)[0] for number in (e.value, *e.ci95))
-        value, half = say.with_ends(shown, low, high)
-        width, unit = say.resolution(shown, low, high), say.display(e.value, e.unit)[1]
+        value, half, width = say.with_ends(shown, low, high)
+        unit = say.display(e.value, e.unit)[1]
     else:
         width = (e.ci95[1] - e.ci95[0]) / 2
         value, half, unit = say.estimate(e.value, width, e.unit)
         width = say.display(width, e.unit)[0]
-    known = "–" if true is None else say.rounded_alike(say.display(true, e.unit)[0], width)
+    known = "–" if true is None else say.with_uncertainty(say.display(true, e.unit)[0], width)[0]
     return value, half, unit, known
 
 
