@@ -235,7 +235,12 @@ def load(sources: Sources) -> ModuleType:
             module = module_from_spec(spec)
             sys.modules[name] = module  # dataclasses and pickle look a class's module up there
             _here = sources.digest, folder, module
-            calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
+            # Nothing is left in the user's folder: no bytecode of its modules.
+            before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+            try:
+                calling(folder, "importing study.py", lambda: spec.loader.exec_module(module))
+            finally:
+                sys.dont_write_bytecode = before
         return _here[2]
 
 

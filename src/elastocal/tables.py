@@ -70,7 +70,7 @@ def csv_lines(
         return InputError(f"{source}, line {number}: {told}")
 
     def says_nothing(line: bytes, blank: bytes) -> bool:
-        bare = line.removeprefix(b"\xef\xbb\xbf").strip(blank + b',;"' * comments)
+        bare = line.removeprefix(b"\xef\xbb\xbf").strip(b' \t\r\n,;"' if comments else blank)
         return not bare or (comments and bare.startswith(b"#"))
 
     def next_line() -> bytes:

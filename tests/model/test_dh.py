@@ -106,6 +106,17 @@ def test_fixed_rows_beta_and_comments(tmp_path: Path, convention) -> None:
     np.testing.assert_allclose(evaluate(chain, q[1:-1]), expected, rtol=0, atol=1e-13)
 
 
+def test_a_tab_separated_table_has_empty_lines_and_comments_too(tmp_path: Path) -> None:
+    rows, _, _ = random_table(3)
+    plain = write(tmp_path / "dh.csv", HEADER, rows)
+    lines = plain.read_text().replace(",", "\t").splitlines()
+    lines[2:2] = ["\t" * (len(rows[0]) - 1), "\t# of the upper arm"]
+    tabs = tmp_path / "tabs.csv"
+    tabs.write_text("\n".join(lines) + "\n")
+    q = np.zeros(len(rows))
+    np.testing.assert_array_equal(evaluate(read_dh(tabs), q), evaluate(read_dh(plain), q))
+
+
 @pytest.mark.parametrize("convention", ["standard", "modified"])
 def test_centres_of_mass_are_given_in_dh_frames(tmp_path: Path, convention) -> None:
     rows, _, _ = random_table(3)

@@ -48,6 +48,7 @@ def test_one_that_raises_is_recorded_with_its_traceback_until_it_is_retried(tmp_
     ending = run_study(folder, results, lambda study: on_processes(study, 2))
     assert (ending.done, ending.failed, ending.complete) == (10, 2, True)
     assert failures(results) == {2: "ArithmeticError: two", 8: "ArithmeticError: two"}
+    assert not list(folder.glob("__pycache__"))  # nothing is left in it
     log = (results / "_failures.log").read_text("utf-8")
     assert log.count('raise ArithmeticError("two")') == 2
     assert 'task 8 {"n": 16, "label": "many", "replicate": 2}' in log
