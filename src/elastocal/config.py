@@ -14,7 +14,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
 from types import UnionType
 from typing import (
@@ -95,9 +95,8 @@ class Key:
     """A key of a file; `takes` completes the sentence 'key … takes …'.
 
     `form`: the type of its value there, None where it is the field's.  `into`: makes the field's
-    value of it, its table and its name; None converts from the unit that the name ends with.  Both
-    may stand in the Annotated of a type instead.  `kind`: the type that is checked, as `fields_of`
-    finds it.
+    value of it, its table and its name; None converts from the unit that the name ends with.
+    `kind`: the type that is checked, as `fields_of` finds it.
     """
 
     name: str = ""
@@ -183,21 +182,19 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
                        of.is_required(), hints[name]),)
             for name, of in cls.model_fields.items()
         }  # fmt: skip
-    found = {}
-    for name, one in cls.__dataclass_fields__.items():
-        how = next((note for note in _notes(hints[name]) if isinstance(note, Key)), None)
-        found[name] = tuple(
+    return {
+        name: tuple(
             replace(
                 known,
                 name=known.name or name,
                 takes=known.takes.replace("{}", UNITS[known.unit][0] if known.unit else "")
                 or _choice(known.form or hints[name]),
-                into=known.into or (how and how.into),
-                kind=known.kind or known.form or (how.form if how else hints[name]),
+                kind=known.kind or known.form or hints[name],
             )
             for known in one.metadata.get("keys", ())
         )
-    return found
+        for name, one in cls.__dataclass_fields__.items()
+    }
 
 
 # Field of a table or record → the keys that state it.
@@ -216,14 +213,6 @@ def _choice(hint: Any) -> str:
             *first, last = (f'"{name}"' for name in get_args(one))
             return f"{', '.join(first)} or {last}"
     return "true or false"
-
-
-def _notes(hint: Any) -> Iterator[Any]:
-    """What stands in the Annotated of a type, or of a member of a union."""
-    yield from getattr(hint, "__metadata__", ())
-    if get_origin(hint) in (Union, UnionType):
-        for member in get_args(hint):
-            yield from _notes(member)
 
 
 def is_table(kind: object) -> bool:
@@ -554,11 +543,6 @@ def direction(vector: Array, spot: Spot, name: str) -> Array:
     return _direction(vector)
 
 
-def _tuple(value: object) -> object:
-    listing = value.tolist() if isinstance(value, np.ndarray) else value
-    return tuple(listing) if isinstance(listing, list) else listing
-
-
 def existing_file(found: str, spot: Spot, name: str) -> Path:
     return check_exists(spot.path.parent / found, spot.key(name), spot.path)
 
@@ -570,15 +554,21 @@ Count = Annotated[int, Field(ge=1, le=10_000_000, description="a whole number >=
 Numbers = Annotated[Array, numbers(), Field(description="a list of numbers")]
 Vector2 = Annotated[Array, numbers(2), Field(description="two numbers")]
 Vector3 = Annotated[Array, numbers(3), Field(description="three numbers")]
-TUPLE = BeforeValidator(_tuple)
+TUPLE = BeforeValidator(
+    lambda v: (
+        tuple(v.tolist() if isinstance(v, np.ndarray) else v)
+        if isinstance(v, list | np.ndarray)
+        else v
+    )
+)
 AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
 AS_PATH = BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
-File = Annotated[Path, AS_PATH, Key(form=Text, into=existing_file)]
-Rotation = Annotated[
-    Array,
-    matrix(3, 3),
-    Key(form=Vector3, into=lambda rpy, *_: rotation_from_rpy(np.radians(rpy))),
-]
+File = Annotated[Path, AS_PATH]
+Rotation = Annotated[Array, matrix(3, 3)]
 Transform = Annotated[Array, matrix(4, 4)]
-Direction = Annotated[Array, PlainValidator(_direction), Key(form=Vector3, into=direction)]
+Direction = Annotated[Array, PlainValidator(_direction)]
+# Fields of these three types, which a file states otherwise.
+file_key = partial(keyed, form=Text, into=existing_file)
+turn_key = partial(keyed, form=Vector3, into=lambda v, *_: rotation_from_rpy(np.radians(v)))
+direction_key = partial(keyed, form=Vector3, into=direction)

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
-from types import CodeType, ModuleType
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import InputError, option, raised_at, require
@@ -164,18 +164,12 @@ def _run_file(path: Path, where: str) -> None:
     module.__file__ = str(path)
     sys.modules[module.__name__] = module
 
-    def run() -> None:
-        code: CodeType = compile(source, str(path), "exec")
-        exec(code, module.__dict__)
-
     try:
-        _run(where, path, run)
+        _run(where, path, lambda: exec(compile(source, str(path), "exec"), module.__dict__))
     except InputError:
         del sys.modules[module.__name__]
         raise
-    register_pickle_by_value(
-        module
-    )  # worker processes, which have not run it, are sent its classes
+    register_pickle_by_value(module)  # workers, which have not run it, are sent its classes
     _files[path] = version
 
 
@@ -190,19 +184,15 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:
-        raise InputError(f"{where}: {_told(error, path)}") from error
-
-
-def _told(error: BaseException, path: Path | None) -> str:
-    """ "my_effects.py, line 3: NameError: …": the last line that is the plug-in's own."""
-    file, line = (
-        raised_at(error, lambda f: f == str(path))
-        or raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
-        or raised_at(error, lambda f: True)
-        or ("", 0)
-    )
-    text = error.msg if isinstance(error, SyntaxError) else error
-    return f"{file}, line {line}: {type(error).__name__}: {text}; correct the plug-in"
+        file, line = (  # the last that is the plug-in's own
+            raised_at(error, lambda f: f == str(path))
+            or raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
+            or raised_at(error, lambda f: True)
+            or ("", 0)
+        )
+        text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
+        told = f"{where}: {file}, line {line}: {text}; correct the plug-in"
+        raise InputError(told) from error
 
 
 # What may be registered, whatever it is.

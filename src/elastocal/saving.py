@@ -20,7 +20,7 @@ from elastocal.files import atomic_write, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.manipulator import Model
-from elastocal.tables import PARQUET, csv_text
+from elastocal.tables import PARQUET, Labels, csv_text
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
@@ -163,13 +163,14 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
         visits[key := (int(code), force.tobytes())] += 1
         again = f"/{visits[key]}" if visits[key] > 1 else ""
         names.append(plan.configuration_labels[code] + again)
-    labels, order = tuple(dict.fromkeys(names)), map(str, range(1, len(plan) + 1))
+    visited = Labels.of(names)
     table = replace(
-        plan, configuration=np.array([labels.index(name) for name in names], dtype=np.int64),
-        configuration_labels=labels, marker=np.zeros(len(plan), dtype=np.int64),
-        marker_names=(DEFAULT_MARKER,), joint_kinds=tuple(kinds),
+        plan, configuration=visited.codes, configuration_labels=visited.names,
+        marker=np.zeros(len(plan), dtype=np.int64), marker_names=(DEFAULT_MARKER,),
+        joint_kinds=tuple(kinds),
     )  # fmt: skip
-    write_plan(path, table, {"level": ["1"] * len(plan), "order": list(order)})
+    order = list(map(str, range(1, len(plan) + 1)))
+    write_plan(path, table, {"level": ["1"] * len(plan), "order": order})
 
 
 ANY = "any ending"  # of an arm the formats know theirs

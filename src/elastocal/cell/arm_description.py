@@ -24,6 +24,7 @@ from elastocal.config import (
     Text,
     Vector3,
     checked,
+    file_key,
     from_table,
     joint_values,
     key,
@@ -31,6 +32,7 @@ from elastocal.config import (
     keys_of,
     numbers,
     record,
+    turn_key,
 )
 from elastocal.errors import InputError, require
 from elastocal.text import is_label, listed, quoted
@@ -61,17 +63,17 @@ class Robot:
         6
     """
 
-    urdf: File | None = keyed('the path of a URDF file, e.g. "arm.urdf"', default=None)
-    mjcf: File | None = keyed('the path of a MuJoCo model, e.g. "arm.xml"', default=None)
+    urdf: File | None = file_key('the path of a URDF file, e.g. "arm.urdf"', default=None)
+    mjcf: File | None = file_key('the path of a MuJoCo model, e.g. "arm.xml"', default=None)
     base: Text | None = keyed(
         "the name of a link of the URDF, or of a body of the MuJoCo model", default=None
     )
     flange: Text | None = keyed(
         "the name of a link of the URDF, or of a body or site of the MuJoCo model", default=None
     )
-    dh: File | None = keyed('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
+    dh: File | None = file_key('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
     dh_convention: Convention = keyed(default="standard")
-    masses: File | None = keyed(
+    masses: File | None = file_key(
         'the path of a table of link masses, e.g. "links.csv"', default=None
     )
     ur_model: Text | None = keyed('the name of a Universal Robot, e.g. "UR10e"', default=None)
@@ -353,7 +355,7 @@ class Nominal:
         "one number >= 0 per joint, in rad/(N m)", form=Compliances, default=None
     )
     base_position: Vector3 | None = keyed("three numbers in m", "base_position_m", default=None)
-    base_rotation: Rotation | None = keyed(
+    base_rotation: Rotation | None = turn_key(
         "three numbers in degrees: roll, pitch, yaw", "base_rpy_deg", default=None
     )
     gravity_compensator: dict[str, Any] | None = keyed(

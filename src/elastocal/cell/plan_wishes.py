@@ -25,6 +25,7 @@ from elastocal.config import (
     Vector3,
     existing_file,
     fields_of,
+    file_key,
     header,
     joint_values,
     key,
@@ -33,6 +34,7 @@ from elastocal.config import (
     numbers,
     record,
     stated,
+    turn_key,
 )
 from elastocal.errors import require
 from elastocal.units import Array
@@ -88,7 +90,7 @@ class TargetPose:
 class TargetPath:
     """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
 
-    file: File = keyed('the path of a table of poses, e.g. "path.csv"', required=True)
+    file: File = file_key('the path of a table of poses, e.g. "path.csv"', required=True)
     force: Vector3 | None = FORCE()
     point: Vector3 | None = POINT()
 
@@ -107,7 +109,7 @@ class TargetBox:
         "three numbers in m, the opposite corner in the data's frame", "upper_m", required=True
     )
     count: Annotated[int, Field(ge=1, le=10_000)] = keyed("a whole number, 1 to 10000", default=20)
-    rotation: Rotation | None = keyed(
+    rotation: Rotation | None = turn_key(
         "three numbers in degrees: roll, pitch, yaw of the flange", "rpy_deg", default=None
     )
     force: Vector3 | None = FORCE()

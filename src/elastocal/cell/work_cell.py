@@ -34,7 +34,9 @@ from elastocal.config import (
     Vector3,
     checked,
     direction,
+    direction_key,
     fields_of,
+    file_key,
     from_table,
     header,
     joint_values,
@@ -94,7 +96,7 @@ class Solid:
     shape: Shape = keyed(required=True)
     size: Numbers = keyed(keys=SIZE_KEYS)
     placement: Transform = keyed(keys=PLACE_KEYS, default_factory=lambda: np.eye(4))
-    mesh: File | None = keyed('the path of a mesh, e.g. "fixture.stl"', "file", default=None)
+    mesh: File | None = file_key('the path of a mesh, e.g. "fixture.stl"', "file", default=None)
 
     def __post_init__(self) -> None:
         count = {"box": 3, "mesh": 3, "sphere": 1}.get(self.shape, 2)
@@ -150,7 +152,7 @@ class HalfSpace:
     point: Vector3 = keyed(
         "three numbers in m, a point of the boundary plane", "point_m", required=True
     )
-    normal: Direction = keyed(
+    normal: Direction = direction_key(
         "three numbers, a direction to the side where the arm may be", required=True
     )
 
@@ -167,7 +169,7 @@ class HangingLoad:
     solid: Solid = keyed(keys=keys_of(Solid, without=("name", "position_m", "rpy_deg")))
     rope: NonNegative = keyed("a number >= 0 in m, from load point to load", "rope_m", default=0.0)
     rope_radius: Positive = keyed("a positive number in mm", "rope_radius_mm", default=0.01)
-    rope_axis: Direction | None = keyed(
+    rope_axis: Direction | None = direction_key(
         "three numbers, a direction in the flange frame", default=None
     )
     max_angle: float | None = keyed(ANGLE, "max_angle_deg", form=Angle, default=None)
