@@ -14,7 +14,7 @@ from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_search import _component
 from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum, posed
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
-from elastocal.diagnosis.effect_search import Item
+from elastocal.diagnosis.evidence import Item
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.gears import EncoderScale

@@ -33,8 +33,8 @@ from elastocal.diagnosis.components import (
     presence_cost,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import Item, ModelSet, about, extended, settings_of, spans_of
-from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
+from elastocal.diagnosis.effect_search import ModelSet, about, extended, settings_of, spans_of
+from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together, possible
 from elastocal.diagnosis.lines import (
     FEW_POSES,

@@ -26,7 +26,6 @@ from elastocal.diagnosis.effect_search import (
     SelectedEffects,
     with_likelier_backlash_model,
 )
-from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import (
     BY_LAST_MOVE,
     OUT_OF_ORDER,
@@ -296,8 +295,7 @@ def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
     By the flips of the forward search; of a sum that is so many `nats` more probable than nothing,
     noise alone yields as much with a chance of exp(−nats) at most (Markov's inequality).
     """
-    p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
-    nothing = found.slots[0].probabilities()[1]
+    p, nothing = found.p_value, found.slots[0].probabilities()[1]
     if nats <= 0:
         return p, nothing
     return max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))

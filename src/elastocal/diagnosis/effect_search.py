@@ -3,7 +3,7 @@ step re-examined, under noise fitted beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -14,7 +14,15 @@ from scipy.special import expit, log_ndtr, logsumexp, ndtr
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Grams, Scan, exceedance, log_prior_odds, scan
+from elastocal.diagnosis.evidence import (
+    ANOTHER,
+    Grams,
+    Item,
+    Scan,
+    exceedance,
+    log_prior_odds,
+    scan,
+)
 from elastocal.diagnosis.hypotheses import Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import (
     SHARED,
@@ -36,27 +44,6 @@ from elastocal.units import Array, IntArray
 # A set of additions to the model: its noise, its evidence, its estimates, its imitators.
 
 REFINED_ROUNDS = 3  # of settings that depend on each other
-
-
-@dataclass(frozen=True)
-class Item:
-    """One addition: a hypothesis at its settings, or a block without a name.
-
-    `log_prior` is the log of its prior odds, the search over its settings included.
-    """
-
-    what: Hypothesis | Generic
-    settings: Array
-    log_prior: float
-
-    @property
-    def known(self) -> bool:
-        return self.what.known
-
-    @property
-    def key(self) -> tuple[str, str]:
-        """(effect, place); a block without a name is an unknown effect at its place."""
-        return self.what.key
 
 
 @dataclass(frozen=True)
@@ -97,6 +84,17 @@ class ModelSet:
     def without(self, k: int) -> tuple[Item, ...]:
         return self.items[:k] + self.items[k + 1 :]
 
+    def beside(self, k: int) -> NoisyData:
+        """The data with the columns of all items but k."""
+        kept = np.ones(len(self.data.precision), dtype=bool)
+        kept[self.spans[k]] = False
+        return replace(self.data, X=self.data.X[:, :, kept], precision=self.data.precision[kept])
+
+    def signal(self, k: int) -> Array:
+        """What item k does to the readings (C, m) at its estimate."""
+        span = self.spans[k]
+        return self.data.masked(self.data.X[:, :, span] @ self.at.beta[span])
+
 
 def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
     """Where groups of so many coefficients each stand, the last of `total`."""
@@ -105,58 +103,35 @@ def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
 
 
 def fit_set(
-    dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None
-) -> ModelSet:
-    """Fit the noise beside the items, twice where their best scale is not the typical one."""
-    return next(fit_sets(dataset, [items], start))
-
-
-def fit_sets(
-    dataset: DiagnosisData, each: Sequence[tuple[Item, ...]], start: NoiseValues | None = None
-) -> Iterator[ModelSet]:
-    """The same for several sets, from one noise."""
-
-    def fitted(joined: tuple[tuple[Item, ...], NoisyData]) -> ModelSet:
-        return _fitted(dataset, *joined, start)
-
-    with_columns = ((items, with_items(dataset, items, (1.0,) * len(items))) for items in each)
-    return ahead(fitted, with_columns, dataset.data.threads)
-
-
-def _fitted(
-    dataset: DiagnosisData, items: tuple[Item, ...], joined: NoisyData, start: NoiseValues | None
-) -> ModelSet:
-    """The set of the items whose columns, of typical size, stand last in `joined`."""
-    scales, noise = (1.0,) * len(items), start
-
-    def at(scales: tuple[float, ...]) -> NoisyData:
-        return replace(joined, precision=_precision(dataset.data, items, scales))
-
+    dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None,
+    joined: NoisyData | None = None,
+) -> ModelSet:  # fmt: skip
+    """Fit the noise beside the items, twice where their best scale is not the typical one; their
+    columns, of typical size, stand last in `joined`."""
+    noise, scales = start, (1.0,) * len(items)
+    data = joined = joined or with_items(dataset, items, scales)
     for _ in range(2):
-        noise = fit_noise(at(scales), noise)
+        noise = fit_noise(data, noise)
         weighted = Weighted.of(joined, noise)
-        best, mixed = _mixed_scales(dataset.data, weighted, items, scales)
+        best, score = _mixed_scales(dataset.data, weighted, items, scales)
         if best == scales:
             break
-        scales = best
+        scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
     assert noise is not None
-    data = at(scales)
-    mixed += _within_bounds(items, weighted.projection(data.precision))
-    prior = sum(item.log_prior for item in items) - 0.5 * log_prior(dataset.data.stated, noise)
-    return ModelSet(items, noise, data, mixed + prior, scales)
+    at = weighted.projection(data.precision)
+    z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
+    for item, span in zip(items, spans_of([i.what.width for i in items], len(z)), strict=True):
+        score += item.log_prior
+        if isinstance(item.what, Hypothesis):
+            score += within_bounds(z[span][item.what.bounded])
+    score -= 0.5 * log_prior(dataset.data.stated, noise)
+    return ModelSet(items, noise, data, score, scales)
 
 
 def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ...]) -> Array:
     """Of the coefficients of the data's columns and of the items'."""
     own = [np.full(item.what.width, 1 / s**2) for item, s in zip(items, scales, strict=True)]
     return np.concatenate([data.precision, *own])
-
-
-def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
-    spans = spans_of([item.what.width for item in items], len(at.beta))
-    z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
-    own = zip((item.what for item in items), spans, strict=True)
-    return sum(within_bounds(z[s][h.bounded]) for h, s in own if isinstance(h, Hypothesis))
 
 
 def within_bounds(z: Array) -> float:
@@ -211,39 +186,29 @@ def _refined(
     what = item.what
     if not what.settings:
         return None
-    data = beside(dataset, chosen, k)
+    data = chosen.beside(k)
     grams = Grams(dataset, data, project(data, noise))
     grid = dataset.grids[what.key]
-
-    def evidence(tried: Array) -> Array:
-        return grams.of(what, tried).evidence(what.scales)
-
     settings, searched = item.settings, False
     widths = grid.step[grid.nearest(settings)]
     for _ in range(1 if len(settings) == 1 else REFINED_ROUNDS):
         for s, setting in enumerate(what.settings):
             if setting.kind == "change_time":
-                trial = dataset.moments[np.abs(dataset.moments - settings[s]) <= widths[s]]
-                if len(trial) <= 1 or len(dataset.moments) == len(np.unique(grid.values[:, s])):
+                moments = dataset.moments
+                steps = [moments[np.abs(moments - settings[s]) <= widths[s]] - settings[s]]
+                if len(steps[0]) <= 1 or len(moments) == len(np.unique(grid.values[:, s])):
                     continue
-                settings = _best_along(settings, s, trial, evidence)
             else:
-                for width in widths[s] / 8.0 ** np.arange(3):
-                    trial = settings[s] + np.linspace(-width, width, 21)
-                    trial = np.clip(trial, setting.lower, setting.upper)
-                    settings = _best_along(settings, s, trial, evidence)
+                steps = [np.linspace(-w, w, 21) for w in widths[s] / 8.0 ** np.arange(3)]
+            for step in steps:
+                tried = np.repeat(settings[None], len(step), axis=0)
+                tried[:, s] = np.clip(settings[s] + step, setting.lower, setting.upper)
+                settings = tried[int(np.argmax(grams.of(what, tried).evidence(what.scales)))]
             searched = True
     if not searched:
         return None
     refined = replace(item, settings=settings)
     return fit_set(dataset, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), noise)
-
-
-def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array], Array]) -> Array:
-    """The settings with number s at the best of the values `trial`, the others held."""
-    tried = np.repeat(settings[None], len(trial), axis=0)
-    tried[:, s] = trial
-    return np.asarray(tried[int(np.argmax(evidence(tried)))])
 
 
 def with_items(
@@ -257,20 +222,9 @@ def with_items(
     return dataset.data.with_columns(columns, _precision(dataset.data, items, scales)[p:])
 
 
-def beside(dataset: DiagnosisData, chosen: ModelSet, k: int) -> NoisyData:
-    return with_items(dataset, chosen.without(k), chosen.scales[:k] + chosen.scales[k + 1 :])
-
-
 # Which other effects would look the same in these poses: what no size of noise can tell apart.
 
 PLAUSIBLE = 5.0
-
-
-def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
-    """What item k does to the readings (C, m) at its estimate."""
-    item = chosen.items[k]
-    columns = dataset.packed(item.what, item.settings)
-    return dataset.data.masked(columns @ chosen.at.beta[chosen.spans[k]])
 
 
 def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[str, str], float]:
@@ -280,7 +234,7 @@ def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[st
     columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
     standard deviations.  A rival larger than usual is less probable, but it is no less alike.
     """
-    v, data = signal_of(dataset, chosen, k), beside(dataset, chosen, k)
+    v, data = chosen.signal(k), chosen.beside(k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
     signal = float((v * at.u).sum())
@@ -448,7 +402,8 @@ class Slot:
 @dataclass(frozen=True)
 class SelectedEffects:
     """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
-    p-value of every step against all that could have been found by chance.
+    p-value of the first of them, or else of the likeliest addition, against all that could have
+    been found by chance.
 
     `dataset` is the one that the set was fitted on: columns about a fit with its large effects.
     `first` is the scan beside nothing under its own noise, `alone` under the final noise.
@@ -457,7 +412,7 @@ class SelectedEffects:
     dataset: DiagnosisData
     chosen: ModelSet
     slots: tuple[Slot, ...]
-    p_values: tuple[float, ...]
+    p_value: float
     nothing: ModelSet
     first: Scan
     alone: Scan
@@ -479,7 +434,7 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     """
     used, whats = ~dataset.data.left_out, [item.what for item in chosen.items]
     direct = {k: h for k, h in enumerate(whats) if isinstance(h, Hypothesis) and not h.driven}
-    signals = (signal_of(dataset, chosen, k)[used] for k in direct)
+    signals = (chosen.signal(k)[used] for k in direct)
     if not any((signal**2).mean() > FAR**2 for signal in signals):
         return dataset
     fitted = fit_extended(dataset, chosen, [chosen.items[k] for k in direct])
@@ -535,7 +490,6 @@ CLEARLY = 10.0  # nats by which several named effects must beat fewer without a 
 PART = 0.3
 # Causes from which on a sum of all that may act is the better judge: of fewer this search is.
 MANY = 3
-KEPT = 4  # scans that are kept, the last ones
 
 
 TENTHS = 10  # blocks of time that are left out in turn
@@ -561,10 +515,10 @@ class ForwardSelection:
     generic: list[Generic]
     level: float
     seed: int
-    _start: DiagnosisData = field(init=False)
-    _visited: set[frozenset[int]] = field(init=False, default_factory=set)
     _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
-    _scanned: dict[tuple, Scan] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._start = self.dataset
 
     @cached_property
     def signs(self) -> Array:
@@ -573,55 +527,54 @@ class ForwardSelection:
         return rng.choice([-1.0, 1.0], (FLIPS, len(self.dataset.blocks.member)))
 
     def run(self) -> SelectedEffects:
-        self._start = dataset = self.dataset
+        dataset = self.dataset
         nothing = current = fit_set(dataset, (), dataset.data.noise)
-        scanned = first = alone = self._scan(current, beside=current)
-        slots: list[Slot] = []
-        start: list[Slot] = []
-        p_values: list[float] = []
+        first = alone = scanned = self._scan(nothing, beside=nothing)
+        slots, visited, p = list[Slot](), set[frozenset[int]](), None
         while True:
             best, slot = self._best_addition(current, scanned)
-            if best is None or len(current.items) + 1 >= MANY:
-                break
-            # Score all again under the noise beside the winner: an effect that is still missing
-            # looks like noise, and hides others with it.
-            observed = self._scan(current, best.noise, best)
+            observed = scanned
+            if best is not None:
+                # Score all again under the noise beside the winner: an effect that is still missing
+                # looks like noise, and hides others with it.
+                if current.items or (best.noise.logs() != scanned.noise.logs()).any():
+                    observed = self._scan(current, best.noise, best)
+                if not current.items:
+                    alone = observed
+                best, again = self._best_addition(current, observed)
+                slot = slot.best_of(again)
             if not current.items:
-                alone = observed
-            better, again = self._best_addition(current, observed)
-            best, slot = better, slot.best_of(again)
+                start = slot
             if best is None or not slot.claimable:
                 break
             if current.items and slot.probabilities()[1] > DOUBT_MORE:
                 break
-            p = exceedance(observed.flipped, observed.odds)
+            chance = exceedance(observed.odds[1:], float(observed.odds[0]))
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
-            if p > self.level or key in self._visited:
+            if chance > self.level or key in visited:
                 break
-            self._visited.add(key)
-            if not current.items:
-                start = [slot]
-            current, scanned = best, self._scan(best)
+            visited.add(key)
+            p = chance if p is None else p
+            current = best
             slots.append(slot)
-            p_values.append(p)
             if (anew := relinearised(self.dataset, current)) is not self.dataset:
-                self.dataset = anew
-                self._forget()
-                current = fit_set(self.dataset, current.items, current.noise)
-                scanned = self._scan(current)
+                self._turn_to(anew)
+                current = fit_set(anew, current.items, current.noise)
             if len(current.items) > 1:
-                current, slots, scanned = self._reexamined(current, slots, scanned)
+                current, slots = self._reexamined(current, slots)
+            if len(current.items) + 1 >= MANY:
+                break
+            scanned = self._scan(current)
         current, slots = self._paying(current, slots)
-        if not current.items:
-            self.dataset, current = dataset, nothing
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
-        self._forget()
-        return SelectedEffects(
-            self.dataset, current, tuple(slots or start or [slot]), tuple(p_values[: len(slots)]),
-            nothing, first, alone,
-        )  # fmt: skip
+        if not current.items or p is None:
+            current, p = nothing, exceedance(first.odds[1:], float(first.odds[0]))
+            self.dataset = dataset
+        self._turn_to(self.dataset)
+        slots = slots or [start]
+        return SelectedEffects(self.dataset, current, tuple(slots), p, nothing, first, alone)
 
     def settled(self, found: SelectedEffects) -> SelectedEffects:
         """What effects of the catalogue alone would make of it, where that is clearly better.
@@ -629,20 +582,24 @@ class ForwardSelection:
         A block without a name fits a little of everything, and may come first where several
         effects act at once.
         """
-        first = found.slots[0]
-        alone = max((s for i, s in zip(first.items, first.scores, strict=True) if i.known),
+        slot = found.slots[0]
+        alone = max((s for i, s in zip(slot.items, slot.scores, strict=True) if i.known),
                     default=-np.inf)  # fmt: skip
-        if not found.chosen.unknown or alone <= PART * first.scores.max():
+        if not found.chosen.unknown or alone <= PART * slot.scores.max():
             return found
         named = ForwardSelection(self._start, [], self.level, self.seed).run()
         if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
             return found
-        self.dataset = named.dataset
-        self._forget()
-        chosen, slots, _ = self._reexamined(named.chosen, list(named.slots), found.alone)
-        return replace(
-            found, dataset=self.dataset, chosen=chosen, slots=tuple(slots), p_values=named.p_values
-        )
+        self._turn_to(named.dataset)
+        chosen, slots = self._reexamined(named.chosen, list(named.slots))
+        return replace(found, dataset=self.dataset, chosen=chosen, slots=tuple(slots),
+                       p_value=named.p_value)  # fmt: skip
+
+    def _turn_to(self, dataset: DiagnosisData) -> None:
+        """What was fitted about another fit is void, and after a search only fills the memory:
+        each set holds its columns."""
+        self.dataset = dataset
+        self._fitted.clear()
 
     def _paying(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
         """The set without items beside whose others the error of configurations left out of the
@@ -665,34 +622,15 @@ class ForwardSelection:
             current, slots = without[k], slots[:k] + slots[k + 1 :]
         return current, slots
 
-    def _forget(self) -> None:
-        """What was fitted and scanned about another fit is void, and after a search only fills the
-        memory: each set holds its columns."""
-        self._fitted.clear()
-        self._scanned.clear()
-
     def _scan(
         self, current: ModelSet, noise: NoiseValues | None = None, beside: ModelSet | None = None
     ) -> Scan:
         """All candidates beside the set; with flips of what is left `beside` another, where one is
         given: they hold nothing of what this one explains."""
-        noise = noise or current.noise
-        items = tuple((id(item.what), item.settings.tobytes()) for item in current.items)
-        # Sets that a step has judged come again when its items are re-examined; the noise beside
-        # which a residual is flipped is that of the set that leaves it.
-        key = items, current.scales, noise.logs().tobytes(), beside is not None
-        if key not in self._scanned:
-            flips = None if beside is None else (self.signs, beside.at.scattered)
-            self._scanned[key] = scan(
-                self.dataset, self.generic, self._prior(current), current.data, noise, flips
-            )
-            while len(self._scanned) > KEPT:
-                self._scanned.pop(next(iter(self._scanned)))
-        return self._scanned[key]
-
-    def _prior(self, current: ModelSet) -> Array:
+        flips = None if beside is None else (self.signs, beside.at.scattered)
         something = ANOTHER if current.items else SOMETHING
-        return log_prior_odds(self.dataset.hypotheses, self.generic, something)
+        prior = log_prior_odds(self.dataset.hypotheses, self.generic, something)
+        return scan(self.dataset, self.generic, prior, current.data, noise or current.noise, flips)
 
     def _best_addition(
         self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND
@@ -701,47 +639,40 @@ class ForwardSelection:
 
         Beside other items it has to be better than the set without it.
         """
-        slot, base = self._options(current, scanned), current.score
-        best: ModelSet | None = None
-        scores, close = slot.scores.copy(), self._close(slot, behind)
-        there = {k for k in close if any(slot.items[k].what is o.what for o in current.items)}
-        scores[list(there)] = -np.inf
-        added = [k for k in close if k not in there]
+        # Scores count from the set as it is, under the noise that suits it best.
+        base = current.score
+        offset = sum(item.log_prior for item in current.items) - base
+        offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
+        slot, best = Slot(scanned.items, scanned.scores + offset), None
+        close, there = self._close(slot, behind), {id(item.what) for item in current.items}
+        scores, added = (
+            slot.scores.copy(),
+            [k for k in close if id(slot.items[k].what) not in there],
+        )
+        scores[[k for k in close if id(slot.items[k].what) in there]] = -np.inf
         fits = self._with_each(current, [slot.items[k] for k in added])
         for k, fitted in zip(added, fits, strict=True):
-            if fitted.excessive:
-                scores[k] = -np.inf
-                continue
-            scores[k] = fitted.score - base
-            if best is None or fitted.score > best.score:
+            scores[k] = -np.inf if fitted.excessive else fitted.score - base
+            if not fitted.excessive and (best is None or fitted.score > best.score):
                 best = fitted
         if best is not None and current.items and best.score <= base:
             best = None
         return best, Slot(slot.items, scores)
 
-    def _options(self, current: ModelSet, scanned: Scan) -> Slot:
-        prior = self._prior(current)
-        # Scores count from the set as it is, under the noise that suits it best.
-        offset = sum(item.log_prior for item in current.items) - current.score
-        offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
-        whats: tuple[Hypothesis | Generic, ...] = (*self.dataset.hypotheses, *self.generic)
-        # What the search over settings costs stays with the item.
-        items = [
-            Item(what, s.settings, float(w + s.evidence - s.best if what.known else w))
-            for what, s, w in zip(whats, scanned.scored, prior, strict=True)
-        ]
-        scores = [w + s.evidence + offset for s, w in zip(scanned.scored, prior, strict=True)]
-        return Slot(tuple(items), np.array(scores))
-
     def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
         """The set with each of the items more, its noise and settings fitted; kept, since they are
         asked for again."""
+        dataset = self.dataset
         sets = [(*current.items, item) for item in added]
         keys = [tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in s) for s in sets]
         new = {key: items for key, items in zip(keys, sets, strict=True) if key not in self._fitted}
-        fits = fit_sets(self.dataset, list(new.values()), current.noise)
-        for key, fitted in zip(new, fits, strict=True):
-            self._fitted[key] = refine(self.dataset, fitted, len(fitted.items) - 1)
+
+        def fitted(joined: tuple[tuple[Item, ...], NoisyData]) -> ModelSet:
+            return fit_set(dataset, joined[0], current.noise, joined[1])
+
+        columns = ((s, with_items(dataset, s, (1.0,) * len(s))) for s in new.values())
+        for key, found in zip(new, ahead(fitted, columns, dataset.data.threads), strict=True):
+            self._fitted[key] = refine(dataset, found, len(found.items) - 1)
         return [self._fitted[key] for key in keys]
 
     def _close(self, slot: Slot, behind: float) -> IntArray:
@@ -751,16 +682,14 @@ class ForwardSelection:
         order = order[slot.scores[order] > slot.scores[order[:1]].max(initial=-np.inf) - behind]
         return np.concatenate([order[known[order]][:CLOSE], order[~known[order]][:CLOSE_BLOCKS]])
 
-    def _reexamined(
-        self, current: ModelSet, slots: list[Slot], scanned: Scan
-    ) -> tuple[ModelSet, list[Slot], Scan]:
+    def _reexamined(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
         """Every item against all that could stand in its place, the others given."""
         for _ in range(2):
             changed, k = False, 0
             while k < len(current.items):
                 others = fit_set(self.dataset, current.without(k), current.noise)
-                beside = self._scan(others, current.noise)
-                best, slot = self._best_addition(others, beside, BEHIND_COMPLETE)
+                scanned = self._scan(others, current.noise)
+                best, slot = self._best_addition(others, scanned, BEHIND_COMPLETE)
                 slots[k] = slot
                 if best is None:  # no longer needed
                     current, changed = others, True
@@ -775,4 +704,4 @@ class ForwardSelection:
                 k += 1
             if not changed:
                 break
-        return current, slots, self._scan(current)
+        return current, slots

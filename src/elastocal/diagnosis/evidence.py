@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import logsumexp
@@ -33,13 +34,19 @@ from elastocal.units import Array
 
 @dataclass(frozen=True)
 class Spectrum:
-    """V groups of K columns: eigenvalues `lam` (V, K) of A, `beta` (V, K) = Uᵀb, and `flips`
-    (V, K, F): β of residuals whose configurations had their signs flipped, F = 0 unless asked
-    for."""
+    """V groups of K columns: eigenvalues `lam` (V, K) of A, and `beta` (V, K, T) = Uᵀb of T
+    residuals, the readings' own first, then those whose configurations had their signs flipped."""
 
     lam: Array
     beta: Array
-    flips: Array
+
+    @classmethod
+    def of(cls, A: Array, b: Array) -> Spectrum:
+        """Of Gram matrices A (V, K, K) and b (V, K, T)."""
+        lam, U = np.linalg.eigh(A)
+        # Rounding leaves a tiny β along directions that P removes altogether.
+        seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
+        return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
 
     @property
     def distance(self) -> Array:
@@ -49,21 +56,15 @@ class Spectrum:
     def explained(self, scale: float) -> Array:
         """What each group takes off eᵀPe, its coefficients γ charged with |γ|²/scale² (V,)."""
         squared = scale**2
-        return np.asarray((squared * self.beta**2 / (1 + squared * self.lam)).sum(axis=1))
+        return np.asarray((squared * self.beta[..., 0] ** 2 / (1 + squared * self.lam)).sum(axis=1))
 
     def evidence(self, scales: Array = SCALES) -> Array:
-        """Log evidence (V,) over the model without the group."""
-        return evidence_of(self.lam, self.beta, scales)
+        """Log evidence (V,) of the readings over the model without the group."""
+        return self.evidences(scales)[:, 0]
 
-    def flipped(self, log_prior: Array, scales: Array = SCALES) -> Array:
-        """Log evidence (W, F) of the residuals with flipped signs: of W hypotheses, whose V/W
-        groups stand one after the other and are weighed by `log_prior` (W, V/W)."""
-        each = at_scales(self.lam, self.flips, scales)
-        each = each.reshape(*log_prior.shape, *each.shape[1:])
-        each += (log_prior - np.log(len(scales)))[:, :, None, None]
-        top = each.max(axis=(1, 2))
-        each -= top[:, None, None]
-        return np.asarray(top + np.log(np.exp(each, out=each).sum(axis=(1, 2))))
+    def evidences(self, scales: Array) -> Array:
+        """The same of every residual (V, T)."""
+        return log_sum(at_scales(self.lam, self.beta, scales), axis=1) - np.log(len(scales))
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
@@ -90,11 +91,6 @@ def exceedance(flipped: Array, observed: float) -> float:
     return max(min(counted, by_tail), SMALLEST_P)
 
 
-def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
-    """Log evidence (V,) from eigenvalues and β (V, K); mixed over `scales` (S,)."""
-    return log_sum(at_scales(lam, beta[..., None], scales)[..., 0]) - np.log(len(scales))
-
-
 def at_scales(lam: Array, beta: Array, scales: Array) -> Array:
     """Log evidence (V, S, F) at each of the scales, from eigenvalues (V, K) and β (V, K, F)."""
     squared = scales[:, None] ** 2
@@ -106,7 +102,8 @@ def at_scales(lam: Array, beta: Array, scales: Array) -> Array:
 
 def log_sum(values: Array, axis: int = -1) -> Array:
     top = values.max(axis=axis, keepdims=True)
-    return np.asarray(np.log(np.exp(values - top).sum(axis=axis)) + top.squeeze(axis))
+    each = values - top
+    return np.asarray(np.log(np.exp(each, out=each).sum(axis=axis)) + top.squeeze(axis))
 
 
 def evidence_of_groups(
@@ -120,22 +117,10 @@ def evidence_of_groups(
         for d in np.ones((1, len(b))) if scalings is None else scalings[n]:
             of_width[len(b)].append((n, A * d * d[:, None], b * d))
     best = np.full(len(groups), -np.inf)
-    for k, same in of_width.items():
+    for same in of_width.values():
         of, A, b = (np.array(each) for each in zip(*same, strict=True))
-        found = spectrum(A, b, np.zeros((len(b), k, 0)))
-        np.maximum.at(best, of, found.evidence(scales))
+        np.maximum.at(best, of, Spectrum.of(A, b[..., None]).evidence(scales))
     return best.tolist()
-
-
-def spectrum(A: Array, b: Array, flips: Array) -> Spectrum:
-    """Of Gram matrices A (V, K, K), b (V, K) and those of flipped residuals (V, K, F)."""
-    lam, U = np.linalg.eigh(A)
-    back = U.transpose(0, 2, 1)
-    beta, flips = (back @ b[..., None])[..., 0], back @ flips
-    # Rounding leaves a tiny β along directions that P removes altogether.
-    gone = lam <= 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
-    flips[gone] = 0.0
-    return Spectrum(np.where(gone, 0.0, lam), np.where(gone, 0.0, beta), flips)
 
 
 # Prior probabilities, fixed before any data: nothing, something unknown, or a known effect.
@@ -180,34 +165,54 @@ def log_prior_odds(
 Flips = tuple[Array, Array]
 
 
+class Residuals(NamedTuple):
+    """T residuals: V⁻¹e, of which `signs` (T, C) flip each configuration's, less what the fit takes
+    of them, V⁻¹e − H hᵀ with h (T, p); or what `of` a direction V⁻¹e is (C, …), as it stands."""
+
+    signs: Array
+    of: Array
+    h: Array
+
+    def along(self, columns: Array, Z: Array) -> Array:
+        """b (g, T) of columns (C, n, g), Z (p, g) = Hᵀ of them; `of` is (C, n)."""
+        own = np.einsum("cn,cng->gc", self.of.reshape(columns.shape[:2]), columns)
+        return own @ self.signs.T - Z.T @ self.h.T
+
+
+def residuals_of(at: Projection, flips: Flips | None = None) -> tuple[Residuals, ...]:
+    """The readings', which is P r already, and the flipped ones where they are asked for."""
+    C, _, p = at.H.shape
+    own = Residuals(np.ones((1, C)), at.u, np.zeros((1, p)))
+    if flips is None:
+        return (own,)
+    signs, e = flips[0], flips[1][..., None]
+    h = signs @ (at.H.transpose(0, 2, 1) @ e)[..., 0]
+    return own, Residuals(signs, (at.inverse @ e)[..., 0], h)
+
+
 @dataclass(frozen=True)
 class EntrySums:
-    """Of one entry under one noise: `local` (C, v, d, v, d), `H` (p, C, v, d), `b` (C, v, d).
-
-    `flip` (C, v, d) and `h` (F, p) are of the residual that is flipped by `signs` (F, C).
-    """
+    """Of one entry under one noise: `local` (C, v, d, v, d), `H` (p, C, v, d), and the residuals
+    `of` its motions (C, v, d)."""
 
     local: Array
     H: Array
-    b: Array
-    signs: Array
-    flip: Array
-    h: Array
+    residuals: tuple[Residuals, ...]
 
     @classmethod
-    def of(cls, E: Array, blocks: Blocks, at: Projection, flips: Flips | None = None) -> EntrySums:
+    def of(
+        cls, E: Array, blocks: Blocks, at: Projection, residuals: Sequence[Residuals]
+    ) -> EntrySums:
         """E (C, m, d): the entry's packed columns, zero in rows that do not count."""
         C, m, d = E.shape
         v = blocks.in_visit.shape[2]
         wide = (blocks.in_visit[:, :, :, None] * E[:, :, None, :]).reshape(C, m, v * d)
         local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
         H = np.ascontiguousarray((at.H.transpose(0, 2, 1) @ wide).transpose(1, 0, 2))  # (p, C, v·d)
-        b = np.einsum("cmk,cm->ck", wide, at.u)
-        signs, u, h = _flipped(at, flips)
-        flip = np.einsum("cmk,cm->ck", wide, u)
+        own = (r._replace(of=np.einsum("cmk,cm->ck", wide, r.of)) for r in residuals)
         return cls(
             local.reshape(C, v, d, v, d), H.reshape(-1, C, v, d),
-            b.reshape(C, v, d), signs, flip.reshape(C, v, d), h,
+            tuple(r._replace(of=r.of.reshape(C, v, d)) for r in own),
         )._by_fewest  # fmt: skip
 
     @property
@@ -217,15 +222,15 @@ class EntrySums:
         if len(H) <= H.shape[1]:
             return self
         Q, R = np.linalg.qr(H)
-        return replace(self, H=R.reshape(-1, *self.H.shape[1:]), h=self.h @ Q)
+        turned = tuple(r._replace(h=r.h @ Q) for r in self.residuals)
+        return replace(self, H=R.reshape(-1, *self.H.shape[1:]), residuals=turned)
 
     @cached_property
     def _of_configurations(self) -> EntrySums:
         """The same for directions that do not differ within a configuration: v = 1."""
-        return replace(
-            self, local=self.local.sum(axis=(1, 3), keepdims=True),
-            H=self.H.sum(axis=2, keepdims=True), b=self.b.sum(axis=1, keepdims=True),
-            flip=self.flip.sum(axis=1, keepdims=True),
+        return EntrySums(
+            self.local.sum(axis=(1, 3), keepdims=True), self.H.sum(axis=2, keepdims=True),
+            tuple(r._replace(of=r.of.sum(axis=1, keepdims=True)) for r in self.residuals),
         )._by_fewest  # fmt: skip
 
     def each(
@@ -233,17 +238,16 @@ class EntrySums:
     ) -> Spectrum:
         """Spectrum of n groups, for so many of which at a time `directions` are asked as are HELD
         numbers, of `width` columns each."""
-        step = max(1, HELD // (self.b.size * width))
+        step = max(1, HELD // (self.H[0].size * width))
         D = (directions(slice(k, k + step)) for k in range(0, n, step))
-        parts = zip(
-            *((s.lam, s.beta, s.flips) for s in ahead(self.driven, D, threads)), strict=True
-        )
-        return Spectrum(*map(np.concatenate, parts))
+        parts = list(ahead(self.driven, D, threads))
+        lam, beta = (np.concatenate([getattr(s, k) for s in parts]) for k in ("lam", "beta"))
+        return Spectrum(lam, beta)
 
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
         are the same in all visits of a configuration."""
-        if D.shape[1] < self.b.shape[1]:
+        if D.shape[1] < self.local.shape[1]:
             return self._of_configurations.driven(D)
         C, v, d, V, k = D.shape
         n = v * d
@@ -253,12 +257,8 @@ class EntrySums:
         Z = self.H.reshape(-1, C * n) @ flat.reshape(C * n, V * k)
         A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
-        b = self.b.ravel() @ flat.reshape(C * n, V * k)
-        flips = np.zeros((V * k, len(self.signs)))
-        if flips.size:
-            own = np.einsum("ci,cig->cg", self.flip.reshape(C, n), flat)
-            flips = own.T @ self.signs.T - Z.T @ self.h.T
-        return spectrum(A, b.reshape(V, k), flips.reshape(V, k, -1))
+        b = np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
+        return Spectrum.of(A, b.reshape(V, k, -1))
 
 
 def _each_with_each(a: Array, b: Array) -> Array:
@@ -266,24 +266,13 @@ def _each_with_each(a: Array, b: Array) -> Array:
     return np.asarray(a.transpose(1, 2, 0) @ b.transpose(1, 0, 2))
 
 
-def _flipped(at: Projection, flips: Flips | None) -> tuple[Array, Array, Array]:
-    """The signs (F, C), V⁻¹e (C, m), which they flip, and Σ_c signs (Hᵀe)_c (F, p)."""
-    if flips is None:
-        return np.zeros((0, len(at.u))), np.zeros_like(at.u), np.zeros((0, at.H.shape[2]))
-    signs, e = flips[0], flips[1][..., None]
-    h = (at.H.transpose(0, 2, 1) @ e)[..., 0]
-    return signs, (at.inverse @ e)[..., 0], signs @ h
-
-
-def direct(C: Array, at: Projection, flips: Flips | None = None) -> Spectrum:
+def direct(C: Array, at: Projection, residuals: Sequence[Residuals] = ()) -> Spectrum:
     """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count."""
     k = C.shape[2]
     A = C.reshape(-1, k).T @ (at.inverse @ C).reshape(-1, k)
     Z = at.H.reshape(-1, at.H.shape[2]).T @ C.reshape(-1, k)
-    b = np.einsum("cmk,cm->k", C, at.u)
-    signs, u, h = _flipped(at, flips)
-    flipped = signs @ np.einsum("cmk,cm->ck", C, u) - h @ Z
-    return spectrum((A - Z.T @ Z)[None], b[None], flipped.T[None])
+    b = np.concatenate([r.along(C, Z) for r in residuals or residuals_of(at)], axis=1)
+    return Spectrum.of((A - Z.T @ Z)[None], b[None])
 
 
 # Numbers of regressor directions that are held at a time: with more of them the sums over thousands
@@ -302,82 +291,72 @@ class Grams:
     flips: Flips | None = None
     _entries: dict[EntryKey, EntrySums] = field(init=False, default_factory=dict)
 
+    @cached_property
+    def _residuals(self) -> tuple[Residuals, ...]:
+        return residuals_of(self.at, self.flips)
+
     def entry(self, key: EntryKey) -> EntrySums:
         if key not in self._entries:
             E = self.data.masked(self.dataset.entry(key))
-            self._entries[key] = EntrySums.of(E, self.data.blocks, self.at, self.flips)
+            self._entries[key] = EntrySums.of(E, self.data.blocks, self.at, self._residuals)
         return self._entries[key]
 
-    def of(self, h: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
+    def of(self, what: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
         """A block, or a hypothesis at every one of the `settings` (G, …), by default those of the
         search."""
-        if isinstance(h, Generic):
-            return self._of_blocks([h])
-        if not h.driven:
-            columns = self.data.masked(self.dataset.packed(h))
-            return direct(columns, self.at, self.flips)
-        tried = self.dataset.grids[h.key].values if settings is None else settings
-        sums, dataset = self.entry(h.entry_key(self.dataset.base.model)), self.dataset
-        return sums.each(
-            len(tried), h.width, lambda some: dataset.direction(h, tried[some]), self.data.threads
-        )
-
-    def of_each(
-        self, whats: Sequence[Hypothesis | Generic]
-    ) -> Iterator[tuple[Sequence[int], Spectrum]]:
-        """Numbers of hypotheses or blocks and their spectra: a hypothesis by itself, at all of its
-        settings; blocks that move one entry by as many functions together, since hundreds of small
-        products cost a call each."""
-        alike = defaultdict[Hashable, list[int]](list)
-        for n, what in enumerate(whats):
-            moved = what.entry if isinstance(what, Generic) else None
-            alike[n if moved is None else (moved, what.width)].append(n)
-        for members in alike.values():
-            blocks = [what for n in members if isinstance(what := whats[n], Generic)]
-            yield members, self._of_blocks(blocks) if blocks else self.of(whats[members[0]])
-
-    def _of_blocks(self, blocks: Sequence[Generic]) -> Spectrum:
-        """Of blocks that move one entry by as many functions, or of one block."""
-        entry, columns = blocks[0].entry, blocks[0].columns
-        if entry is None:
-            assert columns is not None
-            return direct(self.data.masked(columns), self.at, self.flips)
-        functions = [b.direction for b in blocks if b.direction is not None]
-        return self.entry(entry).each(
-            len(blocks), blocks[0].width, lambda some: np.stack(functions[some], axis=3),
+        dataset = self.dataset
+        if isinstance(what, Generic) and what.entry is not None and what.direction is not None:
+            return self.entry(what.entry).driven(what.direction[:, :, :, None])
+        if isinstance(what, Generic) or not what.driven:
+            return direct(self.data.masked(dataset.packed(what)), self.at, self._residuals)
+        tried = dataset.grids[what.key].values if settings is None else settings
+        return self.entry(what.entry_key(dataset.base.model)).each(
+            len(tried), what.width, lambda some: dataset.direction(what, tried[some]),
             self.data.threads,
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Scored:
-    """Evidence of one hypothesis or block over the model without it (nats).
+# Everything that may be missing, scored under one noise.
 
-    `settings` are its best ones, `best` the evidence at them without the prior of the search;
-    `distance` is d of its typical size there, in standard deviations.
+
+@dataclass(frozen=True)
+class Item:
+    """One addition: a hypothesis at its settings, or a block without a name.
+
+    `log_prior` is the log of its prior odds, the search over its settings included.
     """
 
-    evidence: float
-    best: float
+    what: Hypothesis | Generic
     settings: Array
-    distance: float
+    log_prior: float
+
+    @property
+    def known(self) -> bool:
+        return self.what.known
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """(effect, place); a block without a name is an unknown effect at its place."""
+        return self.what.key
 
 
 @dataclass(frozen=True)
 class Scan:
-    """Everything scored under one noise: hypotheses, then blocks, and the odds of all together.
+    """Everything scored under one noise, and the odds of all together.
 
-    `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
-    `flipped` (F,) the same for residuals whose configurations had their signs flipped;
-    `covariate_odds` the largest evidence among the blocks of a covariate, and its flips;
-    `marginal` the log marginal likelihood of the data beside which they were scored.
+    `items` are hypotheses, then blocks, each at its best settings, of log posterior `scores` (W,)
+    over the model without it, up to what they share; `distance` (W,) is d of a typical size there,
+    in standard deviations.  `odds` (1 + F,) is the log of the mean evidence over catalogue and
+    blocks, weighted by prior, of the readings and of residuals whose configurations had their signs
+    flipped, and `covariates` (1 + F,) the largest evidence among the blocks of each; `marginal` the
+    log marginal likelihood of the data beside which they were scored.
     """
 
-    scored: tuple[Scored, ...]
-    odds: float
-    flipped: Array
-    covariate_odds: dict[str, float]
-    covariate_flips: dict[str, Array]
+    items: tuple[Item, ...]
+    scores: Array
+    distance: Array
+    odds: Array
+    covariates: dict[str, Array]
     marginal: float
     noise: NoiseValues
 
@@ -388,30 +367,24 @@ def scan(
 ) -> Scan:  # fmt: skip
     """Score all hypotheses and blocks, of log odds `prior`, beside the columns in `data`."""
     grams = Grams(dataset, data, project(data, noise), flips)
+    items, distance, rows = list[Item](), list[float](), list[Array]()
+    covariates: dict[str, Array] = {}
     whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
-    found: dict[int, Scored] = {}
-    F = 0 if flips is None else len(flips[0])
-    flipped = np.empty((len(whats), F))
-    for members, spectra in grams.of_each(whats):
-        scales = whats[members[0]].scales
-        # A hypothesis has all of its settings, of several blocks each has one.
-        grids = [dataset.grids.get(whats[n].key, NO_SETTINGS) for n in members]
-        each, spans = spectra.evidence(scales), np.arange(len(spectra.lam)).reshape(len(grids), -1)
-        flipped[list(members)] = spectra.flipped(np.stack([g.log_prior for g in grids]), scales)
-        for n, own, grid in zip(members, spans, grids, strict=True):
-            weighed = each[own] + grid.log_prior
-            k = int(np.argmax(weighed))
-            best, d = float(each[own[k]]), float(spectra.distance[own[k]])
-            found[n] = Scored(float(log_sum(weighed)), best, grid.values[k], d)
-    scored = tuple(found[n] for n in range(len(whats)))
-    of_covariate = defaultdict[str, list[int]](list)
-    for n, block in enumerate(generic, start=len(dataset.hypotheses)):
-        of_covariate[block.covariate].append(n)
-    total, by_covariate = float(logsumexp(prior)), of_covariate.items()
+    for what, w in zip(whats, prior.tolist(), strict=True):
+        grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
+        each = spectra.evidences(what.scales)
+        weighed = each + grid.log_prior[:, None]
+        evidence, k = log_sum(weighed, axis=0), int(np.argmax(weighed[:, 0]))
+        rows.append(evidence)
+        # What the search over settings costs stays with the item.
+        items.append(Item(what, grid.values[k], w + float(evidence[0] - each[k, 0])))
+        distance.append(float(spectra.distance[k]))
+        if isinstance(what, Generic):
+            covariates[what.covariate] = np.maximum(
+                covariates.get(what.covariate, -np.inf), evidence
+            )
+    scores = prior[:, None] + np.array(rows)
+    odds = log_sum(scores, axis=0) - float(logsumexp(prior))
     return Scan(
-        scored, float(log_sum(prior + [s.evidence for s in scored])) - total,
-        log_sum(prior[:, None] + flipped, axis=0) - total,
-        {c: max(scored[n].evidence for n in own) for c, own in by_covariate},
-        {c: flipped[own].max(axis=0) for c, own in by_covariate if F},
-        grams.at.marginal, noise,
-    )  # fmt: skip
+        tuple(items), scores[:, 0], np.array(distance), odds, covariates, grams.at.marginal, noise
+    )

@@ -21,14 +21,13 @@ from elastocal.diagnosis.diagnosis_data import (
 )
 from elastocal.diagnosis.effect_search import (
     PLAUSIBLE,
-    Item,
     distances,
     fit_set,
     settings_to_try,
     spans_of,
     with_items,
 )
-from elastocal.diagnosis.evidence import Grams, evidence_of
+from elastocal.diagnosis.evidence import Grams, Item, at_scales
 from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
@@ -499,7 +498,7 @@ def _posterior_draws(
         lam, U = np.linalg.eigh(S[of, of])
         lam = np.maximum(lam, 0.0)
         beta = U.T @ S[of, -1]
-        each = [evidence_of(lam[None], beta[None], np.array([s]))[0] for s in item.what.scales]
+        each = at_scales(lam[None], beta[None, :, None], item.what.scales)
         precision = lam + 1 / item.what.scales[int(np.argmax(each))] ** 2
         z = rng.normal(size=(DRAWS, len(lam))) / np.sqrt(precision)
         out.append((beta / precision + np.concatenate([z, -z])) @ U.T)

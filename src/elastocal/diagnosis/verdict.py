@@ -27,13 +27,12 @@ from elastocal.diagnosis.diagnosis import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import (
     LARGEST_SET,
-    Item,
     SelectedEffects,
     distances,
     fit_extended,
     settings_of,
 )
-from elastocal.diagnosis.evidence import Scan, exceedance
+from elastocal.diagnosis.evidence import Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.stated_floor import each_left_out, with_intervals
@@ -106,12 +105,14 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     The statistic is the largest evidence among the covariate's blocks; its distribution without
     structure comes from flipping the signs of whole configurations.
     """
-    if not observed.covariate_flips:
+    each = observed.covariates
+    if not each:
         return ()
-    largest = np.max(list(observed.covariate_flips.values()), axis=0)
-    odds, flips = observed.covariate_odds, observed.covariate_flips
+    odds = {covariate: float(own[0]) for covariate, own in each.items()}
+    largest = np.max([own[1:] for own in each.values()], axis=0)
     tests = [
-        StructureTest(c, exceedance(flips[c], odds[c]), exceedance(largest, odds[c])) for c in odds
+        StructureTest(c, exceedance(own[1:], odds[c]), exceedance(largest, odds[c]))
+        for c, own in each.items()
     ]
     return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
 
@@ -307,9 +308,8 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
     """Every hypothesis with its probability: in the slot where it is likeliest."""
     found = few.selected
     best: dict[tuple[str, str], Candidate] = {}
-    distance = {
-        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
-    }
+    alone = zip(dataset.hypotheses, found.alone.distance.tolist(), strict=False)
+    distance = {h.key: d for h, d in alone}
     for k, slot in enumerate(found.slots):
         rivals = few.rivals[k] if k < len(few.rivals) else ()
         named = {id(item.what): p for item, p in rivals if item.known}
@@ -337,8 +337,8 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
     advice = "spread the poses over more of the work space, or raise the load"
     return tuple(
         Untested(*h.key, reason, advice)
-        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
-        if s.distance < DETECTABLE and id(h) not in chosen
+        for h, d in zip(dataset.hypotheses, found.alone.distance, strict=False)
+        if d < DETECTABLE and id(h) not in chosen
     )
 
 
