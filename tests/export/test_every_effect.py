@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from support.robots import KR270
 from elastocal.cell.arm_description import Nominal
 from elastocal.export.export import Wish, export
 from elastocal.export.exportable import Conditions, cost_of, evaluate_pieces, keep
+from elastocal.model.arm import Arm, Spring
 from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
@@ -92,6 +94,16 @@ def test_it_is_accounted_for(name: str, elastic: bool) -> None:
         if entry is not None:
             assert entry.difference == cost.total
     assert evaluate_pieces(kept.exported, CONDITIONS).chain.n_joints == 6
+
+
+def test_a_spring_whose_axis_is_a_list_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    def add(arm: Arm, spring: Spring) -> None:
+        axis: Any = list(spring.axis)  # as an effect of a plug-in may state it
+        arm.springs.append(replace(spring, axis=axis))
+
+    monkeypatch.setattr(Arm, "add_spring", add)
+    kept = keep(calibrated("off_axis_compliance"), True, CONDITIONS)
+    assert len(evaluate_pieces(kept.exported, CONDITIONS).springs) > 6
 
 
 def test_linear_deflections_are_held_at_the_deflected_pose_and_that_costs() -> None:

@@ -109,7 +109,7 @@ def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
 # (tracker frame, z vertical).
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)  # a key, whatever its axis and law are made of
 class Spring:
     """One elastic degree of freedom: a small joint inserted into the chain.
 
