@@ -114,3 +114,19 @@ def test_the_mapping_shown_is_one_and_takes_the_files_it_names(tmp_path):
     (text,) = re.findall(r"```toml mapping\n(.*?)```", PAGE, re.S)
     with pytest.raises(InputError, match=r"mapping.toml: no file fits files = 'loaded\*.csv'"):
         imported(tmp_path, {"unloaded.txt": "", "poses.dat": ""}, text)
+
+
+def test_a_joint_stated_by_itself_counts_before_that_of_the_preset(tmp_path, readings):
+    _, degrees, points = readings
+    axes = ", ".join(f'q{i + 1}_deg = "A{i}"' for i in range(1, 7))
+    mapping = (
+        '[[source]]\npreset = "spatialanalyzer"\nfiles = ["points.txt"]\n'
+        f'[[source]]\npreset = "kuka"\ncolumns = {{ q1_mm = "E1", {axes} }}\n'
+    )
+    poses = krl(degrees).replace("E1 0.0", "E1 250.0")
+    files = {"points.txt": spatialanalyzer(points), "poses.dat": poses}
+    found = imported(tmp_path, files, mapping)
+    assert found.table.kinds == ("prismatic", *("revolute",) * 6)
+    q = np.repeat(degrees, points.shape[1], axis=0)
+    np.testing.assert_allclose(found.table.q[:, 0], 0.25)
+    np.testing.assert_allclose(np.degrees(found.table.q[:, 1:]), q, rtol=0, atol=1e-9)

@@ -8,10 +8,11 @@ import csv
 import math
 import re
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,6 @@ SAMPLE = 200  # lines that decide on the delimiter, and in which a header is loo
 SHOWN = 120
 
 Line = tuple[int, list[str]]  # its number and cells
-Header = tuple[str, int, tuple[str, ...]]  # the delimiter, the line (0: there is none) and cells
 
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"
@@ -133,12 +133,13 @@ def table_rows(
     passed over and listed.
     """
     guess = NumberCells("auto", settings.thousands, settings.missing, ())
-    places = [c.at for c in asked if c.required and c.quantities and isinstance(c.at, int)]
+    numbers = (c.at[0] for c in asked if c.required and c.quantities)
+    places = [at for at in numbers if isinstance(at, int)]
 
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    named = any(isinstance(part, str) for c in asked if c.required for part in c.parts)
+    named = any(isinstance(part, str) for c in asked if c.required for part in c.at)
     marks = tuple(settings.comments)
     skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
@@ -156,52 +157,63 @@ def table_rows(
     # Some write the names of the columns as a comment.
     mark = re.compile("".join(f"(?:{re.escape(m)})?" for m in sorted(marks, key=len, reverse=True)))
     plain = [(number, mark.sub("", line, count=1)) for number, line in comments[:SAMPLE]]
-    delimiter, header_line, header = (
-        _named_header(source, tried, [*content[:SAMPLE], *plain], asked)
-        if named else _unnamed_header(source, tried[0], content, is_data)
-    )  # fmt: skip
+    delimiter, begin, header_line, header = tried[0], 0, 0, list[str]()
+    for way, (number, line) in product(tried, [*content[:SAMPLE], *plain]) if named else ():
+        cells = _cells(way, line) or []
+        if not mapping_file.lacking(asked, cells):
+            delimiter, header_line, header = way, number, cells
+            break
+    table: list[Line] = []
+    for number, line in content:
+        if (found := _cells(delimiter, line)) is None:
+            raise InputError(
+                f"{source}, line {number}: quotation marks do not match in "
+                f"{quoted(line.strip())}; close them on the same line"
+            )
+        table.append((number, found))
+    if not named:
+        first = next((k for k, row in enumerate(table[:SAMPLE]) if is_data(row[1])), None)
+        if first is None:
+            number, line = content[0]
+            raise InputError(
+                f"{source}, line {number}: no numbers where the mapping has them, in "
+                f"{quoted(line.strip())} and the {min(len(content), SAMPLE) - 1} lines after it "
+                f"(columns split at {delimiter!r}); correct the places or the delimiter in [source]"
+            )
+        begin = table[first][0]
+        if first and len(table[first - 1][1]) == len(table[first][1]):
+            header_line, header = table[first - 1]
+    above = f"stands above the {'header' if header_line else 'first reading'}"
     rows: list[Line] = []
-    for number, cells in _split(source, delimiter, content):
-        if not named and header_line == 0 and not rows and not is_data(cells):
-            ignored.append((number, "stands above the first reading"))
-        elif number < header_line:
-            ignored.append((number, "stands above the header"))
-        elif number == header_line:
-            pass
-        elif header and [c.strip() for c in cells] == list(header):
+    for number, cells in table:
+        if number < (header_line or begin):
+            ignored.append((number, above))
+        elif header and cells == header and number != header_line:
             ignored.append((number, "repeats the header"))
-        elif any(cell.strip() for cell in cells):
+        elif any(cells) and number != header_line:
             rows.append((number, cells))
     if not rows:
         raise InputError(f"{source}: a header but no readings below it; export the points")
     if named and not header_line:  # which line comes nearest, and what it lacks
-        found = [(*row, mapping_file.lacking(asked, row[1])) for row in rows[:SAMPLE]]
-        number, cells, absent = min(found, key=lambda row: len(row[2]))
+        absent = [mapping_file.lacking(asked, cells) for _, cells in rows[:SAMPLE]]
+        least, (number, cells) = min(zip(absent, rows, strict=False), key=lambda row: len(row[0]))
         raise InputError(
             f"{source}: no line has all the columns that the mapping names; line {number} has "
-            f"{listed(map(quoted, cells), 12)}, but not {listed(absent, 8)}: correct "
+            f"{listed(map(quoted, cells), 12)}, but not {listed(least, 8)}: correct "
             "the names, the delimiter or the comments in [source], or give columns by number"
         )
     at = {"tab": "tabs", "space": "blanks"}.get(delimiter, f"{delimiter!r}")
     head = f"header in line {header_line}" if header_line else "no header"
     told = tuple(line for _, line in comments)
-    return Rows(header, rows, ignored, f"columns split at {at}, {head}", told)
+    return Rows(tuple(header), rows, ignored, f"columns split at {at}, {head}", told)
 
 
-def _split(source: str, name: str, lines: Sequence[tuple[int, str]]) -> Iterator[Line]:
-    """(line number, cells) of each line; a quotation mark that runs on is an error."""
-    reader = csv.reader(
-        (" ".join(line.split()) if name == "space" else line for _, line in lines),
-        delimiter=DELIMITER_NAMES[name], skipinitialspace=True,
-    )  # fmt: skip
-    for before, cells in enumerate(reader):
-        number, line = lines[before]
-        if reader.line_num != before + 1:
-            raise InputError(
-                f"{source}, line {number}: quotation marks do not match in "
-                f"{quoted(line.strip())}; close them on the same line"
-            )
-        yield number, cells
+def _cells(delimiter: str, line: str) -> list[str] | None:
+    """None where a quotation mark runs on beyond the line."""
+    text = " ".join(line.split()) if delimiter == "space" else line
+    reader = csv.reader([text, ""], delimiter=DELIMITER_NAMES[delimiter], skipinitialspace=True)
+    cells = next(reader)
+    return [cell.strip() for cell in cells] if reader.line_num == 1 else None
 
 
 def _by_numbers(content: list[tuple[int, str]]) -> list[str]:
@@ -209,48 +221,11 @@ def _by_numbers(content: list[tuple[int, str]]) -> list[str]:
     be decimal marks."""
 
     def numbers(delimiter: str) -> int:
-        counts = []
-        for line in content[:SAMPLE]:
-            with suppress(InputError):
-                ((_, cells),) = _split("", delimiter, [line])
-                counts.append(sum(bool(NUMBER.fullmatch(cell.strip())) for cell in cells))
-        return sorted(counts)[len(counts) // 2] if counts else 0
+        lines = (_cells(delimiter, line) or [] for _, line in content[:SAMPLE])
+        counts = sorted(sum(bool(NUMBER.fullmatch(cell)) for cell in cells) for cells in lines)
+        return counts[len(counts) // 2]
 
     return sorted(DELIMITER_NAMES, key=numbers, reverse=True)
-
-
-def _named_header(
-    source: str, tried: Sequence[str], lines: list[tuple[int, str]], asked: Sequence[ColumnKey]
-) -> Header:
-    for delimiter in tried:
-        try:
-            for one in lines:
-                ((number, cells),) = _split(source, delimiter, [one])
-                header = tuple(cell.strip() for cell in cells)
-                if not mapping_file.lacking(asked, header):
-                    return delimiter, number, header
-        except InputError:  # quotation marks that do not match with this one
-            if len(tried) == 1:
-                raise
-    return tried[0], 0, ()
-
-
-def _unnamed_header(
-    source: str, delimiter: str, content: list[tuple[int, str]],
-    is_data: Callable[[Sequence[str]], bool],
-) -> Header:  # fmt: skip
-    before: Line = 0, []
-    for number, cells in _split(source, delimiter, content[:SAMPLE]):
-        if is_data(cells):
-            known = before if len(before[1]) == len(cells) else (0, [])
-            return delimiter, known[0], tuple(cell.strip() for cell in known[1])
-        before = number, cells
-    number, line = content[0]
-    raise InputError(
-        f"{source}, line {number}: no numbers where the mapping has them, in "
-        f"{quoted(line.strip())} and the {min(len(content), SAMPLE) - 1} lines after it (columns "
-        f"split at {delimiter!r}); correct the places or the delimiter in [source]"
-    )
 
 
 class NumberCells:

@@ -260,31 +260,20 @@ class ColumnKey:
     stem: str
     unit: str
     quantities: tuple[str, ...] = ()
-    at: Where = ""
+    at: tuple[str | int, ...] = ()
     required: bool = True
     index: tuple[int, ...] = ()
     header: str = ""
 
     @property
-    def parts(self) -> list[str | int]:
-        return list(self.at) if isinstance(self.at, list) else [self.at]
-
-    @property
     def of_each_marker(self) -> bool:
         """Whether one row has such a column for each marker."""
-        return isinstance(self.at, str) and EACH in self.at
+        return EACH in str(self.at[0])
 
     def of_marker(self, name: str) -> ColumnKey:
-        return replace(self, at=str(self.at).replace(EACH, name)) if self.of_each_marker else self
-
-    @property
-    def is_template(self) -> bool:
-        """q#: one column for each joint."""
-        return self.stem.endswith("#")
-
-    def numbered(self, i: int) -> ColumnKey:
-        key, stem = self.key.replace("#", str(i)), f"{self.stem[:-1]}{i}"
-        return replace(self, key=key, stem=stem, required=self.required and i == 1)
+        if not self.of_each_marker:
+            return self
+        return replace(self, at=(str(self.at[0]).replace(EACH, name),))
 
 
 def column_key(where: str, key: str) -> ColumnKey:
@@ -318,16 +307,14 @@ def wanted(
 ) -> tuple[ColumnKey, ...]:
     """The keys of [source.columns] (required) and [source.optional], checked."""
     filled: dict[str, ColumnKey] = {}
+    # q1 that is stated by itself counts before the q1 of q#, as of a preset.
+    single = {column_key(where, name).stem for name in (*required, *optional) if "#" not in name}
     for name, at, needed in (*((*own, True) for own in required.items()),
                             *((*own, False) for own in optional.items())):  # fmt: skip
-        target = replace(column_key(where, name), at=at, required=needed)
-        # Seconds and nanoseconds of one clock stand in two columns, and are added.
-        before = filled.setdefault(name if target.stem == "time" else target.stem, target)
+        target, places = column_key(where, name), at if isinstance(at, list) else [at]
+        joints = range(1, MOST_JOINTS + 1) if "#" in name else ()  # q#: one column for each
         require(
-            before is target, f"{where}: {before.key} and {name} fill the same column; keep one"
-        )
-        require(
-            not (target.is_template and any(isinstance(p, int) for p in target.parts)),
+            not (joints and any(isinstance(part, int) for part in places)),
             f'{where}: {name} takes a name with # or #0 in it, as in "position_#0"; write '
             f"{name.replace('#', '1')} = {at}, … for columns by number",
         )
@@ -336,27 +323,40 @@ def wanted(
             f"{where}: {name} takes one column; only texts such as name are joined from several",
         )
         require(
-            EACH not in str(at) or (target.of_each_marker and bool(target.quantities)),
+            EACH not in str(at) or bool(target.quantities),
             f"{where}: {name} = {quoted(str(at))}: {EACH} stands for the markers of a row in "
             'places of numbers, as in x_mm = "*_x"',
         )
+        every = [replace(target, at=tuple(places), required=needed)]
+        if joints:
+            every = [
+                replace(
+                    target, key=name.replace("#", str(i)), stem=target.stem.replace("#", str(i)),
+                    at=tuple(str(part).replace("#0", str(i - 1)).replace("#", str(i))
+                             for part in places),
+                    required=needed and i == 1,
+                )
+                for i in joints if target.stem.replace("#", str(i)) not in single
+            ]  # fmt: skip
+        for one in every:
+            # Seconds and nanoseconds of one clock stand in two columns, and are added.
+            before = filled.setdefault(name if one.stem == "time" else one.stem, one)
+            require(
+                before is one, f"{where}: {before.key} and {name} fill the same column; keep one"
+            )
     return tuple(filled.values())
 
 
 def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
     """The required columns asked for by name that a line does not name, as the mapping has them."""
-    absent = []
     free = _unnamed(asked, cells)
-    for target in (c for c in asked if c.required):
-        if target.of_each_marker:
-            if not _marker_names(target, free):
-                absent.append(f"{target.key} = {quoted(str(target.at))}")
-            continue
-        first = target.numbered(1) if target.is_template else target
-        for part in target.parts:
-            if isinstance(part, str) and not _find(_named(part, first), cells):
-                absent.append(f"{target.key} = {quoted(part)}")
-    return absent
+    return [
+        f"{target.key} = {quoted(part)}"
+        for target in asked
+        for part in target.at
+        if target.required and isinstance(part, str)
+        and not (_marker_names(target, free) if target.of_each_marker else _find(part, cells))
+    ]  # fmt: skip
 
 
 def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
@@ -371,7 +371,7 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
                       if name not in own and (t.required or {*own} & {*names})]:  # fmt: skip
             raise InputError(
                 f"{source}: {quoted(name)} has no column for {listed(t.key for t in absent)}, as "
-                f"{quoted(str(absent[0].of_marker(name).at))}; write the places so that {EACH} "
+                f"{quoted(str(absent[0].of_marker(name).at[0]))}; write the places so that {EACH} "
                 "stands for the markers' names alone"
             )
     return names
@@ -380,10 +380,9 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
 def _unnamed(asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
     """The cells of a header without those that the mapping calls by their whole name, as force_z:
     no marker is called force."""
-    named = [part for c in asked if not c.of_each_marker and not c.is_template
-             for part in c.parts if isinstance(part, str)]  # fmt: skip
-    taken = {i for part in named for name in part.split("|") for i in _find([name], header)}
-    return [cell for i, cell in enumerate(header) if i not in taken]
+    named = {_plain(name) for c in asked if not c.of_each_marker
+             for part in c.at for name in str(part).split("|")}  # fmt: skip
+    return [cell for cell in header if not named & {_plain(cell), _unitless(cell)}]
 
 
 def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
@@ -394,7 +393,7 @@ def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
         unit = split_unit(cell)[1]
         if unit is not None and not set(quantities(unit)) & set(target.quantities):
             continue
-        for part in str(target.at).split("|"):
+        for part in str(target.at[0]).split("|"):
             before, _, after = (re.escape(piece) for piece in part.strip().partition(EACH))
             for text in (" ".join(cell.split()), " ".join(split_unit(cell)[0].split())):
                 if match := re.fullmatch(f"{before}(.+?){after}", text, re.IGNORECASE):
@@ -414,11 +413,7 @@ def resolve(
     """
     columns: list[ColumnKey] = []
     for target in asked:
-        joints = (target.numbered(i) for i in range(1, MOST_JOINTS + 1))
-        for one in joints if target.is_template else (target,):
-            found = _column(source, one, header, width)
-            if found is None:
-                break
+        if (found := _column(source, target, header, width)) is not None:
             columns.append(_with_unit(source, found, units, hint))
     unstated = {c: column(c.stem, next(iter(FACTORS[c.quantities[0]]))) for c in columns
                 if c.unit == AUTO}  # fmt: skip
@@ -438,9 +433,9 @@ def resolve(
 
 def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> ColumnKey | None:
     index = []
-    for part in target.parts:
-        sought = [] if isinstance(part, int) else _named(part, target)
-        hits = [part - 1] * (part <= width) if isinstance(part, int) else _find(sought, header)
+    for part in target.at:
+        sought = [] if isinstance(part, int) else [name.strip() for name in part.split("|")]
+        hits = [part - 1] * (part <= width) if isinstance(part, int) else _find(part, header)
         if not hits and not target.required:
             return None
         require(
@@ -463,14 +458,6 @@ def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -
     return replace(target, index=tuple(index), header=" + ".join(names))
 
 
-def _named(part: str, target: ColumnKey) -> list[str]:
-    """The names "A|B#" stands for, with the joint's number from 1 (#) or 0 (#0)."""
-    number = re.search(r"\d+", target.stem) if "#" in part else None
-    if number:
-        part = part.replace("#0", str(int(number[0]) - 1)).replace("#", number[0])
-    return [name.strip() for name in part.split("|")]
-
-
 @lru_cache(4096)  # of one header many names are sought
 def _plain(name: str) -> str:
     return " ".join(name.split()).casefold()
@@ -481,9 +468,10 @@ def _unitless(name: str) -> str:
     return _plain(split_unit(name)[0])
 
 
-def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
-    """Columns with the first of the names that any has; by the whole header, else less its unit."""
-    for name in names:
+def _find(names: str, header: Sequence[str]) -> list[int]:
+    """Columns with the first of the names "A|B" that any has; by the whole header, else less its
+    unit."""
+    for name in names.split("|"):
         sought = _plain(name)
         for view in (_plain, _unitless):
             hits = [i for i, cell in enumerate(map(view, header)) if cell == sought]
