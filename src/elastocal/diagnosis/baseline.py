@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.identification.least_squares import TOLERANCE
-from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit
+from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit, with_placed
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import stated_by_observation, weights_for
 from elastocal.measurements import Measurements, load_states, numbered, ranked, visits
@@ -162,18 +162,15 @@ def fit_baseline(
     if x0 is None:
         x0 = start_values(model, table, seed)
     problem = posed(model, observed, weights, x0, free)
-    placed, nominal = free[is_placed(model)], None
-    if len(placed) and not started:
-        base = tied_fit(replace(problem, free=placed), PLACING)
-        problem, nominal = replace(problem, x0=base.x), base.residual
+    nominal = None
+    if not started:
+        problem, nominal = with_placed(problem, PLACING)
     if len(free):
         found = tied_fit(problem, TOLERANCE)
         x, residual = found.x, found.residual
     else:
         x, residual = x0, problem.residual(x0)
-    if nominal is None:
-        unknown = np.full_like(residual, np.nan)
-        nominal = unknown if started else problem.residual(problem.x0)
+    nominal = np.full_like(residual, np.nan) if nominal is None else nominal
     stated = stated_by_observation(observed, model.cell.tracker)
     return Baseline(model, observed, x, problem.sizes, residual, nominal, stated)
 

@@ -20,13 +20,7 @@ from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.outliers import FALSE_ALARM, named_runs
-from elastocal.identification.start import (
-    OF_A_TARGET,
-    SCALED,
-    LinearFits,
-    Registration,
-    nominal_problem,
-)
+from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import index
@@ -124,10 +118,10 @@ def _some(table: Measurements) -> Measurements:
 
 def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
-    problem = nominal_problem(model, _some(table))
-    found = Registration(problem)
-    place = found.places(problem.flange, problem.marker)
-    distance = np.linalg.norm(problem.points - place, axis=1)
+    table = _some(table)
+    found = Registration.of(model, table)
+    place = found.places(model.rigid.flange_poses(table), table.marker)
+    distance = np.linalg.norm(np.asarray(table.position) - place, axis=1)
     return found.error, float(np.percentile(distance, MOST))
 
 
@@ -320,7 +314,7 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
 def _placed_by(
     model: Model, table: Measurements, rows: IntArray, shift: IntArray | int
 ) -> Registration:
-    return Registration(nominal_problem(model, _moved(table, rows, shift)))
+    return Registration.of(model, _moved(table, rows, shift))
 
 
 def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:
@@ -576,13 +570,12 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
     poses = len(np.unique(table.q, axis=0))
     if table.position is None or len(names) < 2 or not FEWEST_POSES <= poses <= n <= MOST_READINGS:
         return None
-    problem, row = nominal_problem(model, table), np.arange(n)
+    flange, row = model.rigid.flange_poses(table), np.arange(n)
     marker, far = table.marker, np.sqrt(special.chdtri(3, FALSE_ALARM / n))
     for _ in range(PASSES):  # base and markers by the names as they should be
-        found = Registration(replace(problem, marker=marker))
-        each = [found.places(problem.flange, np.full(n, m)) for m in range(len(names))]
-        places = np.stack(each, axis=1)
-        distance = np.linalg.norm(problem.points[:, None] - places, axis=2)
+        found = Registration.of(model, replace(table, marker=marker))
+        places = np.stack([found.places(flange, np.full(n, m)) for m in range(len(names))], axis=1)
+        distance = np.linalg.norm(table.position[:, None] - places, axis=2)
         nearest = distance.argmin(axis=1)
         least = distance[row, nearest]
         limit = far * np.median(least) / np.sqrt(special.chdtri(3, 0.5))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.least_squares import Fit, PriorRows, fit, moved, root_of
+from elastocal.identification.least_squares import Fit, PriorRows, fit, root_of
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -22,14 +22,11 @@ from elastocal.identification.residuals import (
     predicts_better,
     rms_3d,
 )
-from elastocal.identification.start import check_enough
 from elastocal.identification.weighted_problem import (
-    Part,
     Problem,
     RFactor,
     Weights,
     least_norm,
-    merge,
 )
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
@@ -213,40 +210,28 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides, first on the linearised model, then on the refitted one.
+    decides.
     """
-    problem, heldout = found.problem, list[Array]()
+    problem, held = found.problem, None
     observed = problem.observations
-
-    def predicts(wide: Array) -> bool:
-        if not heldout:
-            heldout.append(looked_at(found)[0])
-        own = observed.configuration, observed.size
-        return predicts_better(heldout[-1], wide, problem.weights, *own)
-
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, found.of_free, sigma, threshold)
         own = found.of_free.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
-        # Of least length in typical sizes where several are least squares.
-        size, cond = problem.sizes[wider.kept], own.rows * np.finfo(float).eps
-        step = size * least_norm(own.R * size, own.projected, cond=cond)
-        start = moved(found.x, wider.kept, step)
-        linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)
-        if not predicts(linear[0]):
-            continue
+        held = looked_at(found)[0] if held is None else held
         try:
-            wide = fit_kept(problem, start, wider, max_steps=30)
+            wide = fit_kept(problem, found.x, wider, max_steps=30)
             after = looked_at(wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        if wide.converged and fits_better(found.r_factor, wide.r_factor) and predicts(after):
-            found, reduction = wide, wider
-            heldout.append(after)
+        own_rows = problem.weights, observed.configuration, observed.size
+        better = wide.converged and fits_better(found.r_factor, wide.r_factor)
+        if better and predicts_better(held, after, *own_rows):
+            found, reduction, held = wide, wider, after
     return found, reduction
 
 
@@ -255,8 +240,8 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
 LOOSE, PLACED = 3.0, 0.3
-# What a step promises of the cost where tied fits end: what is placed, where a parameter of it gets
-# dropped and is held for good, and where the choice and the fit only begin.
+# What a step promises of the cost where tied fits end: what is placed, where a parameter of it
+# gets dropped and is held for good, and where the choice and the fit only begin.
 PLACING, CHOOSING = 1e-12, 1e-2
 # Observations from which on a fit starts from a sample, and how many there are in it.
 MANY, SAMPLE = 2000, 5000
@@ -320,15 +305,9 @@ def settle(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    model, started, exact = problem.model, problem.x0, False
-    placed = problem.free[is_placed(model)[problem.free]]
-    if len(placed):
-        progress("placing base and markers")
-        base = tied_fit(replace(problem, free=placed), CHOOSING)
-        problem = replace(problem, x0=base.x)
-        nominal = base.residual
-    else:
-        nominal = problem.residual(problem.x0)
+    progress("placing base and markers")
+    started, exact = problem, False
+    problem, nominal = with_placed(problem, CHOOSING)
     progress("first fit, tied weakly to the start")
     few = _sampled(problem)
     found = _tied_from(few, problem.x0, CHOOSING)
@@ -340,9 +319,8 @@ def settle(
         reduction = choose(problem, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
             break
-        if not exact and is_placed(model)[reduction.dropped].any():
-            asked = replace(problem, free=placed, x0=started)
-            problem, exact = replace(problem, x0=tied_fit(asked, PLACING).x), True
+        if not exact and is_placed(problem.model)[reduction.dropped].any():
+            problem, exact = with_placed(started, PLACING)[0], True
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
         found = fit_kept(problem, found.x, reduction)
@@ -351,6 +329,15 @@ def settle(
     if left is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)
     return found, reduction, nominal
+
+
+def with_placed(problem: Problem, tolerance: float) -> tuple[Problem, Array]:
+    """The problem with base, markers and cable placed at x0, and the residual (rows,) there."""
+    placed = problem.free[is_placed(problem.model)[problem.free]]
+    if not len(placed):
+        return problem, problem.residual(problem.x0)
+    found = tied_fit(replace(problem, free=placed), tolerance)
+    return replace(problem, x0=found.x), found.residual
 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
@@ -365,26 +352,23 @@ def posed(
     problem = Problem(model, observed, weights, x0, free, np.ones(len(x0)))
     # What is shrunk has its size from its prior.
     every = np.flatnonzero(~model.shrunk | np.isin(np.arange(len(model.shrunk)), free))
-    few = len(observed.value) <= len(free)  # more equations than unknowns need no rank
-    placed = is_placed(model)
-    known = placed | np.array([p.typical is not None for p in model.parameters], dtype=bool)
-    if known.all() and not few:  # then sizes need no B
-        sizes = model.sizes(np.zeros((1, len(known))))
-        return replace(problem, sizes=np.where(placed, PLACED, sizes))
-
-    def of_part(part: Part) -> tuple[Array, RFactor | None]:
-        at = problem.regressor(part, x0, every)
-        r_factor = RFactor.of(at.B[:, np.searchsorted(every, free)], at.residual) if few else None
-        return np.abs(at.B).max(axis=0, initial=0.0), r_factor
-
-    largest, factors = zip(*problem.each(of_part), strict=True)
-    moved = np.zeros((len(largest), len(model.parameters)))
-    moved[:, every] = np.stack(largest)
-    sizes = model.sizes(moved)
-    sizes[placed] = PLACED
-    if few:
-        check_enough(model, observed, merge(t for t in factors if t is not None).R * sizes[free])
-    return replace(problem, sizes=sizes)
+    largest = np.zeros((1, len(x0)))
+    for B in problem.each(lambda part: problem.regressor(part, x0, every).B):
+        largest[0, every] = np.maximum(largest[0, every], np.abs(B).max(axis=0))
+    problem = replace(problem, sizes=np.where(is_placed(model), PLACED, model.sizes(largest)))
+    rows, p = len(observed.value), len(free)
+    if rows > p:  # more equations than unknowns need no rank
+        return problem
+    R = problem.evaluate(x0, free).r_factor.R * problem.sizes[free]
+    rank = int(np.linalg.matrix_rank(R, rtol=STRUCTURAL))
+    if rank == rows:
+        lacking = max(-(-(rank + 1) // observed.size), -(-p // observed.size))
+        raise InsufficientDataError(
+            f"{observed.table.source}: {rows} equations from {len(observed.lead)} readings cannot "
+            f"determine the model's {p} parameters and their uncertainty; measure more poses (more "
+            f"than {lacking} readings) or fit fewer effects"
+        )
+    return problem
 
 
 # Draws of what is dropped, and of the errors of what is kept: from eight the result is a third

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import combinations, product
 
 import numpy as np
 import scipy  # whose `optimize` loads where it is used: it takes as long as a small fit
-from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option
-from elastocal.measurements import Measurements, visits
+from elastocal.measurements import Measurements, firsts, numbered, visits
 from elastocal.model.chain import joint_limits
 from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
 from elastocal.model.manipulator import Model
@@ -70,129 +69,110 @@ SETTLED = 1e-6  # change of the median distance, relative, with which the sweeps
 RCOND = 1e-6  # a direction the poses do not show stays at zero instead of running away
 
 
-@dataclass(frozen=True)
-class RegistrationProblem:
-    """Find R_b, t_b, m with p_i = R_b (R_i m_c(i) + t_i) + t_b.
+class Registration:
+    """R_b, t_b, m with p_i = R_b (R_i m_c(i) + t_i) + t_b by robust alternating registration from
+    several starts; the best by median distance wins: T_tracker_base as rotation (3, 3) and
+    translation (3,), `markers` (M, 3) in the flange frame, and the median distance `error` in m of
+    readings from the nominal arm.
 
     `flange` (n, 4, 4): nominal flange poses in the base frame; `points` (n, 3) readings; `marker`
-    (n,) codes into `start_markers` (M, 3), of which `free_markers` (M,) are unknown; a known base
-    is (`base_rotation`, `base_translation`).
-    """
-
-    flange: Array
-    points: Array
-    marker: IntArray
-    start_markers: Array
-    free_markers: BoolArray
-    free_base: bool = True
-    base_rotation: Array = field(default_factory=lambda: np.eye(3))
-    base_translation: Array = field(default_factory=lambda: np.zeros(3))
-
-
-def nominal_problem(model: Model, table: Measurements) -> RegistrationProblem:
-    n = len(table.marker_names)
-    return RegistrationProblem(
-        model.rigid.flange_poses(table), np.asarray(table.position), table.marker,
-        np.zeros((n, 3)), np.ones(n, dtype=bool),
-    )  # fmt: skip
-
-
-class Registration:
-    """Robust alternating registration from several starts; the best by median distance wins:
-    T_tracker_base as rotation (3, 3) and translation (3,), `markers` (M, 3) in the flange frame,
-    and the median distance `error` in m of readings from the nominal arm.
+    (n,) codes into `markers` (M, 3), of which `free` (M,), by default all, are unknown; `base`,
+    rotation and translation, where it is known.
 
     Starts: the base turned as the linear (non-orthogonal) solution says, as a fit with the
     start markers says, and as the 24 rotations of a cube, so that any attitude is near one.
     """
 
-    def __init__(self, problem: RegistrationProblem, seed: int = 0) -> None:
-        n = len(problem.points)
-        if n > SAMPLE:
-            chosen = np.random.default_rng(seed).choice(n, SAMPLE, replace=False)
-            of_rows = ("flange", "points", "marker")
-            problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
-        starts = problem.base_rotation[None]
-        if problem.free_base:
-            linear = LinearFits(problem.flange[None], problem.points, problem.marker).matrix[0]
-            U, _, Vt = np.linalg.svd(linear.T)
-            body = _body_points(problem, problem.start_markers)
-            starts = np.stack([
+    def __init__(
+        self, flange: Array, points: Array, marker: IntArray, markers: Array,
+        free: BoolArray | None = None, base: tuple[Array, Array] | None = None, seed: int = 0,
+    ) -> None:  # fmt: skip
+        if len(points) > SAMPLE:
+            some = np.random.default_rng(seed).choice(len(points), SAMPLE, replace=False)
+            flange, points, marker = flange[some], points[some], marker[some]
+        self._flange, self._points, self._marker, self._base = flange, points, marker, base
+        self._free = np.arange(len(markers)) if free is None else np.flatnonzero(free)
+        self._fixed = markers.copy()
+        self._fixed[self._free] = 0.0
+        if base is None:
+            U, _, Vt = np.linalg.svd(LinearFits(flange[None], points, marker).matrix[0].T)
+            rotation = np.stack([
                 U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt,
-                _rotation_between(body, problem.points, np.ones(len(body))),
+                _rotation_between(self._body(markers), points, np.ones(len(points))),
                 *Rotation.create_group("O").as_matrix(),
             ])  # fmt: skip
-        rough = _descended(
-            problem, starts, np.ones((len(starts), len(problem.points))), ROUGH_SWEEPS
-        )
+        else:
+            rotation = base[0][None]
+        weight = np.ones((len(rotation), len(points)))
         # A few sweeps show which starts lead where; the others need not be gone through to the end.
-        nearest = np.argsort(rough[3], kind="stable")[:FINALISTS]
-        rotation, translation, markers, error, _ = _descended(
-            problem, rough[0][nearest], rough[4][nearest], SWEEPS
-        )
-        best = int(np.argmin(error))
-        self.rotation, self.translation = rotation[best], translation[best]
-        self.markers, self.error = markers[best], float(error[best])
+        for sweeps, left in ((ROUGH_SWEEPS, FINALISTS), (SWEEPS, 1)):
+            ends = self._descended(rotation, weight, sweeps)
+            nearest = np.argsort(ends[2], kind="stable")[:left]
+            rotation, weight, error, translation, placed = (end[nearest] for end in ends)
+        self.rotation, self.translation = rotation[0], translation[0]
+        self.markers, self.error = placed[0], float(error[0])
+
+    @classmethod
+    def of(cls, model: Model, table: Measurements) -> Registration:
+        """All of a table's markers, wherever they are."""
+        flange, start = model.rigid.flange_poses(table), np.zeros((len(table.marker_names), 3))
+        return cls(flange, np.asarray(table.position), table.marker, start)
 
     def places(self, flange: Array, marker: IntArray) -> Array:
         """Where flanges (n, 4, 4) have each `marker` (n,)."""
         body = np.einsum("nij,nj->ni", flange[:, :3, :3], self.markers[marker]) + flange[:, :3, 3]
         return np.asarray(body @ self.rotation.T + self.translation)
 
+    def _descended(
+        self, rotation: Array, weight: Array, sweeps: int
+    ) -> tuple[Array, Array, Array, Array, Array]:
+        """Rotations, weights, median distances, translations and markers after `sweeps` from every
+        `rotation` (s, 3, 3) and `weight` (s, n), all of them together.
 
-def _descended(
-    problem: RegistrationProblem, rotation: Array, weight: Array, sweeps: int
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Rotations, translations, markers, median distances and weights after `sweeps` from every
-    `rotation` (s, 3, 3) and `weight` (s, n), all of them together.
+        Translation and markers (linear) and rotation (Kabsch) in turn, reweighted by distance so
+        that a share of wrong readings does not pull the start.
+        """
+        error = np.full(len(rotation), np.inf)
+        translation, markers = self._linear_parts(rotation, weight)
+        for _ in range(sweeps):
+            if self._base is None:
+                rotation = _rotation_between(self._body(markers), self._points, weight)
+            translation, markers = self._linear_parts(rotation, weight)
+            predicted = self._body(markers) @ rotation.swapaxes(1, 2) + translation[:, None]
+            distance = np.linalg.norm(self._points - predicted, axis=2)
+            previous, error = error, np.median(distance, axis=1)
+            weight = 1.0 / np.maximum(distance, np.maximum(error, 1e-9)[:, None])
+            if (np.abs(previous - error) <= SETTLED * error).all():
+                break
+        return rotation, weight, error, translation, markers
 
-    Translation and markers (linear) and rotation (Kabsch) in turn, reweighted by distance so that
-    a share of wrong readings does not pull the start.
-    """
-    translation, markers = _linear_parts(problem, rotation, weight)
-    error = np.full(len(rotation), np.inf)
-    for _ in range(sweeps):
-        if problem.free_base:
-            body = _body_points(problem, markers)
-            rotation = _rotation_between(body, problem.points, weight)
-        translation, markers = _linear_parts(problem, rotation, weight)
-        predicted = _body_points(problem, markers) @ rotation.swapaxes(1, 2) + translation[:, None]
-        distance = np.linalg.norm(problem.points - predicted, axis=2)
-        previous, error = error, np.median(distance, axis=1)
-        weight = 1.0 / np.maximum(distance, np.maximum(error, 1e-9)[:, None])
-        if (np.abs(previous - error) <= SETTLED * error).all():
-            break
-    return rotation, translation, markers, error, weight
+    def _linear_parts(self, R: Array, weight: Array) -> tuple[Array, Array]:
+        """Translation (s, 3) and markers (s, M, 3) for every rotation R (s, 3, 3) and weight
+        (s, n).
 
+        With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations.  Its
+        normal equations cost half the digits, which a start can spare.
+        """
+        n, known = len(self._points), np.zeros(3) if self._base is None else self._base[1]
+        y = (self._points - known) @ R - self._body(self._fixed)
+        own = (self._marker[:, None] == self._free)[:, None, :, None]
+        turned = (own * self._flange[:, :3, None, :3]).reshape(n, 3, -1)
+        base = np.broadcast_to(np.eye(3) * (self._base is None), (n, 3, 3))
+        rows = np.concatenate([base, turned], axis=2).reshape(3 * n, -1)
+        weighted = (rows * np.repeat(weight, 3, axis=1)[..., None]).transpose(0, 2, 1)
+        values, vectors = np.linalg.eigh(weighted @ rows)
+        shown = values > RCOND**2 * values[:, -1:]
+        right = (weighted @ y.reshape(len(R), -1, 1)).transpose(0, 2, 1)
+        along = (right @ vectors)[:, 0] / np.where(shown, values, np.inf)
+        x = (vectors @ along[..., None])[..., 0]
+        markers = np.tile(self._fixed, (len(R), 1, 1))
+        markers[:, self._free] = x[:, 3:].reshape(len(R), -1, 3)
+        return known + (R @ x[:, :3, None])[..., 0], markers
 
-def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tuple[Array, Array]:
-    """Translation (s, 3) and markers (s, M, 3) for every rotation R (s, 3, 3) and weight (s, n).
-
-    With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations.  Its normal
-    equations cost half the digits, which a start can spare.
-    """
-    n, free = len(problem.points), np.flatnonzero(problem.free_markers)
-    fixed = problem.start_markers * ~problem.free_markers[:, None]
-    known = np.zeros(3) if problem.free_base else problem.base_translation
-    y = (problem.points - known) @ R - _body_points(problem, fixed)
-    turned = (problem.marker[:, None] == free)[:, None, :, None] * problem.flange[:, :3, None, :3]
-    base = np.broadcast_to(np.eye(3) * problem.free_base, (n, 3, 3))
-    rows = np.concatenate([base, turned.reshape(n, 3, -1)], axis=2).reshape(3 * n, -1)
-    weighted = (rows * np.repeat(weight, 3, axis=1)[..., None]).transpose(0, 2, 1)
-    values, vectors = np.linalg.eigh(weighted @ rows)
-    shown = values > RCOND**2 * values[:, -1:]
-    right = (weighted @ y.reshape(len(R), -1, 1)).transpose(0, 2, 1)
-    along = (right @ vectors)[:, 0] / np.where(shown, values, np.inf)
-    x = (vectors @ along[..., None])[..., 0]
-    markers = np.broadcast_to(fixed, (len(R), *fixed.shape)).copy()
-    markers[:, free] = x[:, 3:].reshape(len(R), -1, 3)
-    return known + (R @ x[:, :3, None])[..., 0], markers
-
-
-def _body_points(problem: RegistrationProblem, markers: Array) -> Array:
-    """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
-    turned = problem.flange[:, :3, :3] @ markers[..., problem.marker, :, None]
-    return np.asarray(turned[..., 0] + problem.flange[:, :3, 3])
+    def _body(self, markers: Array) -> Array:
+        """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
+        turned = self._flange[:, :3, :3] @ markers[..., self._marker, :, None]
+        return np.asarray(turned[..., 0] + self._flange[:, :3, 3])
 
 
 def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
@@ -240,41 +220,35 @@ def start_values(
     rows = np.flatnonzero(light) if enough else np.arange(len(table))
     if len(rows) > SAMPLE:
         rows = np.random.default_rng(seed).choice(rows, SAMPLE, replace=False)
-    T = model.rigid.flange_poses(table.take(rows))
-    nominal = model.cell.model.nominal
-    problem = RegistrationProblem(
-        T, table.position[rows], codes[rows],
+    table, codes = table.take(rows), codes[rows]
+    flange, nominal = model.rigid.flange_poses(table), model.cell.model.nominal
+    unturned, at = nominal.base_rotation, nominal.base_position
+    stated = np.eye(3) if unturned is None else unturned, np.zeros(3) if at is None else at
+    found = Registration(
+        flange, np.asarray(table.position), codes,
         np.array([model.cell.tool.markers[m] for m in names]),
         np.array([f"marker:{m}" in places for m in names]),
-        "base" in places,
-        np.eye(3) if nominal.base_rotation is None else nominal.base_rotation,
-        np.zeros(3) if nominal.base_position is None else nominal.base_position,
+        None if "base" in places else stated, seed,
     )  # fmt: skip
-    found = Registration(problem, seed)
-    values = dict(zip(("base.x", "base.y", "base.z"), found.translation, strict=True))
-    vector = Rotation.from_matrix(found.rotation).as_rotvec()
-    values |= dict(zip(("base.rx", "base.ry", "base.rz"), vector, strict=True))
-    for name, position in zip(names, found.markers, strict=True):
-        values |= {f"marker:{name}.{k}": v for k, v in zip("xyz", position, strict=True)}
+    values = {
+        "base.": [*found.translation],
+        "base.r": Rotation.from_matrix(found.rotation).as_rotvec(),
+    }
+    values |= {f"marker:{name}.": at for name, at in zip(names, found.markers, strict=True)}
     if model.observe == "pose" and table.rotation is not None:
-        values |= _target_rotations(found.rotation, T, table.take(rows), codes[rows], names)
+        arm = Rotation.from_matrix(found.rotation @ flange[:, :3, :3])
+        relative = arm.inv() * Rotation.from_rotvec(table.rotation)
+        values |= {f"marker:{names[c]}.r": relative[codes == c].mean().as_rotvec()
+                   for c in np.unique(codes)}  # fmt: skip
+    of = {
+        f"{name}{k}": float(v)
+        for name, xyz in values.items()
+        for k, v in zip("xyz", xyz, strict=True)
+    }
     for i, parameter in enumerate(model.parameters):
-        if parameter.name in values and i in movable:
-            x[i] = values[parameter.name]
+        if parameter.name in of and i in movable:
+            x[i] = of[parameter.name]
     return x
-
-
-def _target_rotations(
-    base: Array, T: Array, table: Measurements, codes: NDArray, names: list[str]
-) -> dict[str, float]:
-    measured = Rotation.from_rotvec(np.asarray(table.rotation))
-    relative = Rotation.from_matrix(base @ T[:, :3, :3]).inv() * measured
-    values: dict[str, float] = {}
-    for c, name in enumerate(names):
-        if (codes == c).any():
-            vector = relative[codes == c].mean().as_rotvec()
-            values |= {f"marker:{name}.r{k}": v for k, v in zip("xyz", vector, strict=True)}
-    return values
 
 
 def _distance_start(model: Model, table: Measurements, x: Array, movable: set[int]) -> Array:
@@ -465,24 +439,6 @@ def ordinary(model: Model, free: IntArray) -> IntArray:
     return found
 
 
-def check_enough(model: Model, observed: Observations, scaled: Array) -> None:
-    """Refuse when the equations are too few for the minimal set; `scaled`: B
-    (rows, free) in typical sizes, or its R."""
-    rows = len(observed.value)
-    kept = linalg.qr(scaled, mode="r", pivoting=True)[0]
-    diagonal = np.abs(np.diag(kept))
-    rank = int((diagonal > 1e-7 * diagonal.max(initial=0.0)).sum())
-    if rank < rows:
-        return
-    lacking = -(-(rank + 1) // observed.size)
-    raise InsufficientDataError(
-        f"{observed.table.source}: {rows} equations from {len(observed.lead)} readings cannot "
-        f"determine the model's {scaled.shape[1]} parameters and their uncertainty; measure more "
-        f"poses (more than {max(lacking, -(-scaled.shape[1] // observed.size))} readings) or fit "
-        "fewer effects"
-    )
-
-
 # Readings that are copies of others.
 #
 # A repeat differs from its first reading by the noise.  It agrees to the last digit only where
@@ -508,32 +464,24 @@ def copied(observed: Observations) -> BoolArray:
         value = np.hstack([value[:, :3], table.rotation[own]])
     said = [table.q, table.force, table.marker[:, None]]
     said += [] if table.torque is None else [table.torque]
-    found = np.zeros(n, dtype=bool)
-    # Sorting whole rows takes long, and most tables have none to look at.
-    ordered = np.sort(value[:, 0])
-    alike = np.flatnonzero(np.isin(value[:, 0], ordered[1:][ordered[1:] == ordered[:-1]]))
-    if not len(alike):
-        return found
-    key = np.column_stack(said)[own]
-    _, first = np.unique(np.hstack([key[alike], value[alike]]), axis=0, return_index=True)
-    found[np.delete(alike, first)] = True
-    if not found.any():
-        return found
+    key = np.column_stack(said)[own].T
+    whole = numbered(*value.T, *key)
+    found = firsts(whole, int(whole.max()) + 1)[whole] != np.arange(n)
     steps = value[:, :3] / NO_FINER
-    if np.abs(steps - np.round(steps)).max() > 1e-3:
+    if not found.any() or np.abs(steps - np.round(steps)).max() > 1e-3:
         return found
-    _, start, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    group = group.ravel()
-    others = np.flatnonzero(start[group] != np.arange(n))
-    same = value[others] == value[start[group[others]]]
+    group = numbered(*key)
+    size = np.bincount(group)
+    first = firsts(group, len(size))[group]
+    others = np.flatnonzero(first != np.arange(n))
+    same = value[others] == value[first[others]]
     differing = same[~same.all(axis=1)]
     partly = (differing.sum(axis=0) + 0.5) / (len(differing) + 1)
     share = 0.0
     for _ in range(ROUNDS):
         share = float(np.prod(partly * (1 - share) + share))
     # A reading with k others before it is like one of them with probability 1 - (1 - P)^k.
-    before = np.arange(int(np.bincount(group).max()))
-    alike_by_chance = np.cumsum(1 - (1 - share) ** before)[np.bincount(group) - 1]
+    alike_by_chance = np.cumsum(1 - (1 - share) ** np.arange(int(size.max())))[size - 1]
     chance = special.gammainc(int(found.sum()), float(alike_by_chance.sum()))
     return found & bool(chance < COPIED)
 
