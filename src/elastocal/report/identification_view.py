@@ -10,18 +10,7 @@ from functools import cache
 import numpy as np
 
 from elastocal.errors import option
-from elastocal.identification.findings import (
-    ABSORBED,
-    ALONE,
-    BEYOND,
-    COMBINED,
-    FIXED,
-    INVISIBLE,
-    UNREAD,
-    WEAK,
-    no_reading,
-    standings,
-)
+from elastocal.identification import findings
 from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import (
     LOPSIDED,
@@ -211,17 +200,17 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
 
 
 def what_was_identified(result: Calibration) -> str:
-    alone, n = len(names_of(result, ALONE)), len(result.combinations)
+    alone, n = len(names_of(result, findings.ALONE)), len(result.combinations)
     text = f"{alone} of {say.counted(len(result.ordinary), 'parameter')}"
     if n:
-        absorbed = len(names_of(result, ABSORBED))
+        absorbed = len(names_of(result, findings.ABSORBED))
         text += (
             f", and {say.counted(n, 'combination')} of parameters that these readings cannot "
             f"separate ({absorbed} held in exchange)"
         )
     told = {
-        **NO_VALUE, INVISIBLE: "not visible in these data",
-        UNREAD: "of markers without a reading", FIXED: "fixed by the user",
+        **NO_VALUE, findings.INVISIBLE: "not visible in these data",
+        findings.UNREAD: "of markers without a reading", findings.FIXED: "fixed by the user",
     }  # fmt: skip
     for standing, why in told.items():
         if found := len(names_of(result, standing)):
@@ -365,7 +354,7 @@ def _influence_table(result: Calibration) -> say.ShownTable:
 
 
 def names_of(result: Calibration, standing: str) -> list[str]:
-    found = standings(result)
+    found = findings.standings(result)
     return [printable(e.name) for e in result.ordinary if found[e.name] == standing]
 
 
@@ -383,17 +372,17 @@ def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     return f"{text} + {more} more" if more else text
 
 
-NO_VALUE = {WEAK: "hardly shown", BEYOND: "beyond a physical bound"}
+NO_VALUE = {findings.WEAK: "hardly shown", findings.BEYOND: "beyond a physical bound"}
 REDUNDANT = "redundant"
 HELD = {
-    INVISIBLE: " (not visible in these data)",
-    ABSORBED: ", absorbed in a combination",
+    findings.INVISIBLE: " (not visible in these data)",
+    findings.ABSORBED: ", absorbed in a combination",
     REDUNDANT: ", not identifiable with these loads (expected)",
 }
 WITHOUT = {
-    UNREAD: "held: no reading of this marker",
-    INVISIBLE: "held: not visible in these data",
-    FIXED: "fixed by the user",
+    findings.UNREAD: "held: no reading of this marker",
+    findings.INVISIBLE: "held: not visible in these data",
+    findings.FIXED: "fixed by the user",
 }
 
 
@@ -448,7 +437,7 @@ def nominal_text(e: Estimate, parameter: Parameter) -> str:
 
 def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason; `most` names."""
-    standing, known = standings(result), {p.name: p for p in result.model.parameters}
+    standing, known = findings.standings(result), {p.name: p for p in result.model.parameters}
     redundant = result.left.redundant if result.left else ()
     groups: dict[str, list[Estimate]] = {}
     for e in result.ordinary:
@@ -456,12 +445,14 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         extra = kind in HELD and e.name in redundant
         groups.setdefault(REDUNDANT if extra else kind, []).append(e)
     lines = []
-    for kind in (*NO_VALUE, *HELD, UNREAD, FIXED):
+    for kind in (*NO_VALUE, *HELD, findings.UNREAD, findings.FIXED):
         found = groups.get(kind, [])
         at_nominal = all(e.held == e.nominal and stated(known[e.name]) for e in found)
         why = "held at nominal" if at_nominal else "held at the start value"
-        why += HELD.get(kind, f" ({printable(no_reading(result))})" if kind == UNREAD else "")
-        why = "fixed by the user" if kind == FIXED else why
+        why += HELD.get(
+            kind, f" ({printable(findings.no_reading(result))})" if kind == findings.UNREAD else ""
+        )
+        why = "fixed by the user" if kind == findings.FIXED else why
         names = [printable(e.name) for e in found]
         if kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}, so without a value (95 %)"
@@ -472,15 +463,15 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
     heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
-    rows, standing = list[tuple[str, ...]](), standings(result)
+    rows, standing = list[tuple[str, ...]](), findings.standings(result)
     known = {p.name: p for p in result.model.parameters}
     for e in result.ordinary:
         if e.identifiable:
             continue
         kind, why = standing[e.name], printable(e.note)
-        if kind == COMBINED:
+        if kind == findings.COMBINED:
             why = f"only as {shortened(result.combination(e.name))}"
-        elif kind == ABSORBED:
+        elif kind == findings.ABSORBED:
             names = some(map(printable, e.combined_with), 3, more=" + {} more")
             why = f"held: absorbed in {names}"
         elif kind in NO_VALUE:

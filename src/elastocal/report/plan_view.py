@@ -41,12 +41,24 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     reasons = say.ShownTable(("pose", SERVES), why, (1,), title="Why each pose")
     yield say.Fold("Why each pose", lambda: [reasons], printed=True)
     yield say.Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
+    figure = f"{plan.criterion} {plan.unit}".strip()
     if plan.curve:
-        both: list[say.Block] = [curve_table(plan), plan_curve(plan)]
-        yield say.Fold("Number of poses", lambda: both, printed=True, figures=("curve",))
+        rows = [
+            (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
+            for s in plan.curve
+        ]
+        heads = ("poses", figure, "best possible on the pool")
+        curve = say.ShownTable(heads, rows, (), title="Number of poses")
+        both: list[say.Block] = [curve, plan_curve(plan)]
+        yield say.Fold(curve.title, lambda: both, printed=True, figures=("curve",))
     if plan.timed:
-        table = timed_table(plan)
-        yield say.Fold(table.title, lambda: [table], printed=True)
+        timed = say.ShownTable(
+            ("poses", "readings each", "minutes", figure),
+            [(str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}")
+             for s in plan.timed],
+            (), title="Poses and readings within the time",
+        )  # fmt: skip
+        yield say.Fold(timed.title, lambda: [timed], printed=True)
     yield say.Fold("What the plan is worth", lambda: [say.Lines([*plan_lines(plan)])], printed=True)
 
 
@@ -121,27 +133,6 @@ def interval_table(plan: Plan) -> say.ShownTable:
     heads = ("parameter", "± 95 %", "unit", "together with")
     table = say.ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
     return table if any(p.combined_with for p in plan.predicted) else table.without(3)
-
-
-def curve_table(plan: Plan) -> say.ShownTable:
-    rows = [
-        (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
-        for s in plan.curve
-    ]
-    heads = ("poses", _figure(plan), "best possible on the pool")
-    return say.ShownTable(heads, rows, (), title="Number of poses")
-
-
-def timed_table(plan: Plan) -> say.ShownTable:
-    rows = [
-        (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
-    ]
-    heads = ("poses", "readings each", "minutes", _figure(plan))
-    return say.ShownTable(heads, rows, (), title="Poses and readings within the time")
-
-
-def _figure(plan: Plan) -> str:
-    return f"{plan.criterion} {plan.unit}".strip()
 
 
 def stop_table(plan: Plan) -> say.ShownTable:

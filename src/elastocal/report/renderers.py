@@ -242,7 +242,8 @@ def _framed(head: str, body: str, space: bool, kind: str) -> str:
     named by their hashes, and no other: not even one that slipped into a name."""
     source, packed = plotly() if space else ("", "")
     script = say.resource("report.js")
-    hashes = " ".join(f"'sha256-{_digest(text)}'" for text in (script, source) if text)
+    digests = (hashlib.sha256(text.encode()).digest() for text in (script, source) if text)
+    hashes = " ".join(f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests)
     carried = f'<script type="application/octet-stream" id="plotly">{packed}</script>'
     return f"""<!doctype html>
 <html lang="en">
@@ -389,10 +390,6 @@ def plotly() -> tuple[str, str]:
     source = get_plotlyjs()
     packed = gzip.compress(source.encode(), 9, mtime=0)
     return source, base64.b64encode(packed).decode()
-
-
-def _digest(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def sources(result: Any) -> list[Path]:

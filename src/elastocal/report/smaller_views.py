@@ -19,16 +19,8 @@ from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.report import blocks as say
+from elastocal.report import identification_view as fitted
 from elastocal.report.figures import NO_ENDS, rows_of_dots
-from elastocal.report.identification_view import (
-    at_new_poses,
-    before_and_after,
-    joint_lines,
-    prediction_lines,
-    readings,
-    spread_table,
-    what_was_identified,
-)
 from elastocal.report.judgement_view import judgement, method_and_weights
 from elastocal.text import listed, printable, some
 from elastocal.units import Array
@@ -446,14 +438,14 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         )
     facts = [
         ("Robot", printable(result.model.chain.name)),
-        *joint_lines(result),
+        *fitted.joint_lines(result),
         ("Instrument, standard deviations", noise),
-        ("Readings", readings(result)),
+        ("Readings", fitted.readings(result)),
         ("Loads", "; ".join(say.newtons(f) for f in measured_loads(result.observations))),
-        ("Identified", what_was_identified(result)),
+        ("Identified", fitted.what_was_identified(result)),
         ("Method", say.sentence(method_and_weights(result))),
-        *([("Expected error", at_new_poses(result.predicted))] if result.predicted else []),
-        *prediction_lines(result),
+        *([("Expected error", fitted.at_new_poses(result.predicted))] if result.predicted else []),
+        *fitted.prediction_lines(result),
     ]
     yield say.ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
 
@@ -575,9 +567,9 @@ def _poses(
         ends = (budget.steps[0], budget.steps[-1])
         found = {
             name: pose_accuracy(result.observations, step.errors)
-            for name, step in zip(before_and_after(result, budget), ends, strict=False)
+            for name, step in zip(fitted.before_and_after(result, budget), ends, strict=False)
         }
-        yield spread_table(found, "places", "Pose accuracy before and after")
+        yield fitted.spread_table(found, "places", "Pose accuracy before and after")
         yield say.Sentence(
             "In the sense of ISO 9283: the distance between the place that was meant and the mean "
             "of what was read there, at every configuration, marker and load. “Calibrated” is what "

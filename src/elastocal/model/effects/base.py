@@ -24,27 +24,12 @@ Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "track
 Format = Literal["rigid", "elastic"]
 Symbols = Mapping[str, ca.SX]
 NEEDS = ("time", "approach", "temperature", "load", "torque")
-REVOLUTE = "revolute"
 MOTION = "rad or m"  # unit of a parameter of a joint's motion, as the joint turns or slides
 
-# Ranks of parameters: where a choice is free, a minimal complete set takes low ones first.
-STIFFNESS, STATION, MARKER, OFFSET, ORDINARY, LINK = range(6)
-
-# What tells an effect from others where no further pose does.
-MEASURE_MONUMENTS = (
-    "measure fixed reflectors (monuments) on the floor and on the robot's foot along with the "
-    "arm: they tell the tracker's motion, the base's and a joint's apart"
-)
-MEASURE_SCALE = (
-    "measure a reference length (scale bar) or set the tracker up in a second place: that "
-    "tells its errors from the arm's"
-)
-RECORD_TORQUES = (
-    "record the joints' torques or motor currents, which a wrong weight or spring changes "
-    "and a gear error does not"
-)
-WEIGH_LOAD = "weigh the load and measure where it hangs"
-
+# Where a choice is free, a minimal complete set takes parameters of the first ranks.
+RANKS = ("stiffness", "station", "marker", "offset", "ordinary", "link")
+# Units of a motion along and about the axes of a frame.
+MOVE = ("m", "m", "m", "rad", "rad", "rad")
 
 FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
 
@@ -124,8 +109,8 @@ class Effect:
     elastic: ClassVar[bool] = False
     # `typical` is the size of the value itself, not that of its deviation from nominal.
     sized_by_value: ClassVar[bool] = False
-    # Its place in the choice of a minimal complete set, STIFFNESS to LINK.
-    rank: ClassVar[int] = ORDINARY
+    # Its place in the choice of a minimal complete set, of RANKS.
+    rank: ClassVar[str] = "ordinary"
     # The kinds of file that can hold it; what none can hold is exported as an error with its cost.
     formats: ClassVar[tuple[Format, ...]] = ()
     # One of many causes at once: a diagnosis judges it only in the sum of all components.
@@ -266,12 +251,14 @@ def joints(chain: Chain) -> tuple[str, ...]:
 
 def turning_joints(chain: Chain) -> tuple[str, ...]:
     """Those of `joints` that are revolute."""
-    return tuple(j for j, kind in zip(joints(chain), chain.kinds, strict=True) if kind == REVOLUTE)
+    return tuple(
+        j for j, kind in zip(joints(chain), chain.kinds, strict=True) if kind == "revolute"
+    )
 
 
 def motion_unit(place: str, chain: Chain) -> str:
     """Unit of the motion of "jointN": rad, or m where it slides."""
-    return "rad" if chain.kinds[index(place)] == REVOLUTE else "m"
+    return "rad" if chain.kinds[index(place)] == "revolute" else "m"
 
 
 def links(chain: Chain) -> tuple[str, ...]:
@@ -347,7 +334,7 @@ class LinkFrame(Entry):
     name = "link_frame"
     stage: ClassVar[Stage] = "geometry"
     at = "links"
-    units = ("m", "m", "m", "rad", "rad", "rad")
+    units = MOVE
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         i = index(place)
@@ -363,7 +350,7 @@ class BaseMotion(Entry):
     name = "base_motion"
     stage: ClassVar[Stage] = "tracker"
     at = "base"
-    units = ("m", "m", "m", "rad", "rad", "rad")
+    units = MOVE
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
         T = arm.T_tracker_base

@@ -14,7 +14,6 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain, extent
 from elastocal.model.effects.base import (
-    STIFFNESS,
     DrivenEffect,
     Effect,
     JointMotion,
@@ -89,7 +88,7 @@ class JointCompliance(TorqueEffect):
     at = "joints"
     elastic = True
     sized_by_value = True
-    rank = STIFFNESS
+    rank = "stiffness"
     formats = ("elastic",)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
@@ -237,7 +236,7 @@ class OffAxisCompliance(TiltingEffect):
     name = "off_axis_compliance"
     at = "joints"
     sized_by_value = True
-    rank = STIFFNESS
+    rank = "stiffness"
     prefix = "off_axis_compliance_"
     share = 0.2
 
@@ -280,7 +279,7 @@ class BaseCompliance(TiltingEffect):
     name = "base_compliance"
     at = "base"
     sized_by_value = True
-    rank = STIFFNESS
+    rank = "stiffness"
     prefix = "tilt_compliance_"
     share = 0.1
 

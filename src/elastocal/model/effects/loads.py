@@ -15,10 +15,6 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.effects.base import (
-    RECORD_TORQUES,
-    REVOLUTE,
-    STIFFNESS,
-    WEIGH_LOAD,
     DrivenEffect,
     Effect,
     JointMotion,
@@ -65,7 +61,7 @@ class PayloadError(Effect):
     stage = "load"
     at = "load"
     formats = ("elastic",)
-    remedy = WEIGH_LOAD
+    remedy = "weigh the load and measure where it hangs"
     needs = ("load",)
     unknowns = (
         ParameterSpec("payload_scale", "1", 0.0, 0.02),
@@ -80,6 +76,10 @@ class PayloadError(Effect):
         arm.add_potential(-(1 + scale) * ca.dot(force, T[:3, :3] @ shift))
 
 
+RECORD_TORQUES = (
+    "record the joints' torques or motor currents, which a wrong weight or spring changes "
+    "and a gear error does not"
+)
 STANDARD_GRAVITY = 9.80665  # m/s², along −z of the tracker frame, which is vertical
 
 
@@ -212,7 +212,7 @@ class GravityCompensator(Effect):
 
     name = "gravity_compensator"
     stage = "load"
-    rank = STIFFNESS
+    rank = "stiffness"
     formats = ("elastic",)
     remedy = RECORD_TORQUES
 
@@ -305,7 +305,7 @@ def levers(chain: Chain, q: ca.SX, j: int) -> ca.SX:
     for k, joint in enumerate(chain.joints):
         motion = rigid.joint_motion(joint.kind, joint.axis, q[k])
         T = T @ rigid.constant(joint.placement) @ motion
-        turns = joint.kind == REVOLUTE
+        turns = joint.kind == "revolute"
         own = transverse_axes(joint.axis) if turns else (joint.axis,)
         if k >= j:
             arms += [T[:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own]
@@ -418,7 +418,7 @@ class LinkWeights(Effect):
         for link, joint, end, further in described:
             own, across = float(np.linalg.norm(end)), np.array(transverse_axes(joint.axis))
             mass = density * (own + HOUSING)
-            if joint.kind == REVOLUTE:
+            if joint.kind == "revolute":
                 for key, way in zip("xy", np.abs(across @ end).tolist(), strict=True):
                     along, across_it = density * way * (own / 2 + further), mass * HOUSING
                     name, size = f"{link}_moment_{key}", along + across_it
@@ -433,7 +433,7 @@ class LinkWeights(Effect):
         moment = ca.SX(0)
         for i, (link, joint) in enumerate(zip(links(arm.chain), arm.chain.joints, strict=True)):
             up = arm.T_tracker_link[i][2, :3]
-            if joint.kind == REVOLUTE:
+            if joint.kind == "revolute":
                 for key, axis in zip("xy", transverse_axes(joint.axis), strict=True):
                     moment += p[f"{link}_moment_{key}"] * (up @ rigid.constant(axis))
             else:

@@ -14,12 +14,8 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
-    LINK,
-    MARKER,
-    MEASURE_MONUMENTS,
-    MEASURE_SCALE,
     MOTION,
-    STATION,
+    MOVE,
     BaseMotion,
     DrivenEffect,
     Effect,
@@ -46,7 +42,7 @@ class BaseFrame(Effect):
     stage = "tracker"
     at = "base"
     registered = True
-    rank = STATION
+    rank = "station"
     formats = ("rigid", "elastic")
 
     @property
@@ -58,8 +54,7 @@ class BaseFrame(Effect):
         position = np.zeros(3) if nominal.base_position is None else nominal.base_position
         rotation = np.eye(3) if nominal.base_rotation is None else nominal.base_rotation
         vector = Rotation.from_matrix(rotation).as_rotvec()
-        units = ["m"] * 3 + ["rad"] * 3
-        known = zip(KEYS, units, [*position, *vector], strict=True)
+        known = zip(KEYS, MOVE, [*position, *vector], strict=True)
         return tuple(ParameterSpec(k, u, float(v), 3e-3) for k, u, v in known)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
@@ -94,7 +89,7 @@ class LinkGeometry(Effect):
     name = "link_geometry"
     stage = "geometry"
     at = "links"
-    rank = LINK
+    rank = "link"
     formats = ("rigid", "elastic")
     unknowns = (
         *(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
@@ -115,7 +110,7 @@ class MarkerPosition(Effect):
     stage = "tool"
     at = "markers"
     registered = True
-    rank = MARKER
+    rank = "marker"
     formats = ("rigid", "elastic")
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
@@ -135,7 +130,7 @@ class MarkerOrientation(Effect):
     stage = "tool"
     at = "markers"
     registered = True
-    rank = MARKER
+    rank = "marker"
     formats = ("rigid", "elastic")
     seen_in = "pose"
     unknowns = tuple(ParameterSpec(k, "rad", 0.0, 3e-3) for k in ("rx", "ry", "rz"))
@@ -158,7 +153,7 @@ class DistanceSensor(Effect):
     seen_in = "distance"
     at = "tracker"
     registered = True
-    rank = STATION
+    rank = "station"
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.tracker.anchor if cell.tracker.anchor is not None else np.zeros(3)
@@ -194,7 +189,10 @@ class TrackerDistortion(Effect):
 
     name = "tracker_distortion"
     stage = "tracker"
-    remedy = MEASURE_SCALE
+    remedy = (
+        "measure a reference length (scale bar) or set the tracker up in a second place: that "
+        "tells its errors from the arm's"
+    )
     # Data sheets promise 12 µrad and 5 ppm; an instrument that is out by ten times the typical size
     # is one to be mended, and what is out by more is no instrument's error.
     most = 10.0
@@ -233,16 +231,18 @@ def _turned(a: ca.SX, b: ca.SX, angle: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 # What changes while one measures: references, base, tracker, markers and lengths.
 
+MEASURE_MONUMENTS = (
+    "measure fixed reflectors (monuments) on the floor and on the robot's foot along with the "
+    "arm: they tell the tracker's motion, the base's and a joint's apart"
+)
 TIME_CONSTANT = Setting("time_constant_s", "time_constant", 1800.0, 60.0, 1e6)
 
 
 def pose_change(prefix: str, length: float) -> tuple[ParameterSpec, ...]:
     """`prefix`_x … `prefix`_rz with typical sizes `length` in m and 50 µrad."""
-    units, sizes = ["m"] * 3 + ["rad"] * 3, [length] * 3 + [5e-5] * 3
-    return tuple(
-        ParameterSpec(f"{prefix}_{k}", unit, 0.0, size)
-        for k, unit, size in zip(KEYS, units, sizes, strict=True)
-    )
+    sizes = {"m": length, "rad": 5e-5}
+    known = zip(KEYS, MOVE, strict=True)
+    return tuple(ParameterSpec(f"{prefix}_{k}", unit, 0.0, sizes[unit]) for k, unit in known)
 
 
 class WarmUp(DrivenEffect):
