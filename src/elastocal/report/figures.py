@@ -473,11 +473,12 @@ MOST_CONFIGURATIONS = 200
 
 
 class Residuals:
-    """Residuals (observations, components) of a model in µm (µrad for rotations) as figures and a
-    table; `shown` are the observations to draw, all or a random choice."""
+    """Residuals (observations, components) of a model at x (parameters,) in µm (µrad for rotations)
+    as figures and a table; `shown` are the observations to draw, all or a random choice."""
 
-    def __init__(self, model: Model, observed: Observations, residual: Array) -> None:
+    def __init__(self, model: Model, observed: Observations, x: Array, residual: Array) -> None:
         self.kinds, self.observed = model.chain.kinds, observed
+        self.of_what = model, observed, x, residual
         self.components = COMPONENTS[observed.kind]
         self.units = ["µrad" if name.startswith("r") else "µm" for name in self.components]
         self.value = residual.reshape(-1, observed.size) * 1e6
@@ -491,6 +492,11 @@ class Residuals:
     def figures(self) -> Iterator[say.Figure]:
         yield self.by_configuration()
         yield self.over_joints()
+
+    def on_the_arm(self) -> say.Figure:
+        from elastocal.report.arm_view import residual_arm
+
+        return residual_arm(*self.of_what)
 
     def _thinned(self, drawn: int) -> str:
         total = len(self.value)

@@ -82,9 +82,8 @@ def calibration_blocks(
         *([("Truth", held)] if truth else []),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    yield say.Fold(
-        "", lambda: _residuals(result).figures(), figures=("residuals", "against_joints")
-    )
+    residuals = Residuals(result.model, result.observations, result.x, result.residual)
+    yield say.Fold("", residuals.figures, figures=("residuals", "against_joints"))
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
     yield say.Fold("Method, noise and intervals", lambda: _method(result), printed=True)
     missing = undetermined_table(result, truth)
@@ -101,7 +100,8 @@ def calibration_blocks(
         yield say.Fold("Correlations over 0.9", lambda: [_correlation_table(result)], printed=True)
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
-        "Residuals on the arm, over time and by group", lambda: _on_the_arm(result),
+        "Residuals on the arm, over time and by group",
+        lambda: [residuals.on_the_arm(), *residuals.over_time(), residuals.table()],
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -137,19 +137,6 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
         yield found
-
-
-def _residuals(result: Calibration) -> Residuals:
-    return Residuals(result.model, result.observations, result.residual)
-
-
-def _on_the_arm(result: Calibration) -> Iterator[say.Block]:
-    from elastocal.report.arm_view import residual_arm
-
-    residuals = _residuals(result)
-    yield residual_arm(result.model, result.observations, result.x, result.residual)
-    yield from residuals.over_time()
-    yield residuals.table()
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:

@@ -63,8 +63,16 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
 
 
 def next_blocks(found: NextPoses) -> Iterator[say.Block]:
+    g, names = found.gain, ("measured so far", "with this batch")
+    rows = [
+        (f"{name}{model}", value, NO_ENDS)
+        for model, values in (("", (g.before, g.after)),
+                              (", if the model is right", (g.model_before, g.model_after)))
+        for name, value in zip(names, values, strict=True) if math.isfinite(value)
+    ]  # fmt: skip
+    title, axis = "Error before and after the batch", "rms error at the test poses"
     yield say.Lines([*next_lines(found)])
-    yield say.Fold("", lambda: [_gain(found)], figures=("gain",))
+    yield say.Fold("", lambda: [rows_of_dots("gain", title, rows, axis)], figures=("gain",))
     if found.plan is not None:
         yield from plan_blocks(found.plan)
 
@@ -80,19 +88,6 @@ def _key(plan: Plan) -> say.KeyFigures:
     figures.append(("time", minutes))
     figures += [("load states", str(len(plan.forces)))][: 4 - len(figures)]
     return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
-
-
-def _gain(found: NextPoses) -> say.Figure:
-    g = found.gain
-    names = ("measured so far", "with this batch")
-    rows = [
-        (f"{name}{model}", value, NO_ENDS)
-        for model, values in (("", (g.before, g.after)),
-                              (", if the model is right", (g.model_before, g.model_after)))
-        for name, value in zip(names, values, strict=True) if math.isfinite(value)
-    ]  # fmt: skip
-    axis = "rms error at the test poses"
-    return rows_of_dots("gain", "Error before and after the batch", rows, axis)
 
 
 TOLD = 2  # parameters that a pose serves, in the table

@@ -301,14 +301,11 @@ LEVELLED = 0.1  # share of a weight's torque that an axis feels which stands 6°
 def levers(chain: Chain, q: ca.SX, j: int) -> ca.SX:
     """−∂w_k/∂q_j of joint j (0-based), k ≥ j, for unit moments in turn (functions, 3); with u it is
     the torque.  `q` (joints,) are symbols."""
-    T, arms = ca.SX.eye(4), []
-    for k, joint in enumerate(chain.joints):
-        motion = rigid.joint_motion(joint.kind, joint.axis, q[k])
-        T = T @ rigid.constant(joint.placement) @ motion
+    arms, frames = [], rigid.nominal_frames(chain, q, ca.SX.eye(4))
+    for k, joint in enumerate(chain.joints[j:], start=j):
         turns = joint.kind == "revolute"
         own = transverse_axes(joint.axis) if turns else (joint.axis,)
-        if k >= j:
-            arms += [T[:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own]
+        arms += [frames[k][:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own]
     return -ca.vertcat(*[ca.jacobian(arm, q)[:, j].T for arm in arms])
 
 
