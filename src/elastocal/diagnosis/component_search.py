@@ -35,7 +35,7 @@ from elastocal.diagnosis.components import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import ModelSet, about, extended, settings_of, spans_of
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
-from elastocal.diagnosis.hypotheses import Hypothesis, judged_together, possible
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.lines import (
     FEW_POSES,
     families_of,
@@ -209,11 +209,11 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
         for chosen in [stand_out] if many else some:
             noise = found.noise
             for family in chosen:
-                noise = with_scatter(noise, index(family.where), family.scatter)
+                noise = with_scatter(noise, index(family.component.where), family.scatter)
             fitted = exchanged(
                 replace(found, noise=noise),
                 [c for family in chosen for c in family.instead_of],
-                [family.component for family in chosen if family.component is not None],
+                [family.component for family in chosen],
             )  # fmt: skip
             if fitted.score > found.score + GAINED:
                 wider = fitted
@@ -623,7 +623,7 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
         kept = [h for h in kept if not isinstance(h.effect, GearRipple)]
     elif GearRipple.name in without:
         kept += possible(base.model, base.observed.table, CATALOGUE.keys() - {GearRipple.name})[0]
-    more = judged_together(base.model, base.observed.table, without)
+    more = possible(base.model, base.observed.table, without, together=True)[0]
     return replace(dataset, hypotheses=(*kept, *more))
 
 

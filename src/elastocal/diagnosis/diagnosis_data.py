@@ -22,7 +22,6 @@ from elastocal.diagnosis.hypotheses import (
     SettingsGrid,
     compute_columns,
     grid_of,
-    judged_together,
     moments_between,
     possible,
     recorded,
@@ -225,7 +224,7 @@ def diagnosis_data_of(
     acting = model.cell.model.torque != "measured"
     others = CATALOGUE.keys() - {PayloadError.name}
     loads = possible(model, observed.table, others)[0] if acting else []
-    together = (h for h in judged_together(model, observed.table) if not h.driven)
+    together = (h for h in possible(model, observed.table, together=True)[0] if not h.driven)
     asked = list({h.key: h for h in (*loads, *together, *hypotheses)}.values())
     if around is None or x is None:
         around, x = model, base.x

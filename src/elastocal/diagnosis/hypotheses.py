@@ -11,6 +11,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 from scipy.optimize import least_squares
+from scipy.special import logsumexp
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
@@ -126,23 +127,29 @@ class Hypothesis:
 
 
 def possible(
-    model: Model, table: Measurements, without: Container[str] = ()
+    model: Model, table: Measurements, without: Container[str] = (), together: bool = False
 ) -> tuple[list[Hypothesis], list[Untested]]:
-    """Hypotheses that the table's columns can test, and the effects it cannot, with advice."""
+    """Hypotheses that the table's columns can test, and the effects it cannot, with advice; those
+    that are judged by themselves, or those that are judged `together` in a sum alone, but for the
+    smooth ones, which have their own searches."""
     chain, cell = model.chain, model.cell
     active = {(p.effect, p.where) for p in model.parameters}
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():
-        if name in without or not effect.may_be_missing(cell):
+        asked = (
+            effect.together and not corrects(effect) if together else effect.may_be_missing(cell)
+        )
+        if name in without or not asked or (effect.unless and recorded(table, effect.unless)):
             continue
-        if effect.unless and recorded(table, effect.unless):
-            continue
-        places = [w for w in effect.places(chain, cell) if (name, w) not in active]
+        places = [
+            w for w in effect.places(chain, cell)
+            if (name, w) not in active and effect.acts(w, chain, cell)
+        ]  # fmt: skip
         settings = {w: effect.settings(w, chain, cell) for w in places}
         # Only a driven effect can be evaluated at many settings; others' stay as the model has
         # them.
-        searched = isinstance(effect, DrivenEffect)
+        searched = isinstance(effect, DrivenEffect) and not together
         kinds = {s.kind for each in settings.values() for s in each} if searched else set()
         needed = [*effect.needed(cell), *["time"] * bool(kinds & {"change_time", "time_constant"})]
         if kinds == {"change_time"} and table.time is None and cell.model.clock == "rows":
@@ -168,28 +175,6 @@ def possible(
 def corrects(effect: Effect) -> bool:
     """Whether it may stand for any cause: what has no name, and curves and lines of a gear."""
     return effect.nameless or isinstance(effect, JointCurve | GearSpectrum)
-
-
-def judged_together(
-    model: Model, table: Measurements, without: Container[str] = ()
-) -> list[Hypothesis]:
-    """Effects that are judged in a sum alone, but for the smooth ones, which have their own
-    searches, at every place where the table can test them; none `without` which to judge."""
-    chain, cell = model.chain, model.cell
-    active = {(p.effect, p.where) for p in model.parameters}
-    return [
-        Hypothesis(effect, where, parameters, ())
-        for effect in CATALOGUE.values()
-        if effect.together
-        and effect.name not in without
-        and not corrects(effect)
-        and all(recorded(table, need) for need in effect.needed(cell))
-        and not (effect.unless and recorded(table, effect.unless))
-        for where in effect.places(chain, cell)
-        if (effect.name, where) not in active
-        and effect.acts(where, chain, cell)
-        and (parameters := effect.parameters(where, chain, cell))
-    ]
 
 
 def recorded(table: Measurements, need: str) -> bool:
@@ -299,20 +284,21 @@ NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
 def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
     """Grid of a hypothesis' settings for these visits; one empty point where it has none.
 
-    Of several settings it holds every combination.  Where those are more than MOST_POINTS, each
-    setting is tried at fewer values, and its step grows with their distance.
+    Of several settings, which are independent, it holds every combination.  Where those are more
+    than MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long.
     """
     axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
-    if len(axes) < 2:
-        return axes[0] if axes else NO_SETTINGS
-    share = min(1.0, MOST_POINTS / math.prod(len(axis.values) for axis in axes))
-    axes = [_thinned(axis, share ** (1 / len(axes))) for axis in axes]
-    chosen = np.indices([len(axis.values) for axis in axes]).reshape(len(axes), -1)
+    if not axes:
+        return NO_SETTINGS
+    count = [len(axis.values) for axis in axes]
+    k = math.ceil((math.prod(count) / MOST_POINTS) ** (1 / len(axes)))
+    chosen = k * np.indices([-(-n // k) for n in count]).reshape(len(axes), -1)
     picked = list(zip(axes, chosen, strict=True))
+    log_prior = np.sum([axis.log_prior[at] for axis, at in picked], axis=0)
     return SettingsGrid(
-        np.concatenate([axis.values[k] for axis, k in picked], axis=1),
-        np.sum([axis.log_prior[k] for axis, k in picked], axis=0),  # of settings independent
-        np.concatenate([axis.step[k] for axis, k in picked], axis=1),
+        np.concatenate([axis.values[at] for axis, at in picked], axis=1),
+        log_prior - logsumexp(log_prior) if k > 1 else log_prior,
+        np.concatenate([axis.step[at] * k for axis, at in picked], axis=1),
     )
 
 
@@ -335,16 +321,6 @@ def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 
 def _time(visits: Measurements) -> Array:
     return by_rows(visits) if visits.time is None else visits.time
-
-
-def _thinned(axis: SettingsGrid, share: float) -> SettingsGrid:
-    count = max(2, int(len(axis.values) * share))
-    if count >= len(axis.values):
-        return axis
-    kept = np.linspace(0, len(axis.values) - 1, count).round().astype(int)
-    prior = np.exp(axis.log_prior[kept])
-    wider = len(axis.values) / count
-    return SettingsGrid(axis.values[kept], np.log(prior / prior.sum()), axis.step[kept] * wider)
 
 
 def moments_between(time: Array) -> Array:
@@ -383,11 +359,6 @@ MOST_STEPS = 40  # of the refinement
 SAME = 0.05  # of χ²: a difference that is none
 
 
-# Of an effect about a start that it proposes, at the amplitude that the residual asks for: its
-# parameters (k,), their columns (n_rows, size, k), and what is left of the residual's squares.
-Tangent = tuple[Array, Array, float]
-
-
 def with_tangents(
     full: Model,
     places: dict[tuple[str, str], slice],
@@ -397,8 +368,8 @@ def with_tangents(
     B: Array,
 ) -> tuple[Array, Array, dict[tuple[str, str], float]]:
     """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none, in
-    place, x with the best start in it, and of each effect that was screened the log of its mean
-    likelihood over that at its best start."""
+    place, x with the best start in it, and of each such effect the log of its mean likelihood over
+    all starts relative to that at the best one."""
     shares: dict[tuple[str, str], float] = {}
     for h in hypotheses:
         own = places[h.key]
@@ -406,12 +377,8 @@ def with_tangents(
         if shown.all() or shown.sum() != 1:
             continue
         search = StartSearch.of(full, h, base, x, B)
-        if search.screened is None:
-            best = min(search.tangents(), key=lambda tangent: tangent[2])
-        else:
-            best, shares[h.key] = next(search.tangents()), search.screened[1]
-        x = x.copy()
-        x[own], B[:, :, own], _ = best
+        x, shares[h.key] = x.copy(), search.screened[1]
+        x[own], B[:, :, own] = next(search.tangents())
     return B, x, shares
 
 
@@ -461,20 +428,18 @@ class StartSearch:
         model = self.base.model
         return self.h.effect.starts(self.h.where, model.chain, model.cell) or ({},)
 
-    def tangents(self) -> Iterator[Tangent]:
-        """About each start; where they were screened about the best ones, the best first."""
-        return map(self._about, self.starts if self.screened is None else self.screened[0])
-
-    def _about(self, start: Mapping[str, float]) -> Tangent:
-        own, table = own_columns(self.full, self.h), self.base.observed.table
-        at, column = self._amplitude(start, table)
-        left, amplitude, _ = self._fits(column[self.rows][:, :, None])
-        at[own[0]] += amplitude[0]
-        observed = observe(table, self.full.observe)
-        columns = self.full.regressor(table, at, np.array(own), observed).B
-        columns = columns.reshape(len(table), observed.size, -1)
-        columns[:, :, 0] = column
-        return at[own], columns, float(left[0])
+    def tangents(self) -> Iterator[tuple[Array, Array]]:
+        """About the best starts, the best first, at the amplitude that the residual asks for: the
+        effect's parameters (k,) and their columns (n_rows, size, k)."""
+        own, table = np.array(own_columns(self.full, self.h)), self.base.observed.table
+        for start in self.screened[0]:
+            at, column = self._amplitude(start, table)
+            at[own[0]] += self._fits(column[self.rows][:, :, None])[1][0]
+            observed = observe(table, self.full.observe)
+            columns = self.full.regressor(table, at, own, observed).B
+            columns = columns.reshape(len(table), observed.size, -1)
+            columns[:, :, 0] = column
+            yield at[own], columns
 
     def _amplitude(self, start: Mapping[str, float], table: Measurements) -> tuple[Array, Array]:
         """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
@@ -488,15 +453,12 @@ class StartSearch:
         return at, column.reshape(len(table), observed.size)
 
     @cached_property
-    def screened(self) -> tuple[list[Mapping[str, float]], float] | None:
+    def screened(self) -> tuple[list[Mapping[str, float]], float]:
         """The best starts, the first of them refined, and the log of the mean likelihood over all
-        relative to the best one's; None where the effect knows no profiles."""
+        relative to the best one's."""
         starts = list(self.starts)
-        profiles = self._profiles(starts)
-        if profiles is None:
-            return None
         blocks = [slice(k, k + AT_ONCE) for k in range(0, len(starts), AT_ONCE)]
-        each = [self._left(starts[block], profiles[:, block]) for block in blocks]
+        each = [self._left(starts[block]) for block in blocks]
         left = np.concatenate([one for one, _ in each])
         beside = np.concatenate([C for _, C in each], axis=1)
         dof = max(len(self.r) - self.X.shape[1] - 1, 1)
@@ -510,12 +472,14 @@ class StartSearch:
                 break
             if np.abs(beside[:, kept].T @ beside[:, k]).max(initial=0.0) < ALIKE:
                 kept.append(int(k))
-        best = self._refined(starts, starts[kept[0]], np.sqrt(variance))
+        best = starts[kept[0]]
+        if self._factor is not None:
+            best = self._refined(starts, best, np.sqrt(variance))
         return [best, *(starts[k] for k in kept[1:])], share
 
     def _refined(
-        self, starts: list[dict[str, float]], best: Mapping[str, float], noise: float
-    ) -> Mapping[str, float]:
+        self, starts: Sequence[dict[str, float]], best: dict[str, float], noise: float
+    ) -> dict[str, float]:
         """The start near `best` that leaves the least: least squares with the amplitude solved for
         (variable projection; Golub and Pereyra 1973).  Where the residual, over `noise`, does not
         ask for another value, a value stays: each is tied to that of `best` by a spread of all.
@@ -528,10 +492,7 @@ class StartSearch:
             return dict(zip(keys, map(float, x0 + width * values), strict=True))
 
         def residual(values: Array) -> Array:
-            trials = [start_of(values)]
-            profiles = self._profiles(trials)
-            assert profiles is not None
-            left, C = self._left(trials, profiles)
+            left, C = self._left([start_of(values)])
             if left[0] >= self._unexplained @ self._unexplained:  # no amplitude that it can have
                 return np.append(self._unexplained / noise, values)
             c = C[:, 0]
@@ -539,21 +500,25 @@ class StartSearch:
 
         return start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
 
+    def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
+        """The amplitude's (rows, size, starts), by the whole model at each start."""
+        each = [self._amplitude(start, self.part.table)[1] for start in starts]
+        return np.stack(each, axis=2)
+
     def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
         """(rows, starts)."""
-        if not starts[0]:
-            return None
-        return self.h.effect.profiles(self.h.where, starts, self.part.table.q)
+        own = self.h.effect.profiles if starts[0] else None
+        return None if own is None else own(self.h.where, starts, self.part.table.q)
 
     @cached_property
-    def _factor(self) -> Array:
-        """(rows, size): what a profile is to be multiplied with for the amplitude's column."""
+    def _factor(self) -> Array | None:
+        """(rows, size): what a profile is to be multiplied with for the amplitude's column; None
+        where the effect knows no profiles."""
         chosen = np.linspace(0, len(self.starts) - 1, REFERENCES).astype(int)
         references = [self.starts[k] for k in chosen]
-        profiles = self._profiles(references)
-        assert profiles is not None
-        columns = np.stack([self._amplitude(s, self.part.table)[1] for s in references])
-        products = np.einsum("sni,ns->ni", columns, profiles)
+        if (profiles := self._profiles(references)) is None:
+            return None
+        products = np.einsum("nis,ns->ni", self._columns(references), profiles)
         return np.asarray(products / np.maximum((profiles**2).sum(axis=1), 1e-300)[:, None])
 
     @cached_property
@@ -561,10 +526,15 @@ class StartSearch:
         U, s, _ = np.linalg.svd(self.X, full_matrices=False)
         return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
 
-    def _left(self, starts: Sequence[Mapping[str, float]], profiles: Array) -> tuple[Array, Array]:
+    def _left(self, starts: Sequence[Mapping[str, float]]) -> tuple[Array, Array]:
         """What is left of the residual's sum of squares (starts,), all of it where the amplitude
         is one that the effect cannot have, and the unit columns (rows, starts)."""
-        left, amplitudes, C = self._fits(self._factor[:, :, None] * profiles[:, None, :])
+        factor, profiles = self._factor, self._profiles(starts)
+        if factor is None or profiles is None:
+            columns = self._columns(starts)
+        else:
+            columns = factor[:, :, None] * profiles[:, None, :]
+        left, amplitudes, C = self._fits(columns)
         name = f"{self.h.where}.{self.h.parameters[0].key}"
         chain, cell = self.base.model.chain, self.base.model.cell
         for k, amplitude in enumerate(amplitudes):

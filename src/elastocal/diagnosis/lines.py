@@ -40,20 +40,14 @@ LINE_SCALES = np.array([0.3, 1.0, 3.0, 10.0])
 
 @dataclass(frozen=True)
 class LineFamily:
-    """Lines of the joint `where` at `order` and its multiples: `gain` in nats less the search,
-    `sd` how well these data know the order, `search` what finding it cost, the joint's `scatter`
-    beside them, of a visit and as a multiple of it that of a configuration, and the components
-    that they are `instead_of`."""
+    """Lines of a joint as a `component` that earns `gain` nats less the search, the joint's
+    `scatter` beside them, of a visit and as a multiple of it that of a configuration, and the
+    components that they are `instead_of`."""
 
-    where: str
-    order: float
-    multiples: int
+    component: Component
     gain: float
-    sd: float
-    search: float
-    scatter: tuple[float, float] = (0.0, 0.0)
-    instead_of: tuple[Component, ...] = ()
-    component: Component | None = None
+    scatter: tuple[float, float]
+    instead_of: tuple[Component, ...]
 
 
 def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
@@ -63,7 +57,7 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
     beside these, and in their place.
     """
     sums = beside(dataset, found, found.noise)
-    out, now = [], sums.at.marginal
+    out, now = list[LineFamily](), sums.at.marginal
     multiples = MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
     for h in ripples(dataset):
         i = index(h.where)
@@ -78,16 +72,15 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
             (beside(dataset, found, with_scatter(found.noise, i, less), curves), less, curves)
             for less in beneath
         )
-        best = max(
-            (
-                _best_family(grams, h, m, now, less, instead_of)
-                for grams, less, instead_of in chain([(sums, scatter, ())], quieter)
-                for m in multiples
-            ),
-            key=lambda family: family.gain,
+        tried = (
+            (*_best_family(grams, h, m, now), less, instead_of)
+            for grams, less, instead_of in chain([(sums, scatter, ())], quieter)
+            for m in multiples
         )
-        if best.gain > HOPELESS:
-            out.append(replace(best, component=family_component(dataset, best)))
+        gain, of, less, instead_of = max(tried, key=lambda family: family[0])
+        if gain > HOPELESS:
+            component = family_component(dataset, h.where, *of)
+            out.append(LineFamily(component, gain, less, instead_of))
     return sorted(out, key=lambda family: -family.gain)
 
 
@@ -121,22 +114,24 @@ MOST_FOUND = MOST_LINES - 3
 
 
 def _best_family(
-    grams: Grams, h: Hypothesis, m: int, now: float, scatter: tuple[float, float],
-    instead_of: tuple[Component, ...],
-) -> LineFamily:  # fmt: skip
-    """The best family of m lines of a joint, under its scatter and in the place of other
-    components; `now` is the log marginal likelihood of the sum as it is."""
-    q = grams.dataset.table.q[:, index(h.where)]
-    step = STEP / max(float(np.ptp(q)), 1e-3) / m
+    grams: Grams, h: Hypothesis, m: int, now: float
+) -> tuple[float, tuple[float, int, float, float]]:
+    """What the best family of m lines of a joint gains, and its order, m, how well these data know
+    the order, and what finding it cost; `now` is the log marginal likelihood of the sum as it is.
+    """
+    step = STEP * _apart(grams.dataset, h.where) / m
     orders = np.arange(LOWEST, HIGHEST / m, step)
     # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.
     log_prior = -np.log(orders) - np.log((1 / orders).sum() * len(MULTIPLES))
-    each = family_evidence(grams, h, orders, m) + log_prior
-    k = int(np.argmax(each))
+    k = int(np.argmax(family_evidence(grams, h, orders, m) + log_prior))
     search = -float(log_prior[k])
     order, sd, evidence = refined_order(grams, h, float(orders[k]), m, step)
-    gain = evidence - search + (grams.at.marginal - now)
-    return LineFamily(h.where, order, m, gain, sd, search, scatter, instead_of)
+    return evidence - search + (grams.at.marginal - now), (order, m, sd, search)
+
+
+def _apart(dataset: DiagnosisData, where: str) -> float:
+    """1/range(q) of a joint, by which the orders of its lines are told apart."""
+    return 1 / float(np.ptp(dataset.table.q[:, index(where)]))
 
 
 def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | None:
@@ -158,7 +153,7 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
     kept = np.ones(found.data.X.shape[2], dtype=bool)
     kept[np.concatenate(shifts)] = False
     places = [found.components[k].where for k in families]
-    most = STEP / np.array([max(float(np.ptp(dataset.table.q[:, index(w)])), 1e-3) for w in places])
+    most = STEP * np.array([_apart(dataset, where) for where in places])
     best = -np.inf
     for _ in range(SHARPENINGS):
         X = now.data.X
@@ -182,8 +177,8 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
             c = components[k]
             m = c.width // 4
             order = min(max(dict(c.settings)["order_1"] + float(step), LOWEST), HIGHEST / m)
-            family = LineFamily(c.where, order, m, 0.0, float(known), c.search)
-            components[k] = replace(family_component(dataset, family), given=c.given)
+            family = family_component(dataset, c.where, order, m, float(known), c.search)
+            components[k] = replace(family, given=c.given)
         now = replace(now, components=tuple(components))
     return list(found.components) if moved else None
 
@@ -225,19 +220,21 @@ def family_evidence(
     return sums.each(len(orders), 2 * m, directions).evidence(scales)
 
 
-def family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
-    effect, where = GearSpectrum(), family.where
+def family_component(
+    dataset: DiagnosisData, where: str, order: float, m: int, sd: float, search: float
+) -> Component:
+    effect = GearSpectrum()
     q = dataset.table.q[:, index(where)]
     settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
-    for k in range(1, family.multiples + 1):
-        settings |= {f"order_{k}": k * family.order, f"order_sd_{k}": k * family.sd}
+    for k in range(1, m + 1):
+        settings |= {f"order_{k}": k * order, f"order_sd_{k}": k * sd}
     cell = cell_with(dataset.base.model.cell, where, settings)
     parameters = effect.parameters(where, dataset.base.model.chain, cell)
     typical = [p.typical or 0.0 for p in parameters]
     columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
     return Component(
-        "angle", effect, where, columns, LINE, settings=kept, search=family.search,
+        "angle", effect, where, columns, LINE, settings=kept, search=search,
         fellows=len(turning_joints(dataset.base.model.chain)),
     )  # fmt: skip
 
@@ -353,8 +350,7 @@ class OrderPosterior:
         lowest, sd, _ = refined_order(self.grams, self.h, at, m, width, self.scales)
         own = float(logit(min(self.probability(order), CERTAIN)))
         search = max(float(self.evidence[k]) + self.presence - own, 0.0)
-        family = LineFamily(self.h.where, lowest, m, own, sd, search)
-        return replace(family_component(dataset, family), given=True)
+        return replace(family_component(dataset, self.h.where, lowest, m, sd, search), given=True)
 
 
 def order_posterior(
@@ -362,7 +358,7 @@ def order_posterior(
 ) -> OrderPosterior:
     """Of the lines of the joint of the ripple `h` beside the sum without the family `own`."""
     i = index(h.where)
-    unit = 1 / max(float(np.ptp(dataset.table.q[:, i])), MOVED)
+    unit = _apart(dataset, h.where)
     grid = [np.arange(LOWEST, HIGHEST / m, FINE * unit / m) for m in MULTIPLES]
     orders = np.concatenate(grid)
     multiples = np.repeat(MULTIPLES, [len(part) for part in grid])

@@ -250,14 +250,13 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
 
 def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
     """Columns (C, m, k) of an item about each of its starts, per typical size; none without."""
-    what, model = item.what, dataset.base.model
-    if not isinstance(what, Hypothesis):
+    what, model, of = item.what, dataset.base.model, dataset.columns
+    if not isinstance(what, Hypothesis) or not what.effect.starts(
+        what.where, model.chain, model.cell
+    ):
         return []
-    if not what.effect.starts(what.where, model.chain, model.cell):
-        return []
-    of = dataset.columns
     starts = StartSearch.of(of.full, what, of.base, of.x, of.rows).tangents()
-    return [dataset.pack(C) * dataset.sizes_in(what, C) for _, C, _ in starts]
+    return [dataset.pack(C) * dataset.sizes_in(what, C) for _, C in starts]
 
 
 # The settings with which one rival may imitate the others: its order, its time.
@@ -279,30 +278,27 @@ def alternatives(
     """
     widest = tuple(float(item.what.scales.max()) for item in rivals.beside)
     data = with_items(dataset, rivals.beside, widest)
-    grams = []
+    grams, out = list[Grams](), list[tuple[Item, ...]]()
     for item in rivals.rivals:
         C = data.masked(dataset.packed(item.what, item.settings))
         at = project(data.with_columns(C, np.ones(C.shape[2])), noise)
         signal = C @ at.beta[data.X.shape[2] :]
         grams.append(Grams(dataset, data, project(replace(data, r=signal), noise)))
-    return tuple(_of_rival(dataset, rivals.rivals, b, grams) for b in range(len(grams)))
-
-
-def _of_rival(
-    dataset: DiagnosisData, rivals: tuple[Item, ...], b: int, grams: list[Grams]
-) -> tuple[Item, ...]:
-    what, size = rivals[b].what, float(rivals[b].what.scales.max())
-    others = [a for a in range(len(rivals)) if a != b]
-    if not isinstance(what, Hypothesis) or not what.settings or not others:
-        return ()
-    lists = [settings_to_try(dataset, what, rivals[a]) for a in others]
-    tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
-    explained = np.array([grams[a].of(what, tried).explained(size) for a in others])
-    short = explained.max(axis=1, keepdims=True) - explained
-    near = np.flatnonzero((short <= NEARLY).any(axis=0))
-    evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]
-    chosen = list(dict.fromkeys([*short.argmin(axis=1), *evenly]))[:SETTINGS]
-    return tuple(replace(rivals[b], settings=tried[k]) for k in chosen)
+    for b, rival in enumerate(rivals.rivals):
+        what, others = rival.what, [a for a in range(len(grams)) if a != b]
+        if not isinstance(what, Hypothesis) or not what.settings or not others:
+            out.append(())
+            continue
+        lists = [settings_to_try(dataset, what, rivals.rivals[a]) for a in others]
+        tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
+        size = float(what.scales.max())
+        explained = np.array([grams[a].of(what, tried).explained(size) for a in others])
+        short = explained.max(axis=1, keepdims=True) - explained
+        near = np.flatnonzero((short <= NEARLY).any(axis=0))
+        evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]
+        chosen = list(dict.fromkeys([*short.argmin(axis=1), *evenly]))[:SETTINGS]
+        out.append(tuple(replace(rival, settings=tried[k]) for k in chosen))
+    return tuple(out)
 
 
 def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:

@@ -132,15 +132,13 @@ def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
     """Pairs (k, 2) of `good` (N,) observations of one marker and load in different configurations,
     each with its nearest neighbour in the joints, all within NEAR."""
     table, lead = dataset.table, dataset.lead
-    found = [np.zeros((0, 2), dtype=np.int64)]
-    for kind in np.unique(dataset.kind):
-        mine = np.flatnonzero((dataset.kind == kind) & good)
-        # One reading of each configuration: the others are repeats.
-        mine = mine[np.unique(table.configuration[lead[mine]], return_index=True)[1]]
-        if len(mine) > 1:
-            pairs, distance = nearest(table.q[lead[mine]], np.inf)
-            found.append(_unordered(mine[pairs[distance <= NEAR]]))
-    return np.concatenate(found)
+    # One reading of each configuration: the others are repeats.
+    same, some = np.column_stack([table.configuration[lead], dataset.kind]), np.flatnonzero(good)
+    some = some[np.unique(same[some], axis=0, return_index=True)[1]]
+    # Of another marker or load no reading is near.
+    place = np.column_stack([table.q[lead[some]], dataset.kind[some]])
+    pairs, distance = nearest(place, np.inf)
+    return _unordered(some[pairs[distance <= NEAR]])
 
 
 def nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
