@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import special
+from scipy.ndimage import binary_opening
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.identification.outliers import deleted
 from elastocal.identification.weighted_problem import same_size
+from elastocal.measurements import ranked
 from elastocal.units import Array, BoolArray, IntArray
 
 # A reading i left out has an error d whose square dᵀP_ii d follows χ², if the model is right.
@@ -176,28 +178,20 @@ def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     table, lead, moment = dataset.table, dataset.lead, dataset.moment
     loaded = np.any(table.force != 0, axis=1)[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
-        groups = np.unique(label)
-        if len(groups) < 2:
-            continue
-        found, size = np.transpose(
-            [[(faulty & of).sum(), of.sum()] for of in label == groups[:, None]]
-        )
+        group = ranked(label)
+        found, size = np.bincount(group, faulty), np.bincount(group)
         # Each group's count given the total is hypergeometric; the most conspicuous one decides.
-        p = hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(groups)
-        if p < ACCIDENT:
+        p = hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(size)
+        if len(size) > 1 and p < ACCIDENT:
             return False
     return True
 
 
 def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
     """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
-    marker_of, moment = dataset.table.marker[dataset.lead], dataset.moment
-    out = np.zeros(len(suspect), dtype=bool)
+    marker_of, out = dataset.table.marker[dataset.lead], np.zeros(len(suspect), dtype=bool)
     for marker in np.unique(marker_of):
         mine = np.flatnonzero(marker_of == marker)
-        mine = mine[np.argsort(moment[mine], kind="stable")]
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], suspect[mine].astype(int), [0]])))
-        for start, stop in edges.reshape(-1, 2):
-            if stop - start >= RUN:
-                out[mine[start:stop]] = True
+        mine = mine[np.argsort(dataset.moment[mine], kind="stable")]
+        out[mine] = binary_opening(suspect[mine], np.ones(RUN))
     return out
