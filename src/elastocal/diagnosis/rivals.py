@@ -8,7 +8,7 @@ from itertools import chain, islice, permutations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import special
 from scipy.sparse.csgraph import connected_components
 
 from elastocal.diagnosis.baseline import Baseline
@@ -110,14 +110,22 @@ class Suspects:
         self._found = [(f.effect, f.where) for f in diagnosis.effects]
         # Whether something without a name is at work.
         self.unknown = diagnosis.verdict == "unknown_effect"
-        named = [(e.effect, e.where) for group in diagnosis.indistinguishable for e in group]
-        for effect, where in [*self._found, *named]:
+        groups = [
+            [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
+            for group in diagnosis.indistinguishable
+        ]
+        for effect, where in chain(self._found, *groups):
             require(
-                effect == UNKNOWN_EFFECT or (effect, where) in self.items,
+                (effect, where) in self.items,
                 f"{table.source}: the diagnosis names {effect} at {where}, which this model and "
                 "table cannot test; plan with those that were diagnosed",
             )
-        self.sets = tuple(self._named_sets())
+        self.sets = tuple(
+            RivalSet.of(
+                [self.items[key] for key in keys], [self.p[key] for key in keys],
+                [self.items[key] for key in self._found if key not in keys],
+            ) for keys in groups if len(keys) > 1
+        )  # fmt: skip
 
     @property
     def covered(self) -> float:
@@ -127,14 +135,6 @@ class Suspects:
         others = sum(p for key, p in self.p.items() if key not in ours)
         missed = d.probability_nothing + others + (0.0 if self.unknown else d.probability_unknown)
         return min(max(1 - missed, 0.0), 1.0)
-
-    def _named_sets(self) -> Iterator[RivalSet]:
-        for group in self.diagnosis.indistinguishable:
-            keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
-            if len(keys) > 1:
-                beside = [self.items[key] for key in self._found if key not in keys]
-                p = [self.p[key] for key in keys]
-                yield RivalSet.of([self.items[key] for key in keys], p, beside)
 
     def _rivals(self) -> list[tuple[str, str]]:
         items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
@@ -301,12 +301,11 @@ def alternatives(
     return tuple(out)
 
 
-def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
-    """Schur complement of the nuisance in gram (w, w), and its inverse Gram (p, p)."""
-    factor = linalg.cho_factor(gram[:nuisance, :nuisance])
-    inverse = linalg.cho_solve(factor, np.eye(nuisance))
-    cross = gram[:nuisance, nuisance:]
-    return gram[nuisance:, nuisance:] - cross.T @ inverse @ cross, inverse
+def eliminated(gram: Array, nuisance: int) -> Array:
+    """Schur complement of the nuisance, the first columns, in gram (…, w, w)."""
+    cross = gram[..., :nuisance, nuisance:]
+    taken = np.linalg.solve(gram[..., :nuisance, :nuisance], cross)
+    return np.asarray(gram[..., nuisance:, nuisance:] - cross.swapaxes(-1, -2) @ taken)
 
 
 # How far apart rivals are, and how probably the right one is named, after any set of visits.
@@ -383,13 +382,13 @@ class Discrimination:
         spans = spans_of(widths, sum(widths))
         groups, rest = spans[:n], iter(spans[n:])
         by = tuple(tuple(islice(rest, len(each))) or (groups[b],) for b, each in enumerate(others))
-        S = eliminated(gram, nuisance)[0]
+        S = eliminated(gram, nuisance)
         draws = _posterior_draws(rivals, groups, S, rng)
         start = cls(
             rivals, gram[:-1, :-1], white[measured:, :, :-1], nuisance, groups, by,
             draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n),
         )  # fmt: skip
-        return replace(start, before=start._squared(S[None, :-1, :-1])[0])
+        return replace(start, before=start._apart(S[:-1, :-1]))
 
     @property
     def open(self) -> bool:
@@ -401,36 +400,27 @@ class Discrimination:
         return self.known + H.T @ H
 
     def squared(self, gram: Array) -> Array:
-        """d² (rivals, rivals, draws) of every ordered pair; zero of a rival with itself."""
-        return self._squared(eliminated(gram, self.nuisance)[0][None])[0]
+        """d² (…, rivals, rivals, draws) of every ordered pair by gram (…, w, w); zero of a rival
+        with itself."""
+        return self._apart(eliminated(gram, self.nuisance))
 
     def squared_with_each(self, gram: Array) -> Array:
-        """d² (N, rivals, rivals, draws) with each candidate added to the visits behind `gram`.
+        """d² (N, rivals, rivals, draws) with each candidate added to the visits behind `gram`."""
+        return self.squared(gram + self.pool.transpose(0, 2, 1) @ self.pool)
 
-        A candidate's few rows H = [H_X, H_R] change S by EᵀK⁻¹E with E = H_R − H_X M⁻¹ M_XR and
-        K = I + H_X M⁻¹ H_Xᵀ (Woodbury), which spares an elimination for each.
-        """
-        p = self.nuisance
-        S, inverse = eliminated(gram, p)
-        H = self.pool
-        through = H[:, :, :p] @ inverse
-        E = H[:, :, p:] - through @ gram[:p, p:]
-        K = np.eye(H.shape[1]) + through @ H[:, :, :p].transpose(0, 2, 1)
-        return self._squared(S + E.transpose(0, 2, 1) @ np.linalg.solve(K, E))
-
-    def _squared(self, S: Array) -> Array:
+    def _apart(self, S: Array) -> Array:
         n = len(self.draws)
-        out = np.zeros((len(S), n, n, 2 * DRAWS))
+        out = np.zeros((*S.shape[:-2], n, n, 2 * DRAWS))
         for a, b in permutations(range(n), 2):
             of_a, g = self.groups[a], self.draws[a]
             size = PLAUSIBLE * self.rivals.rivals[b].what.scales.max()
-            nearest = np.full((len(S), len(g)), np.inf)
+            each = []
             for of_b in self.alternatives[b]:
                 tie = np.eye(of_b.stop - of_b.start) / size**2
-                taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
-                D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
-                nearest = np.minimum(nearest, ((g @ D) * g).sum(axis=2))
-            out[:, a, b] = np.maximum(nearest, 0.0)
+                taken = np.linalg.solve(S[..., of_b, of_b] + tie, S[..., of_b, of_a])
+                D = S[..., of_a, of_a] - S[..., of_a, of_b] @ taken
+                each.append(((g @ D) * g).sum(axis=-1))
+            out[..., a, b, :] = np.maximum(np.min(each, axis=0), 0.0)
         return out
 
     def gained(self, squared: Array) -> Array:
