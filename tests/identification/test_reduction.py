@@ -9,6 +9,7 @@ from support.cells import kr270_chain, random_poses
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.solve import reduce
+from elastocal.model.effects.gears import JointOffset
 from elastocal.model.manipulator import Model
 
 DOWN = ((0.0, 0.0, -300.0),)
@@ -29,6 +30,13 @@ def reduced(chain, effects, forces=((0, 0, 0),), seed=0, **cell):
         for j, d in enumerate(found.dropped)
     }
     return [model.names[k] for k in found.kept], share, [model.names[d] for d in found.invisible]
+
+
+def test_a_rank_is_a_number_of_which_low_ones_are_kept_first(monkeypatch):
+    """As the page on effects of one's own has it."""
+    assert "joint1.offset" in reduced(planar_chain(), GEOMETRY)[1]
+    monkeypatch.setattr(JointOffset, "rank", 0)
+    assert "joint1.offset" not in reduced(planar_chain(), GEOMETRY)[1]
 
 
 def test_a_vertical_joint_1_leaves_base_z_and_link1_dz_as_a_sum():

@@ -29,7 +29,6 @@ from elastocal.identification.weighted_problem import (
     least_norm,
 )
 from elastocal.model.arm import Parameter
-from elastocal.model.effects.base import RANKS
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -114,7 +113,7 @@ def reduce(
     basis = np.zeros((len(R), 0))
     kept: list[int] = []
     if ranks is None:
-        ranks = np.array([RANKS.index(effect_of(p.effect).rank) for p in parameters])
+        ranks = np.array([effect_of(p.effect).rank for p in parameters])
     for rank in np.unique(ranks):
         candidates = np.flatnonzero(visible & (ranks == rank)).tolist()
         if not candidates:

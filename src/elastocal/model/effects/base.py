@@ -26,8 +26,8 @@ Symbols = Mapping[str, ca.SX]
 NEEDS = ("time", "approach", "temperature", "load", "torque")
 MOTION = "rad or m"  # unit of a parameter of a joint's motion, as the joint turns or slides
 
-# Where a choice is free, a minimal complete set takes parameters of the first ranks.
-RANKS = ("stiffness", "station", "marker", "offset", "ordinary", "link")
+# Ranks of parameters: where a choice is free, a minimal complete set takes low ones first.
+STIFFNESS, STATION, MARKER, OFFSET, ORDINARY, LINK = range(6)
 # Units of a motion along and about the axes of a frame.
 MOVE = ("m", "m", "m", "rad", "rad", "rad")
 
@@ -109,8 +109,8 @@ class Effect:
     elastic: ClassVar[bool] = False
     # `typical` is the size of the value itself, not that of its deviation from nominal.
     sized_by_value: ClassVar[bool] = False
-    # Its place in the choice of a minimal complete set, of RANKS.
-    rank: ClassVar[str] = "ordinary"
+    # Its place in the choice of a minimal complete set, STIFFNESS to LINK.
+    rank: ClassVar[int] = ORDINARY
     # The kinds of file that can hold it; what none can hold is exported as an error with its cost.
     formats: ClassVar[tuple[Format, ...]] = ()
     # One of many causes at once: a diagnosis judges it only in the sum of all components.

@@ -14,6 +14,7 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain, extent
 from elastocal.model.effects.base import (
+    STIFFNESS,
     DrivenEffect,
     Effect,
     JointMotion,
@@ -88,7 +89,7 @@ class JointCompliance(TorqueEffect):
     at = "joints"
     elastic = True
     sized_by_value = True
-    rank = "stiffness"
+    rank = STIFFNESS
     formats = ("elastic",)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
@@ -236,7 +237,7 @@ class OffAxisCompliance(TiltingEffect):
     name = "off_axis_compliance"
     at = "joints"
     sized_by_value = True
-    rank = "stiffness"
+    rank = STIFFNESS
     prefix = "off_axis_compliance_"
     share = 0.2
 
@@ -279,7 +280,7 @@ class BaseCompliance(TiltingEffect):
     name = "base_compliance"
     at = "base"
     sized_by_value = True
-    rank = "stiffness"
+    rank = STIFFNESS
     prefix = "tilt_compliance_"
     share = 0.1
 

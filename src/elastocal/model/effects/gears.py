@@ -12,6 +12,7 @@ from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     MOTION,
+    OFFSET,
     DrivenEffect,
     Effect,
     JointMotion,
@@ -33,7 +34,7 @@ class JointOffset(Effect):
     name = "joint_offset"
     stage = "transmission"
     at = "joints"
-    rank = "offset"
+    rank = OFFSET
     formats = ("rigid", "elastic")
     unknowns = (ParameterSpec("offset", MOTION, 0.0, 1e-3),)
 

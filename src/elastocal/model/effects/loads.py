@@ -15,6 +15,7 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.effects.base import (
+    STIFFNESS,
     DrivenEffect,
     Effect,
     JointMotion,
@@ -212,7 +213,7 @@ class GravityCompensator(Effect):
 
     name = "gravity_compensator"
     stage = "load"
-    rank = "stiffness"
+    rank = STIFFNESS
     formats = ("elastic",)
     remedy = RECORD_TORQUES
 

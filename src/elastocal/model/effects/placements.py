@@ -14,8 +14,11 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
+    LINK,
+    MARKER,
     MOTION,
     MOVE,
+    STATION,
     BaseMotion,
     DrivenEffect,
     Effect,
@@ -42,7 +45,7 @@ class BaseFrame(Effect):
     stage = "tracker"
     at = "base"
     registered = True
-    rank = "station"
+    rank = STATION
     formats = ("rigid", "elastic")
 
     @property
@@ -89,7 +92,7 @@ class LinkGeometry(Effect):
     name = "link_geometry"
     stage = "geometry"
     at = "links"
-    rank = "link"
+    rank = LINK
     formats = ("rigid", "elastic")
     unknowns = (
         *(ParameterSpec(k, "m", 0.0, 1e-3) for k in ("dx", "dy", "dz")),
@@ -110,7 +113,7 @@ class MarkerPosition(Effect):
     stage = "tool"
     at = "markers"
     registered = True
-    rank = "marker"
+    rank = MARKER
     formats = ("rigid", "elastic")
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
@@ -130,7 +133,7 @@ class MarkerOrientation(Effect):
     stage = "tool"
     at = "markers"
     registered = True
-    rank = "marker"
+    rank = MARKER
     formats = ("rigid", "elastic")
     seen_in = "pose"
     unknowns = tuple(ParameterSpec(k, "rad", 0.0, 3e-3) for k in ("rx", "ry", "rz"))
@@ -153,7 +156,7 @@ class DistanceSensor(Effect):
     seen_in = "distance"
     at = "tracker"
     registered = True
-    rank = "station"
+    rank = STATION
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.tracker.anchor if cell.tracker.anchor is not None else np.zeros(3)
