@@ -353,12 +353,8 @@ Line = tuple[str, Joint | None, Array]
 def dh_lines(robot: Robot, pieces: ExportNumbers, convention: Convention) -> list[Line]:
     """The rows of the calibrated table; `robot` says which nominal table, if any, to keep to."""
     nominal = pieces.chain
-    like = _nominal_rows(robot, nominal, convention)
-    ideal = [
-        row if own is None else near(row, own)
-        for row, own in zip(_decompose(nominal, like)[0], like, strict=True)
-    ]
-    rows, F = _decompose(pieces.calibrated_chain(), ideal, keep_last=True)
+    ideal = _nominal_rows(robot, nominal, convention) or _decompose(nominal)[0]
+    rows, F = _decompose(pieces.calibrated_chain(), ideal)
     end, last = split(F)
     rest = np.array([math.atan2(last[1, 0], last[0, 0]), last[2, 3], 0.0, 0.0, 0.0])
     every = np.array([*(near(row, old) for row, old in zip(rows, ideal, strict=True)), end, rest])
@@ -398,13 +394,11 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     return csv_text(header, ([cells.get(name, "") for name in header] for cells in found), comments)
 
 
-def _decompose(
-    chain: Chain, like: Sequence[Array | None], keep_last: bool = False
-) -> tuple[list[Array], Array]:
+def _decompose(chain: Chain, like: list[Array] | None = None) -> tuple[list[Array], Array]:
     """Rows 0 … n of a chain and its flange in the last row's frame, near the rows `like`.
 
-    `keep_last`: the last row changes in θ and d alone, the rest is the flange's.  Its z is often
-    in line with the last axis, where a row of its own would turn any way.
+    Of the last of these θ and d alone change, the rest is the flange's.  Its z is often in line
+    with the last axis, where a row of its own would turn any way.
     """
     turned = [  # rotations whose z column is the axis
         pose_at(np.zeros(3), np.column_stack([*transverse_axes(joint.axis), joint.axis]))
@@ -417,8 +411,8 @@ def _decompose(
     for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
         last = i == chain.n_joints
         T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
-        old = like[i]
-        if last and keep_last and old is not None:
+        old = None if like is None else like[i]
+        if last and old is not None:
             # The turn about and the shift along the axis that bring it closest to T.
             R = T[:3, :3] @ transform(old * TRAILING)[:3, :3].T
             theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
@@ -430,16 +424,15 @@ def _decompose(
     return rows, carried
 
 
-def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> Sequence[Array | None]:
+def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Array] | None:
     """What the user's own table says of links 0 … n; None where it is in another convention."""
-    unknown = [None] * (chain.n_joints + 1)
     if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in dh.UR_ENDINGS:
-        return unknown
+        return None
     table = dh.read_dh_table(robot.dh)
     n = len(table.row)
     # Rows without a joint, joints against z and frames slid along their axes are not rows of ours.
     if n != chain.n_joints or chain.notes or any(joint.axis[2] < 0 for joint in chain.joints):
-        return unknown
+        return None
     stems = ("theta0", "d", "a", "alpha", "beta")
     keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
     numbers = [[dh.dh_number(table, i, *key) for key in keys] for i in range(n)]

@@ -215,13 +215,12 @@ def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str
     np.maximum.at(high, known.codes, q)
     span = high - low
     which = [known.names[c] for c in np.flatnonzero(np.any(span > spread, axis=1))]
-    if not which:
-        return names, []
-    worst = float(span.max())
-    return names, [
-        f"{len(which)} configurations have rows whose joint values differ by up to {worst:.3g} "
-        f"(in the columns' unit): {listed(which, 8)}; if these are different poses, name them apart"
-    ]
+    told = (
+        f"{len(which)} configurations have rows whose joint values differ by up to "
+        f"{span.max():.3g} (in the columns' unit): {listed(which, 8)}; if these are "
+        "different poses, name them apart"
+    )
+    return names, [told] if which else []
 
 
 def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
@@ -380,7 +379,7 @@ def import_files(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
             'export, or set role = "points" in its [[source]]'
         )
-    by_role, told = with_loads_of_names(by_role, table.loads)
+    by_role, warnings = with_loads_of_names(by_role, table.loads)
     points = joining.pooled(by_role["points"])
     log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
     if log is not None and not log.q.shape[1]:
@@ -404,14 +403,19 @@ def import_files(
             observe=observe if cell is None else cell.model.observe,
             text=text,
         )
-    except InputError as error:
-        raise _with_its_place(error, points) from None
+    except InputError as error:  # of a line of the table, and where that came from
+        row = int(found[1]) - 2 if (found := re.search(r"line (\d+)", str(error))) else -1
+        told = f" (from {points.where(row)})" if 0 <= row < len(points) else ""
+        raise InputError(f"{error}{told}") from None
     fit, refused = (
         against_cell(cell, measured, columns, spherical) if cell is not None else (None, "")
     )
-    remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]
-    warnings = [*told, *(r.removeprefix("WARNING: ") for r in remarks), *doubts]
-    warnings += plausibility(columns, measured, None if cell is None else cell.model.observe)
+    remarks = () if joined is None else joined.remarks
+    warnings += [r.removeprefix("WARNING: ") for r in remarks if r.startswith("WARNING: ")]
+    warnings += [
+        *doubts,
+        *plausibility(columns, measured, None if cell is None else cell.model.observe),
+    ]
     if fit is not None and fit.warning:
         warnings.append(fit.warning)
     return Imported(
@@ -429,15 +433,6 @@ def _with_joint_values(points: Records, log: Records, joined: Joined) -> Records
         numbers=theirs.numbers | own.numbers | {s: joined.q[rows, j] for j, s in enumerate(stems)},
         units=theirs.units | own.units | {stem: log.units[stem] for stem in stems},
         texts=pose | own.texts,
-    )
-
-
-def _with_its_place(error: InputError, points: Records) -> InputError:
-    """What is wrong with a line of the table, and where that line came from."""
-    named = re.search(r"line (\d+)", str(error))
-    row = int(named[1]) - 2 if named else -1
-    return InputError(
-        f"{error} (from {points.where(row)})" if 0 <= row < len(points) else str(error)
     )
 
 
