@@ -276,19 +276,14 @@ def _list_of(check: Check, least: int = 0) -> Check:
 
 
 def _by_name(check: Check) -> Check:
-    def checked(value: Any) -> bool:
-        return isinstance(value, Mapping) and all(_text(k) and check(v) for k, v in value.items())
-
-    return checked
+    return lambda value: (
+        isinstance(value, Mapping) and all(_text(k) and check(v) for k, v in value.items())
+    )
 
 
 def _is_a(name: str) -> Check:
     """Whether a class of that name is among those of a value, which need not be loaded for it."""
     return lambda value: any(each.__name__ == name for each in type(value).__mro__)
-
-
-def _seed(value: Any) -> bool:
-    return (_whole(value) and 0 <= value <= LARGEST_SEED) or _is_a("Generator")(value)
 
 
 # Kind as it is annotated → how a message names it, and whether a value is one.  Names that are not
@@ -325,7 +320,10 @@ ALIASES = {
 }
 # A load is the argument `load`, and in a table its column `force`; each is taken for the other.
 SAME = {"force": "load", "load": "force"}
-SEED = (f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator", _seed)
+SEED = (
+    f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator",
+    lambda v: (_whole(v) and 0 <= v <= LARGEST_SEED) or _is_a("Generator")(v),
+)
 
 
 def checked_arguments(function: F) -> F:

@@ -65,8 +65,6 @@ class ElastocalError(Exception):
 class InputError(ElastocalError):
     """The input is wrong: a file, a key, a column, a unit, a value."""
 
-    exit_code = 2
-
 
 class InsufficientDataError(ElastocalError):
     """The input is well formed, but the data do not support an answer."""

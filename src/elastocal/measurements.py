@@ -695,15 +695,11 @@ def read_matrix(path: str | Path, what: str) -> Array:
         return np.array(found, dtype=float)
     lines = enumerate(read_text(path, what, tables.MOST_BYTES).splitlines(), start=1)
     rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if line.strip()]
-    if not rows:
-        raise InputError(f"{path}: empty file; a {what} is a square table of numbers")
+    require(bool(rows), f"{path}: empty file; a {what} is a square table of numbers")
     width = len(rows[0][1])
     for number, cells in rows:
-        if len(cells) != width:
-            raise InputError(
-                f"{path}, line {number}: {len(cells)} numbers, the first line has {width}; a "
-                f"{what} is a square table without a header"
-            )
+        told = f"{len(cells)} numbers, the first line has {width}; a {what} is a square table"
+        require(len(cells) == width, f"{path}, line {number}: {told} without a header")
     columns = {i: f"no. {i + 1}" for i in range(width)}
     if problem := tables.first_bad_cell(str(path), rows, columns, False):
         raise problem

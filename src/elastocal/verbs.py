@@ -201,14 +201,12 @@ def design_request(
         asked["prior"], prior = prior, None
     cell = replace(cell, design=_design_of(cell, asked))
     cell.check()
-    asked_for = [("curve", whole("curve", n)) for n in curve]
+    for number in curve:
+        check_levels(cell, "curve", whole("curve", number))
     if asked.get("poses") is not None:
-        asked_for.append(("poses", cell.design.poses or 0))
-    for name, number in asked_for:
-        check_levels(cell, name, number)
-    files = (augment, knowledge, keep, strike)
+        check_levels(cell, "poses", cell.design.poses or 0)
+    files, done = (augment, knowledge, keep, strike), None
     known = None if all(file is None for file in files) else Model(cell)
-    done = None
     if augment is not None and known is not None:
         own = model if isinstance(model, Model) else known
         done = _table("augment", own, augment)
@@ -227,7 +225,7 @@ def design_request(
         fixed=_names("fixed", fixed),
         prior=_gaussian(prior) if stated is None else stated,
         done=done,
-        curve=tuple(sorted({n for name, n in asked_for if name == "curve"})),
+        curve=tuple(sorted({*curve})),
         notes=notes,
         pins=pins,
     )
@@ -370,13 +368,12 @@ def simulate(
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
         (3.3...e-07, 3.4...e-07)
     """
-    return simulated(_model(model), plan, values, draw, load, repeats, noise, cast(int, seed))[0]
+    return simulated(_model(model), plan, values, draw, repeats, noise, seed, load)[0]
 
 
 def simulated(
-    made: Model, plan: Plan | Table | ArrayLike, values: Mapping[str, float] | ArrayLike | None,
-    draw: float = 0.0, load: ArrayLike | None = None, repeats: int = 1, noise: bool = True,
-    seed: int = 0,
+    made: Model, plan: Any, values: Any, draw: float, repeats: int, noise: bool, seed: Seed,
+    load: ArrayLike | None = None,
 ) -> tuple[Measurements, Array]:  # fmt: skip
     """What `simulate` gives, and the true values (parameters,) behind it."""
     import numpy as np
@@ -391,13 +388,12 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats, 1)
-    given: Any = plan
-    if isinstance(given, str | Path):
-        poses = made.read_plan(given)
-    elif type(given).__name__ == "Plan":
-        poses = given.table()
+    if isinstance(plan, str | Path):
+        poses = made.read_plan(plan)
+    elif type(plan).__name__ == "Plan":
+        poses = plan.table()
     else:
-        poses = given if isinstance(given, Measurements) else made.table(given)
+        poses = plan if isinstance(plan, Measurements) else made.table(plan)
     check_limits(made, poses)
     rng = np.random.default_rng(seed)
     rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)

@@ -36,7 +36,7 @@ from elastocal.config import (
 )
 from elastocal.errors import InputError, require
 from elastocal.text import is_label, listed, quoted
-from elastocal.units import Array, to_si
+from elastocal.units import Array
 
 Observe = Literal["position", "deflection", "pose", "distance"]
 Convention = Literal["standard", "modified"]
@@ -202,13 +202,6 @@ class PolarNoise:
     transverse: Positive = keyed("a positive number in µm", "transverse_um")
     transverse_per_m: NonNegative = keyed("a number >= 0 in µm per m", "transverse_ppm")
 
-    @classmethod
-    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        return {
-            "range_per_m": to_si(table.get("range_ppm", 0.0), "ppm"),
-            "transverse_per_m": to_si(table.get("transverse_ppm", 0.0), "ppm"),
-        }
-
 
 @record
 class Tracker:
@@ -235,23 +228,22 @@ class Tracker:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        polar = [name for name in POLAR_KEYS if name in table]
-        if "sigma_um" in table:
-            spot.require(
-                not polar,
-                f"keys tracker.sigma_um and tracker.{''.join(polar[:1])} are two styles of noise; "
-                f"keep sigma_um, or {', '.join(POLAR_KEYS)}",
-            )
-            return {"noise": from_table(CartesianNoise, table, spot)}
+        polar, cartesian = [name for name in POLAR_KEYS if name in table], "sigma_um" in table
         if not polar:
-            return {"noise": None}
+            return {"noise": from_table(CartesianNoise, table, spot) if cartesian else None}
+        spot.require(
+            not cartesian,
+            f"keys tracker.sigma_um and tracker.{polar[0]} are two styles of noise; keep sigma_um, "
+            f"or {', '.join(POLAR_KEYS)}",
+        )
         for name in ("range_um", "transverse_um"):
             spot.require(
                 name in table,
                 f"key tracker.{name} is missing; beside tracker.{polar[0]} it takes a positive "
                 "number in µm",
             )
-        return {"noise": from_table(PolarNoise, table, spot)}
+        known = {"range_ppm": 0.0, "transverse_ppm": 0.0}
+        return {"noise": from_table(PolarNoise, known | table, spot)}
 
 
 @record
@@ -384,14 +376,11 @@ class Nominal:
         self, place: str, settings: Mapping[str, float], sizes: Mapping[str, float] = {}
     ) -> Nominal:
         """The same with these constants, and sizes, of the effects at a place."""
-
-        def merged(
-            known: dict[str, dict[str, float]], new: Mapping[str, float]
-        ) -> dict[str, dict[str, float]]:
-            return {**known, place: {**known.get(place, {}), **new}} if new else known
-
-        both = merged(self.settings, settings), merged(self.sizes, sizes)
-        return replace(self, settings=both[0], sizes=both[1])
+        more = {kind: new for kind, new in (("settings", settings), ("sizes", sizes)) if new}
+        known: dict[str, Any] = {kind: dict(getattr(self, kind)) for kind in more}
+        for kind, places in known.items():
+            places[place] = {**places.get(place, {}), **more[kind]}
+        return replace(self, **known)
 
 
 @record
