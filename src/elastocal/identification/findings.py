@@ -17,7 +17,7 @@ from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
-from elastocal.identification.result import Calibration, Estimate, Finding, Severity
+from elastocal.identification.result import Calibration, Estimate, Finding
 from elastocal.identification.sentences import AT_BOUND, STATE_NOISE, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
@@ -78,11 +78,9 @@ def judged(
 
     Some only the `solution` and the `whole` table can tell; without them those of the result stay.
     """
-    of_solution = result.findings
+    of_solution = list(result.findings)
     if solution is not None and whole is not None:
-        of_solution = (
-            *_conditioning(result, solution), *_bounds(result), *_exchanged(result, whole)
-        )  # fmt: skip
+        of_solution = [*_conditioning(result, solution), *_exchanged(result, whole)]
     compared = tuple(_against_stated_noise(result))
     fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
     noise = (*compared, *_repeats(result, fits))
@@ -107,7 +105,7 @@ def judged(
         *(f for f in visits if f.kind != "scatter_not_counted"),
         *_prediction(result, explained),
         *_new_poses(result, explained),
-        *(f for f in of_solution if f.kind == "beyond_bound"),
+        *_bounds(result),
         *_faulty(result),
         *_undetermined(result),
         *_prior(result),
@@ -118,16 +116,14 @@ def judged(
 
 
 def _trust(found: list[Finding]) -> Finding:
-    worst: Severity = "good"
-    for severity in ("care", "poor"):
-        if any(f.severity == severity for f in found):
-            worst = severity
-    doubts = tuple(f.kind for f in found if f.severity == worst) if worst != "good" else ()
+    for say, severity in ((_poor, "poor"), (_care, "care")):
+        if doubts := tuple(f.kind for f in found if f.severity == severity):
+            return say("trust", "", because=doubts)
     use = (
         "Use it (elastocal compensate, elastocal export) where poses and loads are like those "
         "measured."
     )
-    return made(worst, "trust", use if worst == "good" else "", because=doubts)
+    return _good("trust", use, because=())
 
 
 def _spoilt(result: Calibration) -> Iterator[Finding]:

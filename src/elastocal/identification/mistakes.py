@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain as chain_of
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 from scipy import special
@@ -90,22 +90,18 @@ def nominal_fit(
     for words, other in chain_of(of_columns, _of_rows(rigid, table)):
         left = _errors(rigid, other)[1]
         if left < near:
-            near, best = left, words.format(_mm(left))
+            near, best = left, words.format(f"{left * 1e3:.3g} mm")
         if near <= POOR:
             break
-    if near >= far / BETTER:
+    better = near < far / BETTER
+    if not better:
         best = (
             "and neither another unit or scale, signs, couplings, offsets or an exchange of "
             "columns, one or two of them, nor rows that have shifted mend that: check the robot of "
             "the cell, offsets of joints, and which joint values belong to which point"
         )
-    said = f"the readings fit the nominal arm only to {_mm(far)}"
-    mark = "," if best.startswith("and neither") else ";"
-    return NominalFit(error, f"{said}{mark} {best}", near <= min(POOR, far / BETTER))
-
-
-def _mm(metres: float) -> str:
-    return f"{metres * 1e3:.3g} mm"
+    said = f"the readings fit the nominal arm only to {far * 1e3:.3g} mm{';' if better else ','}"
+    return NominalFit(error, f"{said} {best}", better and near <= POOR)
 
 
 def _some(table: Measurements) -> Measurements:
@@ -157,49 +153,37 @@ class JointMap:
 
 
 def joint_maps(chain: Chain) -> list[JointMap]:
-    signs, couplings, others = (list(some(chain)) for some in (_signs, _couplings, _others))
-    single = [sign for sign in signs if sign.mistakes == 1]
-    pairs = [
-        *((a, b) for a in signs for b in couplings), *combinations(couplings, 2),
-        *combinations(others, 2), *((a, b) for a in others for b in (*single, *couplings)),
-    ]  # fmt: skip
-    none = JointMap((), np.eye(chain.n_joints), mistakes=0)
-    return [none, *signs, *couplings, *others, *(b.after(a) for a, b in pairs)]
-
-
-def _signs(chain: Chain) -> Iterator[JointMap]:
-    n = chain.n_joints
-    for k in range(1, (n if n <= MOST_SIGNS else 2) + 1):
-        for turned in combinations(range(n), k):
-            D = np.eye(n)
-            D[turned, turned] = -1.0
-            names = f"joint{'s' * (k > 1)} {listed([str(j + 1) for j in turned])}"
-            yield JointMap((f"with the sign of {names} turned round",), D, mistakes=k)
-
-
-def _couplings(chain: Chain) -> Iterator[JointMap]:
-    for j in range(1, chain.n_joints):
-        for factor in (1.0, -1.0) if chain.kinds[j] == chain.kinds[j - 1] else ():
-            C = np.eye(chain.n_joints)
-            C[j, j - 1] = factor
-            words = f"with coupling {{ joint = {j + 1}, of = {j}, factor = {factor:g} }}"
-            yield JointMap((words,), C)
-
-
-def _others(chain: Chain) -> Iterator[JointMap]:
-    eye = np.eye(chain.n_joints)
-    turning = np.array([kind == "revolute" for kind in chain.kinds])
-    for factor, words in ((np.pi / 180, "degrees read as radians"),
-                          (180 / np.pi, "radians read as degrees")):  # fmt: skip
-        yield JointMap((f"if joints were {words}",), np.diag(np.where(turning, factor, 1.0)))
-    for j in np.flatnonzero(turning):
-        for degrees in TURNS:
-            words = f"with offset_deg {degrees} at joint {j + 1}"
-            yield JointMap((words,), eye, np.radians(degrees) * eye[j], 1.1)
-    for a, b in combinations(range(chain.n_joints), 2):
-        order = np.arange(chain.n_joints)
+    n, kinds, eye = chain.n_joints, chain.kinds, np.eye(chain.n_joints)
+    signs, couplings, others = list[JointMap](), list[JointMap](), list[JointMap]()
+    most = n if n <= MOST_SIGNS else 2
+    for turned in chain_of(*(combinations(range(n), k) for k in range(1, most + 1))):
+        names = f"joint{'s' * (len(turned) > 1)} {listed([str(j + 1) for j in turned])}"
+        D = np.diag(np.where(np.isin(np.arange(n), turned), -1.0, 1.0))
+        told = f"with the sign of {names} turned round"
+        signs.append(JointMap((told,), D, mistakes=len(turned)))
+    for j in range(1, n):
+        for factor in (1.0, -1.0) if kinds[j] == kinds[j - 1] else ():
+            told = f"with coupling {{ joint = {j + 1}, of = {j}, factor = {factor:g} }}"
+            couplings.append(JointMap((told,), eye + factor * np.outer(eye[j], eye[j - 1])))
+    turning = np.array([kind == "revolute" for kind in kinds])
+    for factor, told in ((np.pi / 180, "degrees read as radians"),
+                         (180 / np.pi, "radians read as degrees")):  # fmt: skip
+        scale = np.diag(np.where(turning, factor, 1.0))
+        others.append(JointMap((f"if joints were {told}",), scale))
+    for j, degrees in product(np.flatnonzero(turning).tolist(), TURNS):
+        told = f"with offset_deg {degrees} at joint {j + 1}"
+        others.append(JointMap((told,), eye, np.radians(degrees) * eye[j], 1.1))
+    for a, b in combinations(range(n), 2):
+        order = np.arange(n)
         order[[a, b]] = b, a
-        yield JointMap((f"with the columns of joints {a + 1} and {b + 1} exchanged",), eye[order])
+        told = f"with the columns of joints {a + 1} and {b + 1} exchanged"
+        others.append(JointMap((told,), eye[order]))
+    pairs = [
+        *product(signs, couplings), *combinations(couplings, 2), *combinations(others, 2),
+        *product(others, (*signs[:n], *couplings)),
+    ]  # fmt: skip
+    none = JointMap((), eye, mistakes=0)
+    return [none, *signs, *couplings, *others, *(b.after(a) for a, b in pairs)]
 
 
 # The linear map of positions onto the arm tells their unit, scale and handedness.
@@ -290,31 +274,30 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
         return
     most = FARTHEST_ROW * max(round(len(table) / visits), 1)
     shifts, flange = np.arange(-most, most + 1), nominal_flanges(model.chain, table.q)
-    placed = (_placed_by(model, table, block, s) for block, s in
-              _blocks(table, flange, visit, shifts))  # fmt: skip
+    to = rows[:, None] + shifts
+    beyond, to = (to < 0) | (to >= len(rows)), np.clip(to, 0, len(rows) - 1)
+
+    def placed_by(rows: IntArray, shift: IntArray | int) -> Registration:
+        return Registration.of(model, _moved(table, rows, shift))
+
+    placed = (placed_by(*block) for block in _blocks(table, flange, visit, shifts))
     found = next((one for one in placed if one.error <= NEAR / 2), None)
     if found is None:
         return
     for _ in range(3):
-        distance = _distances(found, table, flange, shifts)
+        off = np.asarray(table.position)[:, None] - found.places(flange, table.marker)[to]
+        distance = np.where(beyond, np.inf, np.linalg.norm(off, axis=2))
         path = _path(distance / np.clip(6 * found.error, NEAREST, NEAR))
         moved = shifts[path]
-        inside = np.flatnonzero((rows + moved >= 0) & (rows + moved < len(rows)))
-        found = _placed_by(model, table, inside, moved[inside])
+        inside = np.flatnonzero(~beyond[rows, path])
+        found = placed_by(inside, moved[inside])
     starts = np.flatnonzero(np.r_[True, np.diff(moved) != 0])
     if len(starts) * FEWEST > visits or not moved.any():
         return
     good = distance[rows, path] <= NEAR
-    later = visit[np.clip(rows + moved, 0, len(rows) - 1)] - visit
+    later = visit[to[rows, path]] - visit
     blocks = [(b, np.unique(later[b[good[b]]])) for b in np.split(rows, starts[1:])]
-    words = _slipped_words(table, moved, blocks)
-    yield words, _moved(table, inside, moved[inside])
-
-
-def _placed_by(
-    model: Model, table: Measurements, rows: IntArray, shift: IntArray | int
-) -> Registration:
-    return Registration.of(model, _moved(table, rows, shift))
+    yield _slipped_words(table, moved, blocks), _moved(table, inside, moved[inside])
 
 
 def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:
@@ -337,16 +320,6 @@ def _blocks(
                   for s, left in zip(own.tolist(), fits.left.tolist(), strict=True)]  # fmt: skip
     found.sort(key=lambda one: one[:4])
     return [(rows, s) for *_, rows, s in found[:PLACED]]
-
-
-def _distances(found: Registration, table: Measurements, flange: Array, shifts: IntArray) -> Array:
-    """Distance (n, shifts) in m of every reading from the nominal place of the row that many
-    further on; infinite beyond the table."""
-    place = found.places(flange, table.marker)
-    to = np.arange(len(table))[:, None] + shifts
-    off = np.asarray(table.position)[:, None] - place[np.clip(to, 0, len(table) - 1)]
-    inside = (to >= 0) & (to < len(table))
-    return np.where(inside, np.linalg.norm(off, axis=2), np.inf)
 
 
 def _path(cost: Array) -> IntArray:
@@ -372,31 +345,26 @@ def _slipped_words(
     """ "configurations 1 to 20 fit the nominal arm to 1 mm; from 21 on the points belong to joint
     values one later, from 27 two later", of blocks of rows with the visits that they are off by."""
     by_rows = any(len(visits) != 1 for _, visits in blocks)
-
-    def label(row: int) -> str:
-        return str(
-            table.row[row] if by_rows else table.configuration_labels[table.configuration[row]]
-        )
-
-    fits: list[str] = []
-    later: list[str] = []
+    what, line, unit = ("", "line ", "row") if by_rows else ("configurations ", "", "pose")
+    label = (
+        table.row if by_rows else np.array(table.configuration_labels)[table.configuration]
+    )  # fmt: skip
+    fits, later = list[str](), list[str]()
     for rows, visits in blocks:
         shift = int(moved[rows[0]] if by_rows else visits[0])
-        size = {1: "one", 2: "two"}.get(abs(shift), str(abs(shift)))
-        unit = "row" if by_rows else "pose"
-        unit = f" {unit}{'s' * (abs(shift) > 1)}"
         side = "later" if shift > 0 else "earlier"
+        size = {1: "one", 2: "two"}.get(abs(shift), str(abs(shift)))
+        several = f"{size} {unit}{'s' * (abs(shift) > 1)}"
         if len(blocks) == 1:
-            return f"with the joint values of {size}{unit} {side} they would fit to {{}}"
-        first, last = label(int(rows[0])), label(int(rows[-1]))
+            return f"with the joint values of {several} {side} they would fit to {{}}"
+        first, last = label[rows[[0, -1]]]
         if shift:
             on = "" if later else " on the points belong to joint values"
-            size += unit * by_rows
-            later.append(f"from {'line ' * by_rows}{first}{on} {size} {side}")
+            later.append(f"from {line}{first}{on} {several if by_rows else size} {side}")
         else:
-            end = "and later" if rows[-1] == len(table) - 1 else f"to {last}"
-            fits.append(f"{'line ' * by_rows}{first} {end}")
-    what = "" if by_rows else "configurations "
+            fits.append(
+                f"{line}{first} {'and later' if rows[-1] == len(table) - 1 else f'to {last}'}"
+            )
     own = f"{what}{listed(fits)} fit the nominal arm to {{}}; " if fits else ""
     return f"{own}{listed(later)}"
 
@@ -513,24 +481,18 @@ def _length(model: Model, table: Measurements) -> float:
 
 
 def _cause(every: Measurements, fit: NominalFit | None) -> str:
-    if (same := _constant(every)) and (fit is None or not fit.mended):
-        return f"{same} in all {len(every)} rows: was it recorded?"
+    columns = [] if every.position is None else list(zip("xyz", every.position.T, strict=True))
+    columns += [(f"q{j + 1}", values) for j, values in enumerate(every.q.T)]
+    same = [name for name, values in columns if (values == values[0]).all()]
+    if same and (fit is None or not fit.mended):
+        one = "column {} holds" if len(same) == 1 else "columns {} hold"
+        return f"{one.format(listed(same))} one value in all {len(every)} rows: was it recorded?"
     if fit is not None and fit.warning:
         return fit.warning
     return (
         "check the units and the order of the columns, which joint values belong to which point, "
         "and whether the cell describes this robot"
     )
-
-
-def _constant(table: Measurements) -> str:
-    columns = [] if table.position is None else list(zip("xyz", table.position.T, strict=True))
-    columns += [(f"q{j + 1}", values) for j, values in enumerate(table.q.T)]
-    same = [name for name, values in columns if (values == values[0]).all()]
-    if not same:
-        return ""
-    one = len(same) == 1
-    return f"{'column' if one else 'columns'} {listed(same)} {'holds' if one else 'hold'} one value"
 
 
 # Markers whose names are exchanged: readings that lie where another marker is.
@@ -547,12 +509,6 @@ MOST_READINGS, PASSES = 200_000, 10
 # nearer.  A reading that is wrong by r is as near to it by chance once in (r/least)³.
 BESIDE, NEARER = 3.0, 5.0
 SHOWN = 6  # runs of lines, and configurations, that are named
-
-
-IN_ALL = (
-    "Markers {} lie where [tool.markers_m] states each other: their names are exchanged in all "
-    "rows of the table, or in the cell. Exchange them in one of the two."
-)
 
 
 @dataclass(frozen=True)
@@ -589,11 +545,21 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
     if not len(rows):
         return None
     mixed = np.unique([*table.marker[rows], *meant[rows]])
-    whole = len(rows) == np.isin(table.marker, mixed).sum()
     markers = tuple(names[m] for m in mixed)
-    return Exchanged(
-        rows, markers, IN_ALL.format(listed(markers)) if whole else _in_some(table, rows, markers)
+    words = (
+        f"Markers {listed(markers)} lie where [tool.markers_m] states each other: their names are "
+        "exchanged in all rows of the table, or in the cell. Exchange them in one of the two."
     )
+    if len(rows) < np.isin(table.marker, mixed).sum():
+        lines = named_runs(table.row[rows].tolist())
+        labels = dict.fromkeys(table.configuration_labels[c] for c in table.configuration[rows])
+        words = (
+            f"The names of markers {listed(markers)} are exchanged in {len(rows)} rows (lines "
+            f"{listed(lines, SHOWN)}; configuration{'s' * (len(labels) > 1)} "
+            f"{listed(labels, SHOWN)}): each reading there lies where the other marker is. "
+            "Exchange the names in these rows."
+        )
+    return Exchanged(rows, markers, words)
 
 
 def _as_stated(tool: Tool, names: tuple[str, ...], places: Array) -> IntArray:
@@ -608,14 +574,3 @@ def _as_stated(tool: Tool, names: tuple[str, ...], places: Array) -> IntArray:
         if (off**2).sum() > level * (crossed**2).sum():
             best[[a, b]] = best[[b, a]]
     return best
-
-
-def _in_some(table: Measurements, rows: IntArray, markers: tuple[str, ...]) -> str:
-    lines = named_runs(table.row[rows].tolist())
-    labels = dict.fromkeys(table.configuration_labels[c] for c in table.configuration[rows])
-    several = "s" * (len(labels) > 1)
-    return (
-        f"The names of markers {listed(markers)} are exchanged in {len(rows)} rows (lines "
-        f"{listed(lines, SHOWN)}; configuration{several} {listed(labels, SHOWN)}): each reading "
-        "there lies where the other marker is. Exchange the names in these rows."
-    )

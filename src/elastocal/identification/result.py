@@ -350,8 +350,8 @@ class Calibration(scrutiny.FoundFit, Result):
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
         """The estimates of all parameters but those of smooth functions."""
-        shrunk = {p.name for p in self.model.parameters if p.shrunk}
-        return tuple(e for e in self.estimates if e.name not in shrunk)
+        each = zip(self.estimates, self.model.parameters, strict=True)
+        return tuple(e for e, p in each if not p.shrunk)
 
     @property
     def verdict(self) -> Verdict:
@@ -516,19 +516,12 @@ class Calibration(scrutiny.FoundFit, Result):
     @cached_property
     def arm(self) -> CalibratedArm:
         """The calibrated arm, in memory: to be commanded (`compensate`), posed and saved."""
+        lacking = 0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean()))
         return CalibratedArm(
-            self.model,
-            self.x,
-            self.determined,
-            self.covariance,
-            self.observations.table.source,
-            tuple(_estimate_json(e) for e in self.estimates),
-            self.left,
-            0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean())),
-            measured_loads(self.observations),
-            self.shown,
-            measured_visits(self.observations),
-        )
+            self.model, self.x, self.determined, self.covariance, self.observations.table.source,
+            tuple(map(_estimate_json, self.estimates)), self.left, lacking,
+            measured_loads(self.observations), self.shown, measured_visits(self.observations),
+        )  # fmt: skip
 
     @cached_property
     def load_point_error(self) -> float | None:
@@ -625,9 +618,7 @@ class Calibration(scrutiny.FoundFit, Result):
     def residual_table(self) -> list[dict[str, Any]]:
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
         observed, table = self.observations, self.observations.table
-        parts = self.residual.reshape(-1, observed.size)
-        held = self.held_out.reshape(-1, observed.size)
-        rows = []
+        held, rows = self.held_out.reshape(-1, observed.size), list[dict[str, Any]]()
         for k, i in enumerate(observed.lead):
             row: dict[str, Any] = {
                 "line": int(table.row[i]),
@@ -637,7 +628,7 @@ class Calibration(scrutiny.FoundFit, Result):
             }
             for j, name in enumerate(COMPONENTS[observed.kind]):
                 unit = "urad" if name.startswith("r") else "um"
-                row[f"residual_{name}_{unit}"] = float(parts[k, j]) * 1e6
+                row[f"residual_{name}_{unit}"] = float(self.residuals[k, j]) * 1e6
                 row[f"heldout_{name}_{unit}"] = float(held[k, j]) * 1e6
             rows.append(row)
         return rows
@@ -714,12 +705,9 @@ def _json(part: Any) -> dict[str, Any] | None:
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:
-    told = {
-        "name": e.name, "value": e.value, "unit": e.unit, "std": e.std, "ci95": e.ci95,
-        "dof": e.dof, "identifiable": e.identifiable, "combined_with": e.combined_with,
-        "nominal": e.nominal, "held": e.held, "note": e.note or _endless(e.ci95),
-    }  # fmt: skip
-    return dict(plain(told if e.limits is None else told | {"limits95": e.limits}))
+    told = vars(e) | {"identifiable": e.identifiable, "note": e.note or _endless(e.ci95)}
+    limits = told.pop("limits")
+    return dict(plain(told if limits is None else told | {"limits95": limits}))
 
 
 def _endless(ci95: tuple[float, float] | None) -> str:

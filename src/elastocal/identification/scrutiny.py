@@ -50,8 +50,7 @@ class FoundFit:
     @cached_property
     def columns(self) -> IntArray:
         """Indices (determined,) of the parameters `determined` among the model's."""
-        index = {name: i for i, name in enumerate(self.model.names)}
-        return np.array([index[name] for name in self.determined], dtype=np.int64)
+        return np.array([self.model.names.index(n) for n in self.determined], dtype=np.int64)
 
     @cached_property
     def B(self) -> Array:
@@ -246,38 +245,37 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
         CHOSEN: fitted,
         "all that readings tell apart": every,
     }
-    names: dict[bytes, str] = {}
-    for name, chosen in named.items():
-        if chosen.any() and (name == CHOSEN or chosen.tobytes() not in names):
-            names[chosen.tobytes()] = name
-    if len(names) < 2:
+    sets: dict[bytes, tuple[str, BoolArray]] = {}
+    for name, own in named.items():
+        if own.any() and (name == CHOSEN or own.tobytes() not in sets):
+            sets[own.tobytes()] = name, own
+    if len(sets) < 2:
         return ()
     moves = np.where(fitted & (stage > 0), fit.x - model.nominal, 0.0)
     y = fit.residual + fit.B @ moves
     e, target = weights.apply(fit.residual), weights.apply(y)
     s2 = float(e @ e) / max(fit.dof, 1)
-    held, plain, likelihood = [], {}, {}
-    for name in names.values():
-        chosen = named[name]
+    held, plain, likelihood = list[Array](), list[float](), list[float]()
+    for _, own in sets.values():
         # Whole rows count by the fit's weights, whatever the set.
-        left, own = _refitted(fit, y, np.flatnonzero(chosen), weights)
-        plain[name] = rms_3d(left, size)
-        held.append((own.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
-        placed, others = chosen & (stage == 0), chosen & (stage > 0)
-        likelihood[name] = _restricted(white, target, placed, others, typical, s2)
+        left, alone = _refitted(fit, y, np.flatnonzero(own), weights)
+        plain.append(rms_3d(left, size))
+        held.append((alone.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
+        placed, others = own & (stage == 0), own & (stage > 0)
+        likelihood.append(_restricted(white, target, placed, others, typical, s2))
     _, code = np.unique(observed.configuration, return_inverse=True)
     squares = np.array([np.bincount(code, h) for h in held])
     drawn = _drawn_rms(squares, np.bincount(code), np.random.default_rng(0))
     rms = [float(np.sqrt(h.mean())) for h in held]
-    first = list(names.values()).index(CHOSEN)
+    first = [name for name, _ in sets.values()].index(CHOSEN)
     found = []
-    for k, name in enumerate(names.values()):
+    for k, (name, own) in enumerate(sets.values()):
         over = drawn[k] - drawn[first] if np.isfinite(held[k]).all() else np.full(DRAWS, np.inf)
         low, high = (float(v) for v in np.quantile(over, [0.025, 0.975], method="nearest"))
         found.append(
             ParameterSet(
-                name, int(named[name].sum()), plain[name], rms[k], rms[k] - rms[first],
-                (low, high), likelihood[name] - likelihood[CHOSEN],
+                name, int(own.sum()), plain[k], rms[k], rms[k] - rms[first], (low, high),
+                likelihood[k] - likelihood[first],
             )
         )  # fmt: skip
     return tuple(found)
@@ -402,21 +400,24 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
         return None
     stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
     stage[model.shrunk] = len(STAGES) - 1
-    determined = np.isin(model.names, result.determined)
+    determined, observed = np.isin(model.names, result.determined), result.observations
     last = int(stage[determined].max(initial=0))
-    rng = np.random.default_rng(0)
-    steps = []
-    for k in range(last):
-        if k and not (determined & (stage == k)).any():
+    _, code = np.unique(observed.configuration, return_inverse=True)
+    rng, steps = np.random.default_rng(0), []
+    for k in range(last + 1):
+        if 0 < k < last and not (determined & (stage == k)).any():
             continue
-        residual = _fitted(result, np.flatnonzero(determined & (stage <= k)), stage > k)
-        if residual is not None:
-            steps.append(_step(STAGES[k], result, residual, rng))
-    steps.append(_step(STAGES[last], result, result.held_out, rng))
+        columns = np.flatnonzero(determined & (stage <= k))
+        residual = result.held_out if k == last else _fitted(result, columns, stage > k)
+        if np.isfinite(residual).all():
+            parts = residual.reshape(-1, observed.size)[:, :3]
+            squares = np.bincount(code, (parts**2).sum(axis=1))
+            rms, ci95 = resampled_rms(squares, np.bincount(code), rng)
+            steps.append(BudgetStep(STAGES[k], rms, ci95, parts))
     return ErrorBudget(tuple(steps), *_floor(result))
 
 
-def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_]) -> Array | None:
+def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_]) -> Array:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
     model linearised at the whole fit."""
     model, B = result.model, result.B
@@ -429,19 +430,7 @@ def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_
         sigma = max(float(np.sqrt(np.mean(weights.apply(y) ** 2))), 1e-300)
         kept = reduce(weights.apply(B[:, columns]), sizes, own, sigma, WORTH_A_COLUMN).kept
         columns = columns[kept]
-    if not len(columns):
-        return y
-    found = _refitted(result, y, columns, weights)[1]
-    return found if np.isfinite(found).all() else None
-
-
-def _step(name: str, result: FoundFit, residual: Array, rng: np.random.Generator) -> BudgetStep:
-    observed = result.observations
-    parts = residual.reshape(-1, observed.size)[:, :3]
-    squared = (parts**2).sum(axis=1)
-    _, code = np.unique(observed.configuration, return_inverse=True)
-    rms, ci95 = resampled_rms(np.bincount(code, squared), np.bincount(code), rng)
-    return BudgetStep(name, rms, ci95, parts)
+    return _refitted(result, y, columns, weights)[1] if len(columns) else y
 
 
 def _floor(result: FoundFit) -> tuple[float | None, str]:

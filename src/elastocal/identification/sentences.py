@@ -8,7 +8,7 @@ from typing import Any
 from elastocal.errors import option
 from elastocal.identification.outliers import Outlier, named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
-from elastocal.text import gathered, listed
+from elastocal.text import counted, gathered, listed
 
 # What to do about a finding.
 
@@ -136,6 +136,19 @@ SENTENCES = {
         "load state, marker or region. {remedy}"
     ),
 }
+# Readings beyond the noise that had a part in the fit, and those set apart.
+FAULTY = (
+    (
+        "outliers", ("lies", "lie"),
+        "{} beyond what the noise explains (lines {}); they are in the fit. Check them; {drop} "
+        "excludes them.",
+    ),
+    (
+        "excluded", ("was", "were"),
+        "{} excluded as outliers (lines {}). They are mistakes, or signs of a missing effect. All "
+        "are listed in the result under 'excluded'; {keep} keeps them.",
+    ),
+)  # fmt: skip
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
     "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
@@ -168,7 +181,14 @@ def warning_sentences(result: Calibration) -> tuple[Told, ...]:
 def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
     f = same[0]
     if f.kind == "faulty_readings":
-        yield from _faulty_readings(result)
+        for readings, verbs, text in FAULTY:
+            found: tuple[Outlier, ...] = getattr(result, readings)
+            if n := len(found):
+                told = text.format(
+                    f"{counted(n, 'reading')} {verbs[n > 1]}", _runs(o.line for o in found),
+                    drop=option("outliers", "drop"), keep=option("outliers", "keep"),
+                )  # fmt: skip
+                yield told
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
             k: ", ".join(one if isinstance(one, str) else f"{one:.3g}" for one in v)
@@ -189,35 +209,9 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
 
 
-def _faulty_readings(result: Calibration) -> list[str]:
-    found = []
-    if result.outliers:
-        found.append(
-            f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains "
-            f"({_lines(result.outliers)}); they are in the fit. Check them; "
-            f"{option('outliers', 'drop')} excludes them."
-        )
-    if result.excluded:
-        found.append(
-            f"{_count(result.excluded, 'was', 'were')} excluded as outliers "
-            f"({_lines(result.excluded)}). They are mistakes, or signs of a missing effect. All "
-            f"are listed in the result under 'excluded'; {option('outliers', 'keep')} keeps them."
-        )
-    return found
-
-
-def _lines(readings: tuple[Outlier, ...]) -> str:
-    return f"lines {_runs(o.line for o in readings)}"
-
-
 def _runs(lines: Iterable[int]) -> str:
     runs = named_runs(list(lines))
     return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
-
-
-def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
-    n = len(readings)
-    return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
 
 
 # Of these the warning, or the line on the prior, says what to do.
