@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -224,38 +225,12 @@ class _Judged:
     @cached_property
     def tests(self) -> dict[Level, int]:
         """How many are made per level."""
-        tests: dict[Level, int] = {"reading": len(self.y)}
-        for group in self.groups:
-            tests[group.level] = tests.get(group.level, 0) + 1
-        lengths = [len(run) for _, run in self._ordered(self.marker)]
-        return tests | {"block": sum(k * (k + 1) // 2 for k in lengths)}
+        lengths = (len(run) for _, run in self._ordered(self.marker))
+        blocks: dict[Level, int] = {"block": sum(k * (k + 1) // 2 for k in lengths)}
+        return {"reading": len(self.y), **Counter(g.level for g in self.groups), **blocks}
 
     def adjusted(self, p: float, level: Level) -> float:
         return min(1.0, p * self.tests[level] * len(self.tests))
-
-    def report(self) -> OutlierReport:
-        """What is wrong: the readings that are not good, alone or as groups, and groups of good
-        ones that err together; one at a time, the one that explains most first, as long as a
-        majority is left."""
-        n, size = self.y.shape
-        variance = max(median_scale(np.linalg.norm(self.y, axis=1), size) ** 2, TINY)
-        active, accepted = np.ones(n, dtype=bool), []
-        while True:
-            fit = FitToGood(self.B, self.y, self.good & active, variance)
-            blamed = self._blamed(fit, active)
-            if blamed is None or 2 * (active & ~blamed[0].members).sum() <= n:
-                break
-            group, p = blamed
-            accepted.append((group, p, int((group.members & ~fit.good).sum())))
-            active = active & ~group.members
-        alone = fit.p_values(fit.T, fit.e, fit.good)
-        for i in np.flatnonzero(active & ~fit.good):
-            reading = Group("reading", str(self.lines[i]), np.arange(n) == i)
-            accepted.append((reading, self.adjusted(float(alone[i]), "reading"), 1))
-        findings = [self._finding(fit, *one) for one in accepted]
-        findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
-        sigma = float(np.sqrt(fit.variance))
-        return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, self.tests)
 
     def _ordered(self, markers: NDArray[Any]) -> Iterator[tuple[str, IntArray]]:
         """Readings in the order of their lines: all, and where there are several markers those of
@@ -278,7 +253,7 @@ class _Judged:
                     a, b = self.lines[order[[first, last]]]
                     yield Group("block", f"{a} to {b}{of}", run)
 
-    def _blamed(self, fit: FitToGood, active: BoolArray) -> tuple[Group, float] | None:
+    def blamed(self, fit: FitToGood, active: BoolArray) -> tuple[Group, float] | None:
         """The group that explains most, with its adjusted p-value; None where none is beyond noise.
 
         Tested is all that is active of a group where most of it is beyond the noise and that is no
@@ -301,7 +276,7 @@ class _Judged:
                 found.append((gain, group._replace(members=present), p))
         return max(found, key=lambda one: one[0])[1:] if found else None
 
-    def _finding(self, fit: FitToGood, group: Group, p: float, beyond: int) -> FaultyGroup:
+    def finding(self, fit: FitToGood, group: Group, p: float, beyond: int) -> FaultyGroup:
         """The group as it errs under the fit without any of the others."""
         # Change (p,) of the parameters in their standard deviations if the members were fitted
         # along as read; infinite of one that the good ones leave undetermined.
@@ -310,15 +285,16 @@ class _Judged:
         deviation = np.linalg.norm(root, axis=1) * sigma
         move = np.where(deviation > OPEN, np.inf, np.abs(root @ np.linalg.solve(G, c)) / deviation)
         chosen, column = np.flatnonzero(group.members), int(np.argmax(move))
-        pattern: Pattern = "single" if group.level == "reading" else "scatter"
-        own, error = (
-            float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, self.off)
-        )
+        pattern: Pattern = "single"
         shift, p_left = None, 0.0
         if group.level != "reading":
             *_, shift, p_left = group_test(fit, group.members, group.may_shift)
-        if shift is not None:
-            pattern, own = "common", float(np.linalg.norm(shift))
+            pattern = "scatter" if shift is None else "common"
+        if shift is None:
+            square = ((e[chosen] ** 2).sum(axis=1).mean() for e in (fit.e, self.off))
+            own, error = np.sqrt(list(square)).tolist()
+        else:
+            own = float(np.linalg.norm(shift))
             error = float(np.linalg.norm(np.median(self.off[chosen], axis=0)))
         return FaultyGroup(
             group.level, group.name, pattern, tuple(chosen.tolist()),
@@ -337,7 +313,9 @@ def report_faulty(
     good: BoolArray,
     residual: Array | None = None,
 ) -> OutlierReport | None:
-    """The report of the readings that are not `good` (N,), under the `noise` of the method.
+    """The report of the readings that are not `good` (N,), under the `noise` of the method: alone
+    or as groups, and groups of good ones that err together; one at a time, the one that explains
+    most first, as long as a majority is left.
 
     Readings are linearised at a fit that faulty ones do not bend (`clean`), B and residual whitened
     by the noise of single readings, D.  Where a configuration's readings share a deviation, what is
@@ -349,7 +327,28 @@ def report_faulty(
 
     None for a table too large for B.
     """
-    return None if whole.problem.large else _Judged(whole, clean, noise, good, residual).report()
+    if whole.problem.large:
+        return None
+    judged = _Judged(whole, clean, noise, good, residual)
+    B, y, n = judged.B, judged.y, len(good)
+    variance = max(median_scale(np.linalg.norm(y, axis=1), y.shape[1]) ** 2, TINY)
+    active, accepted = np.ones(n, dtype=bool), []
+    while True:
+        fit = FitToGood(B, y, good & active, variance)
+        blamed = judged.blamed(fit, active)
+        if blamed is None or 2 * (active & ~blamed[0].members).sum() <= n:
+            break
+        group, p = blamed
+        accepted.append((group, p, int((group.members & ~fit.good).sum())))
+        active = active & ~group.members
+    alone = fit.p_values(fit.T, fit.e, fit.good)
+    for i in np.flatnonzero(active & ~fit.good):
+        reading = Group("reading", str(judged.lines[i]), np.arange(n) == i)
+        accepted.append((reading, judged.adjusted(float(alone[i]), "reading"), 1))
+    findings = [judged.finding(fit, *one) for one in accepted]
+    findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
+    sigma = float(np.sqrt(fit.variance))
+    return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, judged.tests)
 
 
 def _groups(

@@ -13,7 +13,7 @@ from scipy import linalg, special
 from elastocal.errors import option
 from elastocal.identification.mistakes import CELL, KILOGRAMS, exchanged, load_ratio
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
-from elastocal.identification.noise_summary import Drift, NoiseSize
+from elastocal.identification.noise_summary import NoiseSize
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
@@ -81,41 +81,55 @@ def judged(
     of_solution = list(result.findings)
     if solution is not None and whole is not None:
         of_solution = [*_conditioning(result, solution), *_exchanged(result, whole)]
-    compared = tuple(_against_stated_noise(result))
-    fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
-    noise = (*compared, *_repeats(result, fits))
-    explained = _explained(result, noise)
-    visits = tuple(_visits(result, fits))
-    far = tuple(_far_values(result, explained))
-    # Where all lengths are others than the cell's, so are the compliances to expect.
-    scaled = any(f.kind == "scale" for f in far)
-    found = [
-        *_spoilt(result),
-        *(f for f in of_solution if f.kind == "exchanged_markers"),
-        *_impossible(result),
-        *far,
-        *_copies(result),
-        *(() if scaled else _load_unit(result)),
-        *_hardly_shown(result),
-        *(f for f in visits if f.kind == "scatter_not_counted"),
-        *_alike_in_time(result, explained),
-        *_few_poses(result),
-        *(f for f in of_solution if f.kind == "ill_conditioned"),
-        *noise,
-        *(f for f in visits if f.kind != "scatter_not_counted"),
-        *_prediction(result, explained),
-        *_new_poses(result, explained),
-        *_bounds(result),
-        *_faulty(result),
-        *_undetermined(result),
-        *_prior(result),
-        *_shape(result),
-        *_test(result),
-    ]
+    found = tuple(_found(result, of_solution))
     return replace(result, findings=(_trust(found), *found))
 
 
-def _trust(found: list[Finding]) -> Finding:
+def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]:
+    """All but the overall one, in the order in which they are told."""
+    compared = list(_against_stated_noise(result))
+    fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
+    noise = [*compared, *_repeats(result, fits)]
+    explained = _explained(result, noise)
+    visits, far = list(_visits(result, fits)), list(_far_values(result, explained))
+    held, nominal, shares = result.heldout_rms, result.nominal_rms, result.prior_share
+    if not result.converged:
+        yield _poor("not_converged", reason=result.reason)
+    if nominal <= held < math.inf and not only_placed(result):
+        yield _poor("no_better_than_nominal", heldout_rms_um=held, nominal_rms_um=nominal)
+    yield from (f for f in of_solution if f.kind == "exchanged_markers")
+    yield from _impossible(result)
+    yield from far
+    if copies := result.copies:
+        fitted = len(result.observations.lead)
+        yield _note("copied_readings", copies=len(copies), fitted=fitted, lines=copies)
+    # Where all lengths are others than the cell's, so are the compliances to expect.
+    if not any(f.kind == "scale" for f in far):
+        yield from _load_unit(result)
+    if weak := tuple(name for name, standing in standings(result).items() if standing == WEAK):
+        yield _note("hardly_shown", parameters=weak)
+    yield from (f for f in visits if f.kind == "scatter_not_counted")
+    yield from _alike_in_time(result, explained)
+    yield from _few_poses(result)
+    yield from (f for f in of_solution if f.kind == "ill_conditioned")
+    yield from noise
+    yield from (f for f in visits if f.kind != "scatter_not_counted")
+    yield from _prediction(result, explained)
+    yield from _new_poses(result, explained)
+    yield from _bounds(result)
+    yield from _faulty(result)
+    yield from _undetermined(result)
+    mostly = tuple(sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n]))
+    if mostly:
+        yield _note("mostly_prior", parameters=mostly, share=tuple(shares[n] for n in mostly))
+    if (summary := result.residual_summary) is not None:
+        yield shape_of(summary)
+        if n := sum(g.n_deviating for g in summary.groupings):
+            yield _note("scatter_unlike_noise_model", groups=n)
+    yield from _test(result)
+
+
+def _trust(found: tuple[Finding, ...]) -> Finding:
     for say, severity in ((_poor, "poor"), (_care, "care")):
         if doubts := tuple(f.kind for f in found if f.severity == severity):
             return say("trust", "", because=doubts)
@@ -126,15 +140,7 @@ def _trust(found: list[Finding]) -> Finding:
     return _good("trust", use, because=())
 
 
-def _spoilt(result: Calibration) -> Iterator[Finding]:
-    if not result.converged:
-        yield _poor("not_converged", reason=result.reason)
-    held, nominal = result.heldout_rms, result.nominal_rms
-    if held < math.inf and nominal < math.inf and held >= nominal and not only_placed(result):
-        yield _poor("no_better_than_nominal", heldout_rms_um=held, nominal_rms_um=nominal)
-
-
-def _explained(result: Calibration, noise: tuple[Finding, ...]) -> bool:
+def _explained(result: Calibration, noise: list[Finding]) -> bool:
     """Whether the noise explains what is left, by the findings on it, and held-out poses agree.
 
     Of n equations for p parameters the held-out error is that of the fit times n / (n - p) or more.
@@ -155,12 +161,6 @@ def _overfitted(result: Calibration) -> float:
 
 
 # What an identification takes for granted.
-
-
-def _copies(result: Calibration) -> Iterator[Finding]:
-    if copies := result.copies:
-        fitted = len(result.observations.lead)
-        yield _note("copied_readings", copies=len(copies), fitted=fitted, lines=copies)
 
 
 def _load_unit(result: Calibration) -> Iterator[Finding]:
@@ -225,12 +225,6 @@ def _impossible(result: Calibration) -> Iterator[Finding]:
         units=tuple(p.unit for p in parameters),
         likely="the sign of the force columns" if signs else "",
     )  # fmt: skip
-
-
-def _hardly_shown(result: Calibration) -> Iterator[Finding]:
-    names = tuple(name for name, standing in standings(result).items() if standing == WEAK)
-    if names:
-        yield _note("hardly_shown", parameters=names)
 
 
 # Values far from nominal: a joint to remaster, a robot file of another arm, a missing effect.
@@ -456,11 +450,10 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     """Joints that settle anew at each visit, and a drift: what a test of false-alarm rate SCATTERS
     finds, whether the noise model has it or not.  `fits`: the residual agrees with the stated
     noise."""
-    noise, sizes = result.noise, result.noise.sizes or ()
-    stated = result.model.cell.noise
+    noise, stated = result.noise, result.model.cell.noise
+    sizes = [s for s in noise.sizes or () if s.sigma]
     scatter = stated.of_joints(result.model.chain.n_joints)
-    joints = [s for s in sizes if s.joints and s.sigma]
-    drifts = [s for s in sizes if s.part == TIME and s.sigma]
+    joints = [s for s in sizes if s.joints]
     for test in noise.tests:
         if test.p >= SCATTERS:
             continue
@@ -470,12 +463,26 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
                 "Measure more poses, not more repeats, and approach each from the same side: the "
                 f"joints settle anew at every visit. {_beside_stated('joints_urad', said, fits)}"
             )
-            of, sizes_of = zip(*((s.name, s.sigma or 0.0) for s in joints), strict=True)
-            yield _note("joint_scatter", remedy, of=of, p=test.p, sigma_urad=sizes_of)
-        elif test.part == TIME and noise.drift is not None:
-            if drifts:
-                remedy = _beside_stated("drift_um", [(drifts[0], stated.drift)], fits)
-                yield _drift(noise.drift, drifts[0], test.p, remedy)
+            of, sigma = zip(*((s.name, s.sigma) for s in joints), strict=True)
+            yield _note("joint_scatter", remedy, of=of, p=test.p, sigma_urad=sigma)
+        elif test.part == TIME and (drift := noise.drift) is not None:
+            for size in [s for s in sizes if s.part == TIME][:1]:
+                timed = drift.seconds is not None
+                remedy = (
+                    "Measure poses and loads in random order, return to a reference pose every ten "
+                    f"poses, {'' if timed else 'record times, '}and let arm and tracker warm up. "
+                    f"{_beside_stated('drift_um', [(size, stated.drift)], fits)}"
+                )
+                if not drift.ends:
+                    remedy += (
+                        " It may last as long as the campaign: these readings do not tell it from "
+                        "a random walk, nor where the base is on another day; measure for longer, "
+                        "or on several days."
+                    )
+                yield _care(
+                    "drift", remedy, sigma_um=size.sigma, p=test.p, lasting_s=drift.seconds,
+                    lasting_share=drift.share, by="times" if timed else "order of the rows",
+                )  # fmt: skip
         else:
             known = scatter.any() if test.part == JOINTS else stated.drift > 0
             remedy = (
@@ -498,24 +505,6 @@ def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -
     if fits:  # parts of the noise that are alike have their sum alone told
         return f"The cell states it: [noise] {key} ({said})."
     return f"Correct [noise] {key} of the cell ({said}) for design and simulate."
-
-
-def _drift(drift: Drift, size: NoiseSize, p: float, remedy: str) -> Finding:
-    timed = drift.seconds is not None
-    remedy = (
-        "Measure poses and loads in random order, return to a reference pose every ten poses, "
-        f"{'' if timed else 'record times, '}and let arm and tracker warm up. {remedy}"
-    )
-    if not drift.ends:
-        remedy += (
-            " It may last as long as the campaign: these readings do not tell it from a random "
-            "walk, nor where the base is on another day; measure for longer, or on several days."
-        )
-    return _care(
-        "drift", remedy,
-        sigma_um=size.sigma or 0.0, p=p, lasting_s=drift.seconds, lasting_share=drift.share,
-        by="times" if timed else "order of the rows",
-    )  # fmt: skip
 
 
 # Poses that were not fitted.
@@ -634,13 +623,6 @@ def no_reading(result: Calibration) -> str:
     return f"no reading of marker{several} {listed(names, 4)} in {source}"
 
 
-def _prior(result: Calibration) -> Iterator[Finding]:
-    shares = result.prior_share
-    names = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
-    if names:
-        yield _note("mostly_prior", parameters=tuple(names), share=tuple(shares[n] for n in names))
-
-
 def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, WEAK (hardly shown),
     BEYOND (its physical bound), UNREAD (of a marker without readings), INVISIBLE or FIXED."""
@@ -662,14 +644,6 @@ def standings(result: Calibration) -> dict[str, str]:
 
     pairs = zip(result.model.parameters, result.estimates, strict=True)
     return {p.name: standing(p, e) for p, e in pairs}
-
-
-def _shape(result: Calibration) -> Iterator[Finding]:
-    if result.residual_summary is not None:
-        yield shape_of(result.residual_summary)
-        n = sum(g.n_deviating for g in result.residual_summary.groupings)
-        if n:
-            yield _note("scatter_unlike_noise_model", groups=n)
 
 
 def shape_of(summary: ResidualSummary) -> Finding:

@@ -200,18 +200,15 @@ def explains_more(one: Stand, other: Stand) -> bool:
 
 
 def until_it_stands(
-    good: BoolArray,
-    fitted: Callable[[BoolArray], Found],
-    judged: Callable[[Found, BoolArray], tuple[Array, float, BoolArray]],
+    good: BoolArray, judged: Callable[[BoolArray], tuple[Stand[Found], BoolArray]]
 ) -> Stand[Found]:
     """Fit and good observations (n,) that agree with each other, starting from `good`.
 
-    `fitted` fits to the good ones and `judged` gives squared errors (n,) beside a fit, its degrees
-    of freedom and which observations it does not contradict.  A set that comes back after others
-    ends the search: those good at any time of that round are kept.  So does a fit that no majority
-    agrees with: it cannot judge.  Observations that are taken back bend the fit, so that more of
-    them seem to fit: where the better half of all is left worse explained than by an earlier set,
-    beyond what chance allows, that set stands.
+    `judged` fits to the good ones and says which observations the fit does not contradict.  A set
+    that comes back after others ends the search: those good at any time of that round are kept.  So
+    does a fit that no majority agrees with: it cannot judge.  Observations that are taken back bend
+    the fit, so that more of them seem to fit: where the better half of all is left worse explained
+    than by an earlier set, beyond what chance allows, that set stands.
 
     Raises ElastocalError where the first fit fails.
     """
@@ -219,13 +216,12 @@ def until_it_stands(
     visited: list[Stand[Found]] = []
     for _ in range(ROUNDS):
         try:
-            found = fitted(good)
+            stand, agrees = judged(good)
         except ElastocalError:
             if not visited:
                 raise
             break  # so few cannot judge the others
-        squared, dof, agrees = judged(found, good)
-        visited.append((found, good, better_half(squared, dof, good)))
+        visited.append(stand)
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]
@@ -265,7 +261,7 @@ def find_faulty(solution: Solution) -> BoolArray:
         starts.append(majority(B, y))
     variance = starts[0][1]
 
-    def fitted(good: BoolArray) -> FitToGood:
+    def judged(good: BoolArray) -> tuple[Stand[FitToGood], BoolArray]:
         nonlocal B, y, variance
         fit = FitToGood(B, y, good, variance)
         for _ in range(STEPS):
@@ -276,17 +272,14 @@ def find_faulty(solution: Solution) -> BoolArray:
             fit = FitToGood(B, y, good, variance)
             if np.linalg.norm(fit.R @ (fit.z - z)) <= SETTLED * np.sqrt(fit.variance):
                 break
-        return fit
-
-    def judged(fit: FitToGood, good: BoolArray) -> tuple[Array, float, BoolArray]:
-        agrees = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
-        return (fit.e**2).sum(axis=1), fit.dof, agrees
+        half = better_half((fit.e**2).sum(axis=1), fit.dof, good)
+        return (fit, good, half), fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
 
     ends = []
     for good, at_first in starts:
         variance = at_first
         with suppress(ElastocalError):  # so far out the arm has no equilibrium
-            ends.append(until_it_stands(good, fitted, judged))
+            ends.append(until_it_stands(good, judged))
     faulty = np.zeros(n, dtype=bool)
     if not ends:
         return faulty
@@ -468,12 +461,9 @@ def settle(
     good = every if good is None else good
     precision: list[Array] = []  # of single readings, by the first noise
 
-    def fitted(chosen: BoolArray) -> NoiseFit:
+    def judged(chosen: BoolArray) -> tuple[Stand[NoiseFit], BoolArray]:
         nonlocal noise
-        noise = estimate_noise(readings.take(chosen), kind, noise)
-        return noise
-
-    def judged(found: NoiseFit, chosen: BoolArray) -> tuple[Array, float, BoolArray]:
+        noise = found = estimate_noise(readings.take(chosen), kind, noise)
         own, behind = own_noise(found.fit, readings)
         if not precision:
             precision.append(np.asarray(np.linalg.inv(own)))
@@ -483,17 +473,17 @@ def settle(
         # reading that was fitted has a part in the variance it is measured with, and is left out
         # there as well.
         t = prediction_errors(found, readings, chosen, own)
-        squared, outside = np.minimum(t**2, behind * (1 - 1e-12)), np.maximum(behind - 1, 1.0)
-        left_out, inside = np.sqrt(squared * outside / (behind - squared)), chosen[:, None]
+        within, outside = np.minimum(t**2, behind * (1 - 1e-12)), np.maximum(behind - 1, 1.0)
+        left_out, inside = np.sqrt(within * outside / (behind - within)), chosen[:, None]
         point = rejection_point(t.size, np.where(inside, outside, behind))
         agrees = np.asarray(~(np.where(inside, left_out, np.abs(t)) > point).any(axis=1))
-        return np.einsum("ni,nij,nj->n", r, precision[0], r), dof, agrees
+        squared = np.einsum("ni,nij,nj->n", r, precision[0], r)
+        return (found, chosen, better_half(squared, dof, chosen)), agrees
 
     try:
-        found, good, _ = until_it_stands(good, fitted, judged)
+        return until_it_stands(good, judged)[:2]
     except ElastocalError:  # the good ones alone do not show all parameters
-        found, good, _ = until_it_stands(every, fitted, judged)
-    return found, good
+        return until_it_stands(every, judged)[:2]
 
 
 # Robust fits by name, by reweighting.

@@ -49,6 +49,12 @@ from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms
+# What JSON has of a result in µm, and under its own name.
+LENGTHS = ("residual_rms", "heldout_rms", "heldout_all_rms", "nominal_rms")
+AS_THEY_ARE = (
+    "residual_summary", "prior_share", "converged", "outliers", "excluded", "copies",
+    "autocorrelation", "warnings", "findings",
+)  # fmt: skip
 LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
 
 
@@ -635,8 +641,9 @@ class Calibration(scrutiny.FoundFit, Result):
 
     def to_json(self) -> dict[str, Any]:
         """The result as a JSON-ready dictionary (DESIGN: identify → JSON)."""
-        chain, observed, test = self.model.chain, self.observations, self.test
-        off = self.unsteadiness
+        chain, observed, test, off = (
+            self.model.chain, self.observations, self.test, self.unsteadiness
+        )  # fmt: skip
         return plain({
             "schema": SCHEMA,
             "robot": chain.name,
@@ -654,11 +661,8 @@ class Calibration(scrutiny.FoundFit, Result):
             "n_rows": len(self.residual),
             "n_readings": len(observed.lead),
             "dof": self.dof,
-            "residual_rms_um": microns(self.residual_rms),
-            "heldout_rms_um": microns(self.heldout_rms),
             "heldout_kept_rms_um": microns(self.heldout_rms),
-            "heldout_all_rms_um": microns(self.heldout_all_rms),
-            "nominal_rms_um": microns(self.nominal_rms),
+            **{f"{name}_um": microns(getattr(self, name)) for name in LENGTHS},
             "test": _json(test),
             "test_rms_um": None if test is None else microns(test.rms),
             "test_mean_um": None if test is None else microns(test.mean),
@@ -677,26 +681,18 @@ class Calibration(scrutiny.FoundFit, Result):
                 "lasting_s": off.lasting, "configuration_um": microns(off.configuration),
                 "tails": None,
             },
-            "residual_summary": self.residual_summary,
             "active": [
                 {"label": a.label, "kind": a.kind, "parameters": a.names,
                  "value": a.value, "multiplier": a.multiplier}
                 for a in self.active
             ],
-            "prior_share": self.prior_share,
             "smooth": [entry for part in self.smooth for entry in part.to_json()],
             "faulty_report": _json(self.faulty_report),
-            "converged": self.converged,
             "backend": self.model.backend_report(),
-            "outliers": self.outliers,
-            "excluded": self.excluded,
-            "copies": self.copies,
             "influence": self.influence(),
             "parameter_sets": [s.to_json() for s in self.parameter_sets()],
-            "autocorrelation": self.autocorrelation,
             "uncertainty": _json(self.uncertainty()),
-            "warnings": self.warnings,
-            "findings": self.findings,
+            **{name: getattr(self, name) for name in AS_THEY_ARE},
         })  # fmt: skip
 
 

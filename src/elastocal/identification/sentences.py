@@ -155,27 +155,14 @@ OF_SEVERAL = {
 }
 
 
-class Told(str):
-    """A sentence that knows the `kind` of the finding it tells; in JSON a text as any other."""
-
-    kind: str
-
-    def __new__(cls, text: str, kind: str = "") -> Told:
-        told = super().__new__(cls, text)
-        told.kind = kind
-        return told
-
-
-def warning_sentences(result: Calibration) -> tuple[Told, ...]:
-    """The findings that call for attention as sentences that name the remedy; of those that are
-    alike one sentence."""
+def warning_sentences(result: Calibration) -> dict[str, str]:
+    """The findings that call for attention as sentences that name the remedy, each with the kind of
+    finding that it tells; of those that are alike one sentence."""
     groups: dict[Any, list[Finding]] = {}
     for k, f in enumerate(result.findings):
         alike = (f.kind, f.numbers["bound"], f.numbers["unit"]) if f.kind in OF_SEVERAL else k
         groups.setdefault(alike, []).append(f)
-    return tuple(
-        Told(text, same[0].kind) for same in groups.values() for text in _told(result, same)
-    )
+    return {text: same[0].kind for same in groups.values() for text in _told(result, same)}
 
 
 def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:

@@ -16,6 +16,7 @@ from elastocal.identification.noise_structure import Kind
 from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
+from elastocal.identification.sentences import warning_sentences
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
 from elastocal.text import gathered, listed, printable, some
@@ -43,7 +44,8 @@ def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
     told = {"residual_above_stated_noise", "scatter_not_counted", "impossible_values"}
     said = {f.kind for f in result.verdict.missing} & told
     notes = {f.kind for f in result.findings if f.severity == "note"}
-    kinds = [(getattr(w, "kind", ""), printable(str(w))) for w in result.warnings]
+    of = warning_sentences(result)
+    kinds = [(of.get(w, ""), printable(w)) for w in result.warnings]
     return [("Note" if kind in notes else say.WARNING, w) for kind, w in kinds if kind not in said]
 
 
