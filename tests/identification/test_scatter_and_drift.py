@@ -51,7 +51,7 @@ def test_joints_that_settle_anew_are_told_with_their_size():
     result = identified(scatter=SCATTER)
     finding = result.finding("joint_scatter")
     assert finding is not None and finding.severity == "note"
-    assert abs(finding.listed("sigma_urad")[0] / 100 - 1) < 0.3
+    assert abs(finding.numbers["sigma_urad"][0] / 100 - 1) < 0.3
     assert any("settle anew" in warning for warning in result.warnings)
     assert "µrad" in noise_model_line(result)
     told = result.to_json()

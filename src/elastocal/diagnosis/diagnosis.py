@@ -10,7 +10,7 @@ from typing import Any, Literal
 from elastocal.above import Result
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.errors import option
-from elastocal.identification.result import Finding, Number
+from elastocal.identification.result import Finding
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.measurements import Measurements
 from elastocal.model.effects.base import Stage
@@ -451,7 +451,7 @@ class Diagnosis(Result):
 
 
 def _findings(d: Diagnosis) -> Iterator[Finding]:
-    numbers: dict[str, Number] = {
+    numbers: dict[str, Any] = {
         "effects": tuple(f"{f.effect}:{f.where}" for f in d.effects),
         "p_value": d.p_value,
         "probability_nothing": d.probability_nothing,

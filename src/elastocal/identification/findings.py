@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import option
-from elastocal.identification.mistakes import CELL, KILOGRAMS, exchanged, load_ratio
+from elastocal.identification.mistakes import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import NoiseSize
 from elastocal.identification.outliers import kept_of
@@ -23,8 +23,15 @@ from elastocal.identification.solve import Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.model.arm import Parameter
+from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.compliances import (
+    RATED_WIND_UP,
+    JointCompliance,
+    rated_torque,
+    usual_over_stated_mass,
+    weight_torque,
+)
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
 from elastocal.text import counted, listed
@@ -160,24 +167,42 @@ def _overfitted(result: Calibration) -> float:
     return len(result.observations.value) / max(result.dof, 1)
 
 
-# What an identification takes for granted.
+# Loads in another unit.
+#
+# Deflections tell compliance times load: loads that are too small by a factor make every
+# compliance too large by it, without a trace in the residual.
+
+KILOGRAMS = 9.80665  # N, the weight of one
 
 
 def _load_unit(result: Calibration) -> Iterator[Finding]:
     """Are all compliances about as much too large as kilograms for newtons make them, or too small?
 
-    Without a load there is no unit of one.  The ratio has to be that factor to within what arms
-    differ from what is expected of them (EXPECTED_TO).  By the links' weights alone, a rule of
-    thumb, it is worth a look, and no more.
+    Without a load there is no unit of one.  What they should be about is what the cell states, else
+    what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
+    The median of the ratios has to be that factor to within what arms differ from what is expected
+    of them (EXPECTED_TO).  By the links' weights, a rule of thumb, it is worth a look, and no more.
     """
+    model, chain = result.model, result.model.chain
     known = {e.name: e.value for e in result.ordinary if e.value is not None}
     # Turned round, the loads may be in another unit as well: then the sizes tell.
     known |= {p.name: abs(e.held) for p, e in impossible(result)}
-    loaded = result.observations.table.force.any()
-    found = load_ratio(result.model, known) if loaded else None
-    if found is None:
+    given, rated, heavier = list[float](), list[float](), usual_over_stated_mass(chain)
+    for p in model.parameters if result.observations.table.force.any() else ():
+        value = known.get(p.name, 0.0)
+        if p.effect != JointCompliance.name or value <= 0:
+            continue
+        i = index(p.where)
+        if p.nominal > 0:
+            given.append(value / p.nominal)
+        elif chain.kinds[i] == "revolute" and weight_torque(chain, i) > 0:
+            torque = rated_torque(chain, model.cell, i) or 0.0
+            rated.append(value * heavier * torque / RATED_WIND_UP)
+    if not (ratios := given or rated):
         return
-    ratio, by = found
+    ratio, by = float(np.median(ratios)), "the cell's nominal compliances"
+    if not given:
+        by = "the weights of the links" if heavier == 1 else "the length of the arm"
     if abs(abs(math.log(ratio)) - math.log(KILOGRAMS)) > math.log(EXPECTED_TO):
         return
     unit, cause, undo = (
@@ -189,8 +214,7 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
         f"Check the unit of the loads: the compliances are {ratio:.2g} times those expected from "
         f"{by}, as where {cause}. If so, {undo} force_x_N, force_y_N and force_z_N by 9.81."
     )
-    say = _care if by == CELL else _note
-    yield say("load_unit", remedy, ratio=ratio, by=by, unit=unit)
+    yield (_care if given else _note)("load_unit", remedy, ratio=ratio, by=by, unit=unit)
 
 
 def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:

@@ -23,14 +23,6 @@ from elastocal.identification.outliers import FALSE_ALARM, named_runs
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import index
-from elastocal.model.effects.compliances import (
-    RATED_WIND_UP,
-    JointCompliance,
-    rated_torque,
-    usual_over_stated_mass,
-    weight_torque,
-)
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
@@ -369,43 +361,6 @@ def _slipped_words(
     return f"{own}{listed(later)}"
 
 
-# Loads in another unit.
-#
-# Deflections tell compliance times load: loads that are too small by a factor make every
-# compliance too large by it, without a trace in the residual.
-
-KILOGRAMS = 9.80665  # N, the weight of one
-
-
-def load_ratio(model: Model, known: dict[str, float]) -> tuple[float, str] | None:
-    """Median of the joints' compliances over what they should be about, and by what; None where
-    nothing says it.
-
-    `known` (SI) are values by parameter name.  They should be those that the cell states, else
-    what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
-    """
-    given, rated = [], []
-    heavier = usual_over_stated_mass(model.chain)
-    for p in model.parameters:
-        value = known.get(p.name, 0.0)
-        if p.effect != JointCompliance.name or value <= 0:
-            continue
-        i = index(p.where)
-        if p.nominal > 0:
-            given.append(value / p.nominal)
-        elif model.chain.kinds[i] == "revolute" and weight_torque(model.chain, i) > 0:
-            torque = rated_torque(model.chain, model.cell, i) or 0.0
-            rated.append(value * heavier * torque / RATED_WIND_UP)
-    for ratios, by in ((given, CELL), (rated, WEIGHTS if heavier == 1 else LENGTH)):
-        if ratios:
-            return float(np.median(ratios)), by
-    return None
-
-
-CELL, WEIGHTS = "the cell's nominal compliances", "the weights of the links"
-LENGTH = "the length of the arm"
-
-
 # What no arm can be.
 
 # What a fitted model may leave, over the length of the arm: the median and rms of the readings,
@@ -436,20 +391,20 @@ def refuse_nonsense(
     `every` reading is looked at for the cause, since few may be left in `observed`.  Deflections
     are small whatever the mistake: there positions that a mistake undone makes fit are enough.
     """
-    off = every_off = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
+    left, n = [residual], len(observed.lead)
     if apart is not None:
-        left = (apart.value - model.predict(apart.table, x, apart)).reshape(-1, apart.size)
-        every_off = np.append(off, np.linalg.norm(left[:, :3], axis=1))
-    error = rms = share = 0.0
+        left.append(apart.value - model.predict(apart.table, x, apart))
+    off = np.linalg.norm(np.concatenate(left).reshape(-1, observed.size)[:, :3], axis=1)
     table, length = observed.table, _length(model, observed.table)
-    if len(off):
-        with np.errstate(over="ignore"):
-            error, rms = float(np.median(off)), float(np.sqrt((off**2).mean()))
-        share = float((every_off > POOREST * length).mean())
+    share = float((off > POOREST * length).mean())
+    with np.errstate(over="ignore"):  # median and rms of those fitted, and of all
+        fitted, every_off = (
+            (float(np.median(e)), float(np.sqrt((e**2).mean()))) for e in (off[:n], off)
+        )
     reach = 0.0 if table.position is None else float(np.abs(table.position).max())
     beyond = [(p.name, v) for p, v in zip(model.parameters, x, strict=True)
               if p.unit == "m" and not abs(v) <= LARGEST * (length + reach)]  # fmt: skip
-    sane = max(error, rms) <= POOREST * length and share <= FEW and not beyond
+    sane = max(fitted) <= POOREST * length and share <= FEW and not beyond
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return
     fit = nominal_fit(model.chain, model.cell, every)
@@ -460,8 +415,7 @@ def refuse_nonsense(
             )
         return
     # Of those set apart too: beside them the few that fit say nothing.
-    if len(every_off):
-        error, rms = float(np.median(every_off)), float(np.sqrt((every_off**2).mean()))
+    error, rms = every_off
     most = f", {share:.0%} of them more than {POOREST * length:.2g} m," if share > FEW else ""
     value = f", whose {beyond[0][0]} is {beyond[0][1]:.3g} m" if beyond else ""
     raise InsufficientDataError(

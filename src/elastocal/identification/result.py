@@ -193,7 +193,6 @@ class TestErrors:
 
 
 Severity = Literal["good", "note", "care", "poor"]
-Number = float | str | tuple[float, ...] | tuple[str, ...] | None
 
 
 @dataclass(frozen=True)
@@ -202,23 +201,19 @@ class Finding:
 
     `severity` is good (it speaks for the result), note (worth knowing), care (use the result
     knowing this) or poor (do not use it).  `numbers` are those that the judgement rests on, with
-    units in their names; `remedy` is a sentence, empty where nothing needs to be done.
+    units in their names, several as a tuple, None where one is not known; `remedy` is a sentence,
+    empty where nothing needs to be done.
     """
 
     kind: str
     severity: Severity
-    numbers: dict[str, Number] = field(default_factory=dict)
+    numbers: dict[str, Any] = field(default_factory=dict)
     remedy: str = ""
 
     def number(self, name: str) -> float:
         """One of the numbers; infinite where it is not known."""
         value = self.numbers[name]
         return value if isinstance(value, float | int) else math.inf
-
-    def listed(self, name: str) -> tuple[float | str, ...]:
-        """Those of the numbers that are several."""
-        value = self.numbers[name]
-        return value if isinstance(value, tuple) else ()
 
 
 @dataclass(frozen=True)

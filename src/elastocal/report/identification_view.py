@@ -203,7 +203,7 @@ def what_was_identified(result: Calibration) -> str:
         if found := len(names_of(result, standing)):
             text += f"; {found} {why}"
     if (far := result.finding("unheard_of")) is not None:
-        text += f"; {len(far.listed('parameters'))} with implausible values"
+        text += f"; {len(far.numbers['parameters'])} with implausible values"
     if smooth := [part.coefficients for part in result.smooth if part.scale]:
         many = say.counted(len(smooth), "smooth function")
         text += f"; and {many} of {sum(smooth)} coefficients"

@@ -91,7 +91,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     ),
     "autocorrelated": "residuals of successive visits are correlated, as under a drift",
     "exchanged_markers": lambda f: (
-        f"the names of markers {listed(map(str, f.listed('markers')))} are exchanged"
+        f"the names of markers {listed(f.numbers['markers'])} are exchanged"
     ),
     "load_unit": lambda f: (
         f"the compliances are {say.significant(f.number('ratio'), 2)} times those expected from "
@@ -113,7 +113,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     "unheard_of": lambda f: _unheard_of(f),
     "little_gain": "the error is hardly smaller than that of the nominal arm",
     "few_configurations": lambda f: (
-        f"{say.counted(int(str(f.numbers['configurations'])), 'configuration')} give only "
+        f"{say.counted(f.numbers['configurations'], 'configuration')} give only "
         f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters "
         f"(needed: {f.numbers['needed']})"
     ),
@@ -123,7 +123,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
     ),
     "new_poses_not_shown": lambda f: (
         f"{_length(f, 'open_um')} of the error at new poses come from parameters that the measured "
-        f"poses do not show ({listed([printable(str(n)) for n in f.listed('parameters')], 3)})"
+        f"poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
     ),
     "new_poses_no_gain": lambda f: (
         f"the error expected at new poses ({_length(f, 'rms_um')}) is "
@@ -142,27 +142,24 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
 
 def _impossible(f: Finding) -> str:
     """ "impossible values: compliance of joints 2 and 3 negative (-0.3, …); most likely …" """
-    values = [float(v) for v in f.listed("values")]
+    values = f.numbers["values"]
     shown = [" ".join((say.significant(number), unit)) for number, unit in
-             map(say.display, values, map(str, f.listed("units")))]  # fmt: skip
+             map(say.display, values, f.numbers["units"])]  # fmt: skip
     how = "negative" if max(values) < 0 else "beyond the physical bound"
-    named = printable(gathered(map(str, f.listed("parameters"))))
+    named = printable(gathered(f.numbers["parameters"]))
     likely = f"; most likely {f.numbers['likely']} is wrong" if f.numbers["likely"] else ""
     return f"impossible values: {named} {how} ({listed(shown, 4)}){likely}"
 
 
 def _unheard_of(f: Finding) -> str:
     """ "implausible values (link6.dx 32.1 mm, 32 typical sizes): …" """
-    each = zip(
-        f.listed("parameters"), f.listed("values"), f.listed("units"), f.listed("typical_sizes"),
-        strict=True,
-    )  # fmt: skip
+    each = (f.numbers[key] for key in ("parameters", "values", "units", "typical_sizes"))
     shown = []
-    for name, value, unit, sizes in each:
-        number, shown_unit = say.display(float(value), str(unit))
+    for name, value, unit, sizes in zip(*each, strict=True):
+        number, shown_unit = say.display(value, unit)
         shown.append(
-            f"{printable(str(name))} at {say.significant(number)} {shown_unit}, "
-            f"{say.significant(float(sizes), 2)} typical deviations from nominal"
+            f"{printable(name)} at {say.significant(number)} {shown_unit}, "
+            f"{say.significant(sizes, 2)} typical deviations from nominal"
         )
     return (
         f"implausible values ({listed(shown, 3)}): most likely an effect is missing, or these "
@@ -299,7 +296,7 @@ def prior_line(result: Calibration) -> str | None:
     if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
         return f"No estimate is mostly prior (largest share {percent(largest)})."
-    mostly = map(str, found.listed("parameters"))
+    mostly = found.numbers["parameters"]
     told = (f"{printable(name)} {percent(shares[name])}" for name in mostly)
     named = some(told, MOST_NAMED, more=", and {} more")
     return f"Mostly prior, share of the information: {named}. Measure poses that load them more."
