@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
@@ -297,10 +297,6 @@ def least_norm(A: Array, b: Array, cond: float | None = None) -> Array:
         return np.asarray(linalg.lstsq(A, b, cond=cond, lapack_driver="gelss")[0])
 
 
-def merge(factors: Iterable[RFactor]) -> RFactor:
-    return reduce(RFactor.merged, factors)
-
-
 def _factor(rows: Array) -> Array:
     """R factor (k, k) of `rows` (n, k), filled up with zeros where n < k."""
     k = rows.shape[1]
@@ -378,15 +374,10 @@ class Problem:
         columns = max(int((~self.model.shrunk).sum()), len(self.free))
         if len(observed.value) * columns <= LARGE or self.weights.kind == "covariance":
             return (np.arange(n),)
-        order = np.argsort(observed.configuration, kind="stable")
-        ends = np.append(np.flatnonzero(np.diff(observed.configuration[order])) + 1, n)
-        parts, start, limit = list[IntArray](), 0, max(PART // (observed.size * columns), 1)
-        while start < n:  # as many configurations as keep within the limit, at least one
-            k = np.searchsorted(ends, start, side="right")
-            last = max(int(np.searchsorted(ends, start + limit, side="right")) - 1, int(k))
-            parts.append(np.sort(order[start : ends[last]]))
-            start = int(ends[last])
-        return tuple(parts)
+        limit = max(PART // (observed.size * columns), 1)
+        # A configuration belongs to the part that its first observation falls into.
+        first = np.searchsorted(np.sort(observed.configuration), observed.configuration)
+        return tuple(np.flatnonzero(first // limit == k) for k in np.unique(first // limit))
 
     def part(self, index: IntArray) -> Part:
         """Observations `index` (n,), ascending, with the weights of these alone: exact where what
@@ -395,14 +386,8 @@ class Problem:
         rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
         if len(index) == len(observed.lead):
             return Part(index, rows, observed, weights)
-        if observed.kind == "deflection":
-            own = subset(observed, np.isin(np.arange(len(observed.lead)), index))
-        else:
-            value = observed.value[_run(rows)]
-            table = observed.table.take(_run(observed.lead[index]))
-            every = sparse.eye_array(len(index), format="csr")
-            own = Observations(observed.kind, value, every, np.arange(len(index)), table)
-        inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
+        own = subset(observed, np.isin(np.arange(len(observed.lead)), index))
+        inside = None if weights.whiten is None else weights.whiten[rows][:, rows]
         mine = replace(weights, whiten=inside)
         if weights.common is not None and weights.together is not None:
             mine = replace(mine, common=weights.common[rows], together=weights.together[index])
@@ -432,13 +417,8 @@ class Problem:
         """
         first, *others = self.parts
         yield work(self.part(first))
-        if not others:
-            return
-        pool = ThreadPoolExecutor(AT_ONCE)
-        try:
+        with ThreadPoolExecutor(AT_ONCE) as pool:
             yield from pool.map(lambda index: work(self.part(index)), others)
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
     def evaluate(self, x: Array, columns: NDArray[np.integer]) -> Evaluation:
         """B of the `columns` at x and the residual, whitened and reduced to their R factor.
@@ -452,7 +432,7 @@ class Problem:
             residual[part.rows] = at.residual
             return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
 
-        return Evaluation(residual, merge(self.each(reduced)))
+        return Evaluation(residual, reduce(RFactor.merged, self.each(reduced)))
 
     def residual(self, x: Array) -> Array:
         """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
@@ -471,10 +451,3 @@ class Problem:
 
     def regressor(self, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
         return self.model.regressor(part.observations.table, x, columns, part.observations)
-
-
-def _run(index: IntArray) -> IntArray | slice:
-    """`index` (n,) as a slice where it counts up by one: arrays are then views and not copies."""
-    if len(index) and index[-1] - index[0] == len(index) - 1 and (np.diff(index) == 1).all():
-        return slice(int(index[0]), int(index[-1]) + 1)
-    return index
