@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations, product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -214,13 +215,12 @@ class SemidefiniteMatrix:
             any(n for row in cells for cell in row for n in cell),
             f"matrix '{self.label}' needs at least one parameter",
         )
-        for i in range(n):
-            for j in range(i):
-                require(
-                    cells[i][j] == cells[j][i],
-                    f"matrix '{self.label}' is not symmetric: entry ({i + 1}, {j + 1}) is "
-                    f"{self.entries[i][j]!r}, entry ({j + 1}, {i + 1}) is {self.entries[j][i]!r}",
-                )
+        for j, i in combinations(range(n), 2):
+            require(
+                cells[i][j] == cells[j][i],
+                f"matrix '{self.label}' is not symmetric: entry ({i + 1}, {j + 1}) is "
+                f"{self.entries[i][j]!r}, entry ({j + 1}, {i + 1}) is {self.entries[j][i]!r}",
+            )
 
 
 @dataclass(frozen=True)
@@ -293,22 +293,19 @@ def _index(name: str, position: Mapping[str, int], where: str) -> int:
 def _row(
     terms: Mapping[str, float], position: Mapping[str, int], where: str
 ) -> tuple[Array, float]:
-    row, constant = np.zeros(len(position)), 0.0
-    for name, coefficient in terms.items():
-        if name:
-            row[_index(name, position, where)] += coefficient
-        else:
-            constant += coefficient
-    return row, constant
+    row = np.zeros(len(position))
+    for name in filter(None, terms):
+        row[_index(name, position, where)] += terms[name]
+    return row, terms.get("", 0.0)
 
 
 def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
     n = len(stated.entries)
     constant, slopes = np.zeros((n, n)), np.zeros((len(position), n, n))
-    for i, row in enumerate(stated.entries):
-        for j, entry in enumerate(row):
-            where = f"matrix '{stated.label}', entry ({i + 1}, {j + 1})"
-            slopes[:, i, j], constant[i, j] = _row(combination(entry), position, where)
+    for i, j in product(range(n), repeat=2):
+        where = f"matrix '{stated.label}', entry ({i + 1}, {j + 1})"
+        terms = combination(stated.entries[i][j])
+        slopes[:, i, j], constant[i, j] = _row(terms, position, where)
     return Matrix(stated.label, constant, slopes, np.ones(n))
 
 

@@ -310,7 +310,8 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
     grown = found.objective - float(fit.whitened @ fit.whitened)
     dof = max(float(before.spread.dof.min()), 1.0)
     if own is not None:
-        grown, dof = grown - own.squares(fit.x), own.dof
+        away = (fit.x[own.columns] - own.mean) * own.sigma / own.std
+        grown, dof = grown - float(away @ away), own.dof
     F = max(grown, 0.0) / (stated * found.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))

@@ -79,9 +79,6 @@ class SmoothPart:
         waves = self.group.basis(x)
         return np.asarray(waves - Q @ (Q.T @ waves))
 
-    def _block(self, c: int, k: int) -> Array:
-        return self.covariance[c * k : (c + 1) * k, c * k : (c + 1) * k]
-
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
         """By unit, over all components and the places of the readings: rms of what is left of the
@@ -105,9 +102,11 @@ class SmoothPart:
             k = waves.shape[1]
             total, spread = np.zeros(DRAWS), 0.0
             for c, m in zip(own, mean, strict=True):
-                drawn = rng.normal(size=(DRAWS, k)) @ root_of(self._block(c, k)).T @ waves.T
+                mine = slice(c * k, (c + 1) * k)
+                covariance = self.covariance[mine, mine]
+                drawn = rng.normal(size=(DRAWS, k)) @ root_of(covariance).T @ waves.T
                 total += ((m + drawn) ** 2).mean(axis=1)
-                spread += float(((waves @ self._block(c, k)) * waves).sum(axis=1).mean())
+                spread += float(((waves @ covariance) * waves).sum(axis=1).mean())
             rms = np.sqrt(total / (1 if basis is None else len(own)))
             low, high = np.quantile(rms, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
             half = float(t_quantile(LEVEL, np.array(np.inf))) * np.sqrt(spread / len(own))
@@ -141,10 +140,6 @@ class FunctionPrior:
     std: Array
     sigma: float
     dof: float
-
-    def squares(self, x: Array) -> float:
-        """Their part of a fit's objective at x (parameters,), in units of whitened rows."""
-        return float((((x[self.columns] - self.mean) * self.sigma / self.std) ** 2).sum())
 
 
 @dataclass(frozen=True)

@@ -110,35 +110,28 @@ def reduce(
     R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
     length = np.linalg.norm(R, axis=0)
     visible = length > max(threshold, STRUCTURAL * length.max(initial=0.0), 1e-300)
-    basis = np.zeros((len(R), 0))
-    kept: list[int] = []
+    basis, chosen = np.zeros((len(R), 0)), np.zeros(0, dtype=np.int64)
     if ranks is None:
         ranks = np.array([effect_of(p.effect).rank for p in parameters])
-    for rank in np.unique(ranks):
-        candidates = np.flatnonzero(visible & (ranks == rank)).tolist()
-        if not candidates:
-            continue
-        off = R[:, candidates] - basis @ (basis.T @ R[:, candidates])
-        off -= basis @ (basis.T @ off)  # twice is enough (Parlett)
+    for rank in np.unique(ranks[visible]):
+        candidates = np.flatnonzero(visible & (ranks == rank))
+        off = R[:, candidates]
+        for _ in range(2):  # twice is enough (Parlett)
+            off = off - basis @ (basis.T @ off)
         # Of columns that are alike but for rounding the first is kept, on any machine.
         alike = 1 - ROUNDING * np.arange(len(candidates))
         _, T, order = linalg.qr(off * alike, mode="economic", pivoting=True)
-        diagonal = np.abs(np.diag(T))
-        for k, d in enumerate(diagonal):
-            c = candidates[order[k]]
-            if d > max(threshold, STRUCTURAL * length[c]):
-                kept.append(c)
-        chosen = R[:, kept]
-        basis = linalg.qr(chosen, mode="economic")[0] if kept else basis
-    kept.sort()
-    dropped = [c for c in range(R.shape[1]) if c not in set(kept)]
-    scaled = least_norm(R[:, kept], R[:, dropped]) if kept and dropped else None
+        far = np.abs(np.diag(T))
+        own = candidates[order[: len(far)]]
+        least = np.maximum(threshold, STRUCTURAL * length[own])
+        chosen = np.append(chosen, own[far > least])
+        basis = linalg.qr(R[:, chosen], mode="economic")[0]
+    kept = np.sort(chosen)
+    dropped = np.setdiff1d(np.arange(R.shape[1]), kept)
     mixing = np.zeros((len(kept), len(dropped)))
-    if scaled is not None:
-        mixing = scaled * sizes[kept][:, None] / sizes[dropped][None, :]
-    unseen = np.array([d for d in dropped if not visible[d]], dtype=np.int64)
-    return Reduction(np.array(kept, dtype=np.int64), np.array(dropped, dtype=np.int64),
-                     mixing, unseen, threshold=threshold)  # fmt: skip
+    if mixing.size:
+        mixing = least_norm(R[:, kept], R[:, dropped]) * sizes[kept][:, None] / sizes[dropped]
+    return Reduction(kept, dropped, mixing, dropped[~visible[dropped]], threshold=threshold)
 
 
 # Which parameters are fitted: a minimal complete set, a wider one.
@@ -284,28 +277,11 @@ class Solution:
 def solve(
     problem: Problem, progress: Progress = lambda message: None, try_wider: bool = True
 ) -> Solution:
-    """Solve `problem`; `try_wider` False skips the comparison with wider sets of parameters.
+    """Place base and markers, choose a minimal complete set of parameters and fit it; `try_wider`
+    False skips the comparison with wider sets.  The fit's problem has base and markers placed.
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    found, reduction, placed = settle(problem, progress)
-    if try_wider:
-        progress("comparing with wider sets")
-        found, reduction = prefer_wider(found, reduction)
-    return Solution(found, reduction, rms_3d(placed, problem.observations.size))
-
-
-def settle(
-    problem: Problem, progress: Progress = lambda message: None
-) -> tuple[Fit, Reduction, Array]:
-    """Place base and markers, choose a minimal complete set of parameters and fit it.
-
-    Returns the fit, whose problem has base and markers placed at x0, the set, and the residual
-    (rows,) of the nominal arm so placed.
-
-    Raises InsufficientDataError where the data determine nothing.
-    """
-    progress("placing base and markers")
     started, exact = problem, False
     problem, nominal = with_placed(problem, CHOOSING)
     progress("first fit, tied weakly to the start")
@@ -328,7 +304,10 @@ def settle(
     left = reduction.seen(problem.free, r_factor.R, problem.sizes)
     if left is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)
-    return found, reduction, nominal
+    if try_wider:
+        progress("comparing with wider sets")
+        found, reduction = prefer_wider(found, reduction)
+    return Solution(found, reduction, rms_3d(nominal, problem.observations.size))
 
 
 def with_placed(problem: Problem, tolerance: float) -> tuple[Problem, Array]:
