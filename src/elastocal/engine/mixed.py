@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-import scipy
-from scipy import linalg
+from scipy import linalg, optimize, sparse
 
 from elastocal.errors import InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
@@ -74,27 +73,15 @@ class Pack:
         """Numbers (C, k) of the variances of all parts."""
         return np.concatenate([part.of for part in self.parts], axis=1)
 
-    @cached_property
-    def alike(self) -> bool:
-        """Whether all clusters have the same variances."""
-        return bool((self.of == self.of[:1]).all())
-
     def added(self, values: Array, K: int) -> Array:
         """Sums (K, …) of `values` (C, k, …) by the numbers of the variances."""
-        if self.alike:
-            of, values = self.of[0], values.sum(axis=0)
-        else:
-            of, values = self.of.ravel(), values.reshape(-1, *values.shape[2:])
-        if values.ndim == 1:
-            return np.bincount(of, values, K).astype(np.float64)
-        out = np.zeros((K, *values.shape[1:]))
-        np.add.at(out, of, values)
-        return out
+        n = self.of.size
+        sums = sparse.csr_array((np.ones(n), (self.of.ravel(), np.arange(n))), shape=(K, n))
+        return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
 
     def pairs(self, values: Array, K: int) -> Array:
         """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
-        of, values = (self.of[:1], values.sum(axis=0)) if self.alike else (self.of, values)
-        at = (of[:, :, None] * K + of[:, None, :]).ravel()
+        at = (self.of[:, :, None] * K + self.of[:, None, :]).ravel()
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
     def V(self, theta: Array) -> Array:
@@ -115,7 +102,7 @@ class Whitened:
         self.pack = pack
         R = np.asarray(np.linalg.cholesky(pack.V(theta)), dtype=np.float64)
         self.log_det = 2 * float(np.log(np.einsum("cii->ci", R)).sum())
-        self.root = lower_inverse(R)
+        self.root = np.linalg.inv(R)
         if pack.absent.any():
             self.root *= ~pack.absent[:, None, :]
         self.B = self.root @ pack.B
@@ -414,28 +401,12 @@ class MixedFit:
         return found - 0.5 * off + 0.5 * (log_dets[0] - log_dets[1])
 
 
-def lower_inverse(R: Array, out: Array | None = None) -> Array:
-    """R⁻¹ of lower triangular R (C, m, m), by halves: a general inverse takes four times as long.
-
-    `out` is where it is put, zeros above the diagonal.
-    """
-    out, m, h = np.zeros_like(R) if out is None else out, R.shape[1], R.shape[1] // 2
-    if m == 1:
-        return np.divide(1.0, R, out=out)
-    upper, lower = (lower_inverse(R[:, s, s], out[:, s, s]) for s in (slice(h), slice(h, m)))
-    # Of single numbers, products of matrices would be a call for each block.
-    cross = R[:, h:, :h] * upper if h == 1 else R[:, h:, :h] @ upper
-    out[:, h:, :h] = -lower * cross if m == 2 else -lower @ cross
-    return out
-
-
 # The least of a function of a few logarithms between limits, by steps of its information.
 
 # Value, slope (k,) and information (k, k) of −2ℓ at logarithms (k,).
 Objective = Callable[[Array], tuple[float, Array, Array]]
 
 STRIDE = 1.5  # longest step of a logarithm
-EXCHANGES = 30  # of what is held at a bound, after which another method has to end the search
 
 
 def climb(
@@ -452,16 +423,12 @@ def climb(
     excess = np.zeros_like(information)  # of the curvature over the information, as steps met it
     for _ in range(steps):
         step, H = np.zeros(len(theta)), information + excess
-        try:
-            root = linalg.cholesky(H[np.ix_(free, free)])
-        except linalg.LinAlgError:
-            break
         low = np.maximum(lower - theta[free], -STRIDE)
         high = np.minimum(upper - theta[free], STRIDE)
-        own = -linalg.cho_solve((root, False), slope[free])
-        if ((own < low) | (own > high)).any():
-            own = least_within(H[np.ix_(free, free)], slope[free], low, high)
-        step[free] = own
+        try:
+            step[free] = step_within(H[np.ix_(free, free)], slope[free], low, high)
+        except linalg.LinAlgError:
+            break
         if -float(slope @ step) < enough:
             return theta, True
         for length in (1.0, 0.5, 0.25, 0.0625):
@@ -480,28 +447,14 @@ def climb(
     return theta, False
 
 
-def least_within(H: Array, slope: Array, low: Array, high: Array) -> Array:
-    """s (k,) in its box where sᵀslope + ½sᵀHs is least, H positive definite.
-
-    What is held at its bounds is exchanged, all at once, for what then passes them or is drawn off
-    them, until that stays (Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865).  Where it
-    goes round in circles, by bounded least squares.
-    """
-    below = above = np.zeros(len(slope), dtype=bool)
-    for _ in range(EXCHANGES):
-        step, inside = np.where(below, low, np.where(above, high, 0.0)), ~(below | above)
-        root = linalg.cho_factor(H[np.ix_(inside, inside)], check_finite=False)
-        step[inside] = linalg.cho_solve(root, -(slope + H @ step)[inside], check_finite=False)
-        force = slope + H @ step
-        was, below, above = (
-            (below, above),
-            (step < low) | (below & (force > 0)), (step > high) | (above & (force < 0)),
-        )  # fmt: skip
-        if np.array_equal(below, was[0]) and np.array_equal(above, was[1]):
-            return np.asarray(step)
+def step_within(H: Array, slope: Array, low: Array, high: Array) -> Array:
+    """s (k,) in its box where sᵀslope + ½sᵀHs is least, H positive definite."""
     root = linalg.cholesky(H)
     target = -linalg.solve_triangular(root, slope, trans="T")
-    return np.asarray(scipy.optimize.lsq_linear(root, target, (low, high), method="bvls").x)
+    step = linalg.solve_triangular(root, target)
+    if ((step < low) | (step > high)).any():
+        step = optimize.lsq_linear(root, target, (low, high), method="bvls").x
+    return np.asarray(step)
 
 
 # Coefficients with a prior of unknown size, of which nothing is left of the rows but products.
@@ -514,8 +467,6 @@ def least_within(H: Array, slope: Array, low: Array, high: Array) -> Array:
 #
 #     −2 ℓ = n log a² + |e|²/a² + log|A| − bᵀA b   (+ n log 2π)
 #     ∂(−2ℓ)/∂ log v_j = 1 − (A⁻¹)_jj − b_j².
-
-SMALL = 64  # triangles that LAPACK inverts
 
 
 @dataclass(frozen=True)
@@ -593,7 +544,7 @@ class Standardised:
     @property
     def inverse(self) -> Array:
         """L⁻¹ (k, k)."""
-        return inverse_triangle(self.L)
+        return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
 
     @cached_property
     def covariance(self) -> Array:
@@ -631,16 +582,4 @@ def beside(
         own = half[:, start : start + c.stop - c.start]
         out.append((M[c, c] - own.T @ own, z[c] - own.T @ half[:, -1]))
         start += own.shape[1]
-    return out
-
-
-def inverse_triangle(L: Array) -> Array:
-    """L⁻¹ of a lower triangular L (p, p), by halves: BLAS's products of triangles are two to three
-    times as fast as LAPACK's inverse."""
-    if len(L) <= SMALL:
-        return np.asarray(linalg.lapack.dtrtri(L, lower=1)[0])
-    h, out, multiply = len(L) // 2, np.zeros(L.shape, order="F"), linalg.blas.dtrmm
-    out[:h, :h] = upper = inverse_triangle(L[:h, :h])
-    out[h:, h:] = lower = inverse_triangle(L[h:, h:])
-    out[h:, :h] = multiply(-1.0, upper, multiply(1.0, lower, L[h:, :h], lower=1), side=1, lower=1)
     return out

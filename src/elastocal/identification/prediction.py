@@ -283,6 +283,7 @@ def position_at(
 MOST_LOADS, MOST_VISITS = 100, 400  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
+APART = 1e-6  # standard deviations in SI units, one of another, whose variances round differently
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
 
 
@@ -455,7 +456,10 @@ def predicted_error(
     if not len(weight):
         return None
     known, off = _moves(arm, B[:, :3])
-    root = root_of((arm.covariance + arm.covariance.T) / 2)
+    std = np.sqrt(np.diag(arm.covariance))
+    # The rounding of large variances would drown what small ones do.
+    unit = np.maximum(std, 1e-300) if std.min() < APART * std.max() else np.ones(len(std))
+    root = unit[:, None] * root_of(arm.covariance / np.outer(unit, unit))
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each
     F = F.reshape(-1, F.shape[2])

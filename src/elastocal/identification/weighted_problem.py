@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import Tracker
-from elastocal.engine.mixed import lower_inverse
 from elastocal.errors import InputError, option
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import (
@@ -184,7 +183,7 @@ def inverse_factor(blocks: Array) -> Array:
             "the noise covariance is not positive definite; check what states it: "
             f"{option('covariance')}, the sigma columns of the table, or [tracker] of the cell"
         ) from None
-    return lower_inverse(factor)
+    return np.linalg.inv(factor)
 
 
 def same_size(codes: NDArray[np.integer]) -> Iterator[IntArray]:
