@@ -74,23 +74,17 @@ def _copy_example(folder: Path) -> tuple[Path, Path]:
         raise InputError(f"{folder}: no permission to make this folder; name another") from None
     with as_file(files("elastocal.demo")) as source:
         own = [path for path in source.iterdir() if path.suffix in (".toml", ".urdf", ".csv")]
-        _check_own(folder, own)
+        # A campaign of somebody's own, or an example changed since, is not written over.
+        there = {folder / path.name: path for path in own if (folder / path.name).exists()}
+        foreign = [path for path, ours in there.items() if path.read_bytes() != ours.read_bytes()]
+        foreign += [folder / n for n in MADE if folder / MARK not in there]
+        for path in (path for path in foreign if path.exists()):
+            raise InputError(
+                f"{path} is not the demo's and would be written over; name another folder"
+            )
         for path in own:
             atomic_write(folder / path.name, path.read_text(encoding="utf-8"))
     return folder / "cell.toml", folder / "plan.csv"
-
-
-def _check_own(folder: Path, copied: list[Path]) -> None:
-    """Refuse a folder with somebody's own campaign, or an example that was changed since."""
-    there = {path.name: folder / path.name for path in copied if (folder / path.name).exists()}
-    changed = [
-        there[path.name]
-        for path in copied
-        if path.name in there and there[path.name].read_bytes() != path.read_bytes()
-    ]
-    made = [] if MARK in there else [folder / n for n in MADE if (folder / n).exists()]
-    for path in [*changed, *made]:
-        raise InputError(f"{path} is not the demo's and would be written over; name another folder")
 
 
 def _rows(path: Path) -> list[dict[str, str]]:

@@ -410,9 +410,8 @@ def import_files(
     fit, refused = (
         against_cell(cell, measured, columns, spherical) if cell is not None else (None, "")
     )
-    remarks = () if joined is None else joined.remarks
-    warnings += [r.removeprefix("WARNING: ") for r in remarks if r.startswith("WARNING: ")]
     warnings += [
+        *(() if joined is None else joined.warnings),
         *doubts,
         *plausibility(columns, measured, None if cell is None else cell.model.observe),
     ]

@@ -406,7 +406,7 @@ UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are s
 
 @dataclass(frozen=True)
 class Records:
-    """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
+    """n rows of exported files; `file` (n,) and `line` (n,) say where each stands.
 
     `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` (name,
     configuration, marker, repeat, load) → n texts; `load` of all rows, where one is stated.
@@ -415,8 +415,7 @@ class Records:
     the file's other columns, `ignored` (line, reason) of everything passed over.
     """
 
-    files: tuple[str, ...]
-    file: IntArray
+    file: list[str]
     line: IntArray
     numbers: dict[str, Array]
     units: dict[str, str]
@@ -428,15 +427,19 @@ class Records:
         return len(self.line)
 
     @property
+    def files(self) -> list[str]:
+        return list(dict.fromkeys(self.file))
+
+    @property
     def source(self) -> str:
-        return self.files[0]
+        return self.file[0]
 
     @property
     def names(self) -> list[str]:
         return self.texts.get("name", [""] * len(self))
 
     def where(self, i: int) -> str:
-        return f"{self.files[self.file[i]]}, line {self.line[i]}"
+        return f"{self.file[i]}, line {self.line[i]}"
 
     @property
     def forces(self) -> list[str]:
@@ -470,7 +473,7 @@ class Records:
     def take(self, rows: IntArray) -> Records:
         return replace(
             self,
-            file=self.file[rows],
+            file=[self.file[i] for i in rows],
             line=self.line[rows],
             numbers={stem: values[rows] for stem, values in self.numbers.items()},
             texts={stem: [own[i] for i in rows] for stem, own in self.texts.items()},
@@ -479,13 +482,10 @@ class Records:
     @classmethod
     def stacked(cls, parts: Sequence[Records]) -> Records:
         """The rows of all parts, which have the same numbers in the same units."""
-        sizes = [len(part.files) for part in parts]
         stems = dict.fromkeys(stem for part in parts for stem in part.texts)
-        first = np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
         return replace(
             parts[0],
-            files=tuple(file for part in parts for file in part.files),
-            file=np.concatenate([part.file for part in parts]) + first,
+            file=[file for part in parts for file in part.file],
             line=np.concatenate([part.line for part in parts]),
             numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
             texts={
@@ -557,8 +557,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
                         if i - 1 not in used),
         "rows": len(kept), "ignored": tuple(sorted({*table.ignored, *ignored})),
     }  # fmt: skip
-    file = np.zeros(len(line), dtype=np.int64)
-    return Records((name,), file, line, numbers, of, texts, understood, source.load)
+    return Records([name] * len(line), line, numbers, of, texts, understood, source.load)
 
 
 def _rows(

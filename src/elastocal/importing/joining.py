@@ -327,16 +327,18 @@ class Joined:
     """`row` (points,) into the joint log, -1 without a partner; `q` (points, joints).
 
     `pose` (points,) names the pose where the log does, None where it does not; `left_out` and
-    `unused` say which points and which poses found no partner; `remarks` are for the preview.
+    `unused` say which points and which poses found no partner; `remarks` and `warnings` are for
+    the preview.
     """
 
     how: str
     row: IntArray
     q: Array
-    pose: list[str] | None
-    left_out: tuple[str, ...]
-    unused: tuple[str, ...]
-    remarks: tuple[str, ...]
+    pose: list[str] | None = None
+    left_out: tuple[str, ...] = ()
+    unused: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def join(points: Records, log: Records, settings: JoinTable) -> Joined:
@@ -477,8 +479,7 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
             )
         row[chosen] = rows[visits]
     names = _names_of(log)
-    pose = [names[r] for r in row] if names else None
-    return Joined("order", row, log.q[row], pose, (), (), ())
+    return Joined("order", row, log.q[row], [names[r] for r in row] if names else None)
 
 
 def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
@@ -542,7 +543,7 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         )
     stop, apart = _nearest(at, clock[first], clock[last])
     good = apart <= settings.tolerance_s
-    unused, remarks = tuple[str, ...](), list[str]()
+    unused, remarks, warnings = tuple[str, ...](), list[str](), list[str]()
     if how == "standstill":
         remarks += [f"{len(first)} standstills of {shortest:g} s or more in {len(log)} rows"]
         empty = np.setdiff1d(np.arange(len(first)), stop[good])
@@ -557,8 +558,8 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
             remarks += [f"clocks differ by {apart[good].max():.3g} s at most, "
                         f"{np.median(apart[good]):.3g} s in the median"]  # fmt: skip
         if len(moving):
-            remarks.append(
-                f"WARNING: the arm moved while {len(moving)} points were measured: "
+            warnings.append(
+                f"the arm moved while {len(moving)} points were measured: "
                 f"{listed((points.shown(int(i)) for i in moving), SHOWN)}; set offset_s, or join "
                 "by standstill"
             )
@@ -568,4 +569,5 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         for i in np.flatnonzero(~good)
     )
     row = np.where(good, order[first[stop]], -1)
-    return Joined(how, row, standing[stop], None, left_out, unused, tuple(remarks))
+    told = left_out, unused, tuple(remarks), tuple(warnings)
+    return Joined(how, row, standing[stop], None, *told)

@@ -380,8 +380,7 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
     ]
     yield "Loads", some(loads, 8, "; ", "; {} more")
     if joined is not None:
-        remarks = [r for r in joined.remarks if not r.startswith("WARNING: ")]
-        yield "Joined", "; ".join([f"by {joined.how}", *remarks])
+        yield "Joined", "; ".join([f"by {joined.how}", *joined.remarks])
     if table.time is not None:
         yield "Time", f"{table.time.max():.6g} s from the first reading to the last"
     if found.fit is not None:
