@@ -213,15 +213,13 @@ def compare(
 def _loads(old: CalibratedArm, new: CalibratedArm, force: Array | None) -> tuple[Array, str]:
     """The forces (L, 3) to compare under and whose they are: those given, else of the earlier
     campaign, in whose frame the tool is compared, the later one, the cell's plan, where any."""
-    planned = old.model.cell.design.loads
-    for whose, loads in (
-        ("the option", None if force is None else force[None]),
-        ("the earlier campaign", old.loads),
-        ("the later campaign", new.loads),
-        ("the cell's plan", planned),
-    ):
-        if loads is not None and (loads.any() or force is not None):
-            return loads if force is not None else loads[loads.any(axis=1)], whose
+    if force is not None:
+        return force[None], "the option"
+    stated = {"the earlier campaign": old.loads, "the later campaign": new.loads,
+              "the cell's plan": old.model.cell.design.loads}  # fmt: skip
+    for whose, loads in stated.items():
+        if loads is not None and loads.any():
+            return loads[loads.any(axis=1)], whose
     return np.zeros((1, 3)), ""
 
 
@@ -320,18 +318,15 @@ def _difference(
         z = np.array([b[n] - a[n] for n in first])
         return first, z, _covariance(old, first) + _covariance(new, first), False
     # All that both fitted, set-up included, which the new campaign's choice may have moved.
-    x = before.x
-    known = [n for n in before.model.names if n in old.determined]
-    markers = len(before.model.cell.tool.markers) or 1
-    tables = [replace(table, marker=np.full(len(table.q), m)) for m in range(markers)]
-    if before.model.cell.tool.markers:
-        marked = tuple(before.model.cell.tool.markers)
-        tables = [replace(t, marker_names=marked) for t in tables]
-    B = np.vstack([before.model.regressor(t, x).B for t in tables])
-    index = {name: k for k, name in enumerate(before.model.names)}
-    fitted = [n for n in before.model.names if n in new.determined]
-    onto, beyond = _spanned(B, before.model.names, known, fitted)
-    _, beyond_new = _spanned(B, before.model.names, fitted, known)
+    names, marked = before.model.names, tuple(before.model.cell.tool.markers)
+    known, fitted = ([n for n in names if n in arm.determined] for arm in (old, new))
+    tables = [
+        replace(table, marker=np.full(len(table.q), m), marker_names=marked or table.marker_names)
+        for m in range(len(marked) or 1)
+    ]
+    B = np.vstack([before.model.regressor(t, before.x).B for t in tables])
+    onto, beyond = _spanned(B, names, known, fitted)
+    _, beyond_new = _spanned(B, names, fitted, known)
     told = [
         f"{by.source} does not determine what {other.source} does: {listed(hidden, NAMED)}"
         for by, other, hidden in ((old, new, beyond), (new, old, beyond_new))
@@ -342,11 +337,10 @@ def _difference(
         f"{'; '.join(told)}; identify both with these held ({option('fixed')}), or from poses and "
         "loads that show them in both",
     )
-    d = after.x - before.x
-    M = onto[:, [index[n] for n in fitted]]
+    M, z = onto[:, np.isin(names, fitted)], onto @ (after.x - before.x)
     V = _covariance(old, known) + M @ _covariance(new, fitted) @ M.T
     arms = [k for k, n in enumerate(known) if n in own]
-    return [known[k] for k in arms], (onto @ d)[arms], V[np.ix_(arms, arms)], True
+    return [known[k] for k in arms], z[arms], V[np.ix_(arms, arms)], True
 
 
 def _spanned(
@@ -357,15 +351,12 @@ def _spanned(
     `names` are those of B's columns, `basis` those of them that a campaign determined, `wanted`
     those that the other one did.
     """
-    place = {name: k for k, name in enumerate(names)}
-    chosen = B[:, [place[name] for name in basis]]
-    scale = np.linalg.norm(chosen, axis=0)
-    scale[scale == 0] = 1.0
-    onto = np.linalg.pinv(chosen / scale, rcond=RANK) / scale[:, None] @ B
-    whole = np.maximum(np.linalg.norm(B, axis=0), np.finfo(float).tiny)
-    rest = np.linalg.norm(B - chosen @ onto, axis=0) / whole
-    hidden = [n for n in wanted if n not in basis and rest[place[n]] > SAME_SPACE]
-    return np.asarray(onto), hidden
+    whole, own = np.linalg.norm(B, axis=0), np.isin(names, basis)
+    whole[whole == 0] = 1.0
+    onto = np.linalg.pinv((B / whole)[:, own], rcond=RANK) / whole[own, None] @ B
+    rest = np.linalg.norm(B - B[:, own] @ onto, axis=0) / whole
+    beyond = np.array(names)[rest > SAME_SPACE].tolist()
+    return np.asarray(onto), [n for n in beyond if n in wanted and n not in basis]
 
 
 def _tested(
@@ -378,12 +369,11 @@ def _tested(
     slope: Array,
 ) -> tuple[tuple[ParameterChange, ...], float]:
     """Each parameter by Holm's rule, and p of all together."""
-    variance = np.diag(V)
     require(
-        bool((variance > 0).all()),
+        bool((np.diag(V) > 0).all()),
         f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
     )
-    std = np.sqrt(variance)
+    std = np.sqrt(np.diag(V))
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
     nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
@@ -391,26 +381,24 @@ def _tested(
     order = np.argsort(p)
     family = np.empty(len(p))
     family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
-    scaled = V / np.outer(std, std)
-    together = float((z / std) @ np.linalg.solve(scaled, z / std)) / len(z)
-    smallest = float(min(d.min() for d in dofs))
-    a = old.values
+    together = float((z / std) @ np.linalg.solve(V / np.outer(std, std), z / std)) / len(z)
+    smallest = float(np.min(dofs))
     units = {q.name: q.unit for q in old.model.parameters}
     others = {str(e["name"]): tuple(e.get("combined_with") or ()) for e in old.entries}
+    columns = (each.tolist() for each in (z, std, p, family, np.abs(z) * slope))
     changes = tuple(
         ParameterChange(
-            n, units[n], a[n], a[n] + float(z[k]), float(z[k]), float(std[k]), float(p[k]),
-            float(family[k]), bool(family[k] < level), float(abs(z[k]) * slope[k]),
-            others.get(n, ()),
+            n, units[n], (a := old.values[n]), a + change, change, sd, alone, in_family,
+            in_family < level, moves, others.get(n, ()),
         )
-        for k, n in enumerate(names)
+        for n, change, sd, alone, in_family, moves in zip(names, *columns, strict=True)
     )  # fmt: skip
     return changes, float(special.fdtrc(len(z), min(smallest, 1e9), together))
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
     """Of each parameter; an older result states no degrees of freedom: normal."""
-    variance = dict(zip(arm.determined, np.diag(arm.covariance), strict=True))
+    variance = dict(zip(arm.determined, np.maximum(np.diag(arm.covariance), 0.0), strict=True))
     stated = {str(entry["name"]): entry.get("dof") for entry in arm.entries}
-    dof = np.array([float(stated.get(name) or np.inf) for name in names])
-    return np.array([max(variance.get(name, 0.0), 0.0) for name in names]), dof
+    each = [(variance.get(name, 0.0), float(stated.get(name) or np.inf)) for name in names]
+    return np.array(each)[:, 0], np.array(each)[:, 1]

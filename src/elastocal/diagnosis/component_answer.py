@@ -17,10 +17,8 @@ from elastocal.diagnosis.component_search import exchanged, imitators, size_of_f
 from elastocal.diagnosis.components import (
     Component,
     FittedSum,
-    Pool,
     drawn,
     presence_cost,
-    side_by_side,
 )
 from elastocal.diagnosis.diagnosis import (
     LARGE,
@@ -37,7 +35,6 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import spans_of
-from elastocal.diagnosis.hypotheses import corrects
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.stated_floor import (
     NEW_POSES,
@@ -50,7 +47,6 @@ from elastocal.diagnosis.stated_floor import (
 )
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.effects.base import Stage, index
-from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
@@ -104,17 +100,20 @@ class SumAnswer:
     def _wide(self) -> NoisyData:
         """The data of the sum with the columns of what is hidden last."""
         data = self.found.data
-        extra = side_by_side(data, [data.masked(c.columns) for c in self.hidden])
-        precision = [
-            np.full(c.width, np.exp(-2 * size_of_fellows(self.found, c))) for c in self.hidden
-        ]
-        return data.with_columns(extra, np.concatenate([np.zeros(0), *precision]))
+        for c in self.hidden:
+            precision = np.full(c.width, np.exp(-2 * size_of_fellows(self.found, c)))
+            data = data.with_columns(data.masked(c.columns), precision)
+        return data
 
     @cached_property
     def _spans(self) -> tuple[slice, ...]:
-        """Of the components' coefficients and the hidden ones', the fitted columns not counted."""
-        widths = [c.width for c in (*self.found.components, *self.hidden)]
+        """Of all components' coefficients, the fitted columns not counted."""
+        widths = [c.width for c in self._every]
         return spans_of(widths, sum(widths))
+
+    @property
+    def _every(self) -> tuple[Component, ...]:
+        return (*self.found.components, *self.hidden)
 
     @cached_property
     def _own(self) -> int:
@@ -127,11 +126,6 @@ class SumAnswer:
         data = self.found.data
         of_size = np.arange(data.r.shape[1]) % data.blocks.size < 3
         return np.asarray(~data.left_out & of_size[None, :])
-
-    @property
-    def _axes(self) -> int:
-        """Rows of a reading among these."""
-        return min(self.found.data.blocks.size, 3)
 
     @cached_property
     def _drawn(self) -> Array:
@@ -171,8 +165,8 @@ class SumAnswer:
         return np.asarray(self.moved.T @ self.moved / self._readings)
 
     @property
-    def _readings(self) -> float:
-        return len(self.moved) / self._axes
+    def _readings(self) -> int:
+        return int(self._left_out[1].sum())
 
     @cached_property
     def _poses(self) -> tuple[IntArray, Array]:
@@ -193,7 +187,7 @@ class SumAnswer:
         rows = np.nonzero(self._rows)[0][kept]
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         each = np.add.reduceat(left**2, starts, axis=0)
-        count = np.diff(np.append(starts, len(rows))) / self._axes
+        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
         return np.asarray((times * each).sum(axis=0) / (times * count[:, None]).sum(axis=0))
 
     def squares(self, members: Sequence[int]) -> Array:
@@ -219,7 +213,7 @@ class SumAnswer:
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
-        return self._left_out_without([])
+        return self._left_out_without(())
 
     @cached_property
     def unexplained(self) -> float:
@@ -252,23 +246,19 @@ class SumAnswer:
         without what does harm there.  What they may take from others is in the shares still."""
         now = self._left_out[0]
         gone = [k for k in self._doubtful if not pays(self._left_out_without([k])[0], now)]
-        answer = self._without(gone) if gone else self
-        harmful = [
-            k for key, gain in answer._not_paying.items() if gain < -HARM
-            for k in answer._at_place[key]
-        ]  # fmt: skip
-        return answer._without(harmful) if harmful else answer
+        answer = self._without(gone)
+        harmful = (key for key, gain in answer._not_paying.items() if gain < -HARM)
+        return answer._without([k for key in harmful for k in answer._at_place[key]])
 
     @cached_property
     def _doubtful(self) -> list[int]:
-        """Effects of next to no share that are probably something else: as causes they would be a
-        guess."""
-        return [
-            k for k in self._rivals
-            if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
-        ]  # fmt: skip
+        """Effects of next to no share that are probably something else: guesses, as causes."""
+        improbable = (k for k in self._rivals if self._probability(k) < PROBABLE)
+        return [k for k in improbable if abs(np.median(self.shares([k]))) < TOLD]
 
     def _without(self, gone: Sequence[int]) -> SumAnswer:
+        if not gone:
+            return self
         removed = [self.found.components[k] for k in gone]
         return replace(self, found=exchanged(self.found, removed), hidden=(*self.hidden, *removed))
 
@@ -282,11 +272,8 @@ class SumAnswer:
         """
         gone: list[int] = []
         out: dict[tuple[str, str], float] = {}
-        named = {
-            key: own for key, own in self._at_place.items()
-            if all(self.found.components[k].named for k in own)
-            and not any(self.found.components[k].given for k in own)
-        }  # fmt: skip
+        free = {k for k, c in enumerate(self.found.components) if c.named and not c.given}
+        named = {key: own for key, own in self._at_place.items() if free.issuperset(own)}
         now = self._left_out[0]
         while named:
             without = {key: self._left_out_without([*gone, *own])[0] for key, own in named.items()}
@@ -326,15 +313,13 @@ class SumAnswer:
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
         chosen = [self.found.components[k] for k in members]
-        hidden = [
-            k for k, c in enumerate(self.hidden, start=len(self.found.components))
-            if (c.family, c.where) == (family, where)
-        ]  # fmt: skip
-        everything = [*members, *hidden]
+        everything = [
+            k for k, c in enumerate(self._every) if (c.family, c.where) == (family, where)
+        ]
         rms, _, rms_ci95 = with_intervals(np.sqrt(self.squares(everything)))
         return ComponentShare(
             family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
-            *self._share_with_ends(everything), rms, rms_ci95,
+            *with_intervals(self.shares(everything))[:2], rms, rms_ci95,
             self._matters(members), any(c.named for c in chosen),
         )  # fmt: skip
 
@@ -351,19 +336,11 @@ class SumAnswer:
         chosen = [self.found.components[k] for k in members]
         places = tuple(sorted({c.where for c in chosen}))
         effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        share, (fall, ci90, _) = (
-            self._share_with_ends(self._of_kind(name)),
-            self._reduction(members),
-        )
-        return EffectGroup(name, places, effects, *share, fall, ci90)
+        share = with_intervals(self.shares(self._of_kind(name)))[:2]
+        return EffectGroup(name, places, effects, *share, *self._reduction(members)[:2])
 
     def _of_kind(self, name: str) -> list[int]:
-        every = (*self.found.components, *self.hidden)
-        return [k for k, c in enumerate(every) if _kind(c) == name]
-
-    def _share_with_ends(self, members: Sequence[int]) -> tuple[float, Interval]:
-        """Median and 90 % interval of a share."""
-        return with_intervals(self.shares(members))[:2]
+        return [k for k, c in enumerate(self._every) if _kind(c) == name]
 
     def _by(self, key: Callable[[Component], Any]) -> dict[Any, list[int]]:
         """The components' numbers by what `key` says of each; without those that it denies."""
@@ -458,16 +435,6 @@ class SumAnswer:
         return [k for k, c in enumerate(self.found.components) if not c.named]
 
     @property
-    def n_causes(self) -> int:
-        return len(self._by(lambda c: (c.family, c.where)))
-
-    @property
-    def without_names(self) -> tuple[FoundEffect, ...]:
-        """Curves, lines and what has no name, which correct the arm though the verdict knows no
-        cause of them."""
-        return (*(f for f in self.effects if corrects(effect_of(f.effect))), *self.fields)
-
-    @property
     def unnamed_probability(self) -> float:
         return max(map(self._probability, self._unnamed), default=0.0)
 
@@ -557,7 +524,7 @@ class SumAnswer:
     @cached_property
     def _present(self) -> Array:
         """Probability (K,) that there is anything at a component's place."""
-        return np.asarray(expit(self.found.earned - Pool(self.found.components).costs))
+        return np.asarray(expit(self.found.earned - self.found.sums.pool.costs))
 
     def _probability(self, k: int) -> float:
         there = float(self._present[k])
@@ -571,10 +538,19 @@ class SumAnswer:
         found = [self.found.components[k] for k in members]
         sizes, lengths = self.found.sizes.size, self.found.sizes.length
         settings: dict[str, float] = {}
+        if isinstance(found[0].effect, GearSpectrum):
+            # One prior size for all families of a joint.
+            size = math.sqrt(float(np.mean(np.exp(2 * sizes[members])))) * found[0].unit
+            q = self.dataset.table.q[:, index(found[0].where)]
+            centre = float((q.max() + q.min()) / 2)
+            settings = {"spectrum_size_rad": size, "spectrum_centre_rad": centre}
+            given = [[value for _, value in c.settings] for c in found]  # order, sd, order, sd, …
+            lines = sorted(pair for one in given for pair in zip(one[::2], one[1::2], strict=True))
+            for n, (order, sd) in enumerate(lines, start=1):
+                settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
+            return settings
         for k, c in zip(members, found, strict=True):
             size, length = float(np.exp(sizes[k]) * c.unit), float(np.exp(lengths[k]))
-            if isinstance(c.effect, GearSpectrum):
-                continue
             settings |= dict(c.settings)
             if c.follows:
                 settings |= {f"field_{c.follows}_size": size, f"field_{c.follows}_length": length}
@@ -585,20 +561,6 @@ class SumAnswer:
                 model = self.dataset.base.model
                 stated = c.effect.stated(c.where, model.chain, model.cell)
                 settings[c.effect.sized_by] = size * stated[c.effect.sized_by]
-        families = [k for k in members if isinstance(self.found.components[k].effect, GearSpectrum)]
-        if families:
-            # One prior size for all families of a joint.
-            each = [np.exp(2 * sizes[k]) for k in families]
-            settings["spectrum_size_rad"] = math.sqrt(float(np.mean(each))) * found[0].unit
-            q = self.dataset.table.q[:, index(found[0].where)]
-            settings["spectrum_centre_rad"] = float((q.max() + q.min()) / 2)
-            given = [dict(self.found.components[k].settings) for k in families]
-            lines = sorted(
-                (one[f"order_{n}"], one[f"order_sd_{n}"])
-                for one in given for n in range(1, len(one) // 2 + 1)
-            )  # fmt: skip
-            for n, (order, sd) in enumerate(lines, start=1):
-                settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
 
     def _parameter_sizes(self, k: int) -> Iterator[tuple[str, float]]:
@@ -659,8 +621,8 @@ class SumAnswer:
         for k, c in enumerate(self.found.components):
             if not isinstance(c.effect, JointCurve) or c.waves is None:
                 continue
-            settings = dict(c.settings)
-            x = np.linspace(settings["curve_low_rad"], settings["curve_high_rad"], 400)
+            (_, low), (_, high) = c.settings
+            x = np.linspace(low, high, 400)
             F = c.waves.at(x) * c.unit
             span = self.found.spans[k]
             y = F @ self.at.beta[span]

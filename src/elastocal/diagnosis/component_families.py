@@ -26,11 +26,9 @@ from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, with_moves
 from elastocal.model.effects.base import (
-    BaseMotion,
     DrivenEffect,
     Effect,
     JointMotion,
-    LinkFrame,
     SmoothFunction,
     Stage,
     index,
@@ -65,13 +63,9 @@ OF_NEED: dict[str, Family] = {"time": "time", "temperature": "temperature", "app
 def family_of(effect: Effect, cell: Cell) -> Family:
     if effect.family:
         return effect.family  # type: ignore[return-value]
-    needed = effect.needed(cell)
-    for need, family in OF_NEED.items():
-        if need in needed:
-            return family
-    if effect.stage == "transmission" and isinstance(effect, LoadedEffect):
-        return "torque"
-    return OF_STAGE[effect.stage]
+    loaded = effect.stage == "transmission" and isinstance(effect, LoadedEffect)
+    needed = (family for need, family in OF_NEED.items() if need in effect.needed(cell))
+    return next(needed, "torque" if loaded else OF_STAGE[effect.stage])
 
 
 def driven_columns(
@@ -89,13 +83,12 @@ def driven_columns(
 def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
     effect, model = JointCurve(), dataset.base.model
     joints = turning_joints(model.chain)
-    n = len(dataset.blocks.member)
     for where in joints:
         if (effect.name, where) in {(p.effect, p.where) for p in model.parameters}:
             continue
         q = dataset.table.q[:, index(where)]
         span = float(np.ptp(q))
-        distinct = min(n, len(np.unique(q.round(3))))
+        distinct = min(len(dataset.blocks.member), len(np.unique(q.round(3))))
         shortest = max(SHORTEST, RESOLVED * span / max(distinct, 1))
         if span < MOVED or shortest > span / 2:
             continue
@@ -128,10 +121,9 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
 
 def drifts(dataset: DiagnosisData) -> Iterator[Component]:
     """A smooth motion of the base in the course of the campaign, where times are recorded."""
-    effect, model, time = ResidualField(), dataset.base.model, dataset.table.time
-    places = effect.places(model.chain, model.cell)
+    time = dataset.table.time
     if recorded(dataset.table, "time") and time is not None and np.ptp(time) > 0:
-        yield from (field_component(dataset, effect, w, "time") for w in places if w == "base")
+        yield field_component(dataset, "base", "time")
 
 
 def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Component | None:
@@ -147,8 +139,7 @@ def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Componen
     share = shortest / float(np.ptp(time)) / SHORTER
     if shortest / SHORTER < resolved or share < LEAST_SHARE:
         return None
-    assert isinstance(c.effect, ResidualField)
-    return field_component(dataset, c.effect, c.where, "time", share)
+    return field_component(dataset, c.where, "time", share)
 
 
 # Smooth fields.
@@ -167,30 +158,30 @@ def beside(
     return Grams(dataset, data, project(data, noise))
 
 
+FIELD = ResidualField()
+
+
 def _field(
-    dataset: DiagnosisData, effect: ResidualField, where: str, name: str, length: float
+    dataset: DiagnosisData, where: str, name: str, length: float
 ) -> tuple[SmoothFunction, dict[str, float]]:
     """A field's function of what it follows, and its settings."""
     x = _followed(dataset.table, name)
-    keys = ("size", "length", "low", "high")
-    values = (1.0, length * float(np.ptp(x)), float(x.min()), float(x.max()))
-    settings = {f"field_{name}_{key}": value for key, value in zip(keys, values, strict=True)}
+    values = {"size": 1.0, "length": length * np.ptp(x), "low": x.min(), "high": x.max()}
+    settings = {f"field_{name}_{key}": float(value) for key, value in values.items()}
     cell = cell_with(dataset.base.model.cell, where, settings)
-    (function,) = effect.functions(where, dataset.base.model.chain, cell)
+    (function,) = FIELD.functions(where, dataset.base.model.chain, cell)
     return function, settings
 
 
-def field_block(
-    dataset: DiagnosisData, effect: ResidualField, where: str, name: str, length: float
-) -> Generic:
+def field_block(dataset: DiagnosisData, where: str, name: str, length: float) -> Generic:
     """A field as a block, for a search: its direction at every visit, the same waves in each
     component of the motion."""
-    function, _ = _field(dataset, effect, where, name, length)
+    function, _ = _field(dataset, where, name, length)
     waves = Waves.of(function)
     sd = np.sqrt(waves.variances(function.size, function.length))
     F = waves.at(_followed(dataset.visit_table, name)) * sd * MOTION
     F = F.reshape(*dataset.present.shape, -1) * dataset.present[:, :, None]
-    entry = effect.entry_at(where)
+    entry = FIELD.entry_at(where)
     D = np.asarray(np.kron(np.eye(entry.size), F[:, :, None, :]), dtype=np.float64)
     return Generic("angle", name, where, "geometry", (entry.name, (where,)), D)
 
@@ -203,17 +194,15 @@ def _followed(table: Measurements, name: str) -> Array:
 
 
 def field_component(
-    dataset: DiagnosisData, effect: ResidualField, where: str, name: str,
-    shortest: float = FIELD_LENGTHS[0],
-) -> Component:  # fmt: skip
-    function, settings = _field(dataset, effect, where, name, shortest)
-    span = settings[f"field_{name}_high"] - settings[f"field_{name}_low"]
-    columns = driven_columns(dataset, effect, where, settings) * MOTION
+    dataset: DiagnosisData, where: str, name: str, shortest: float = FIELD_LENGTHS[0]
+) -> Component:
+    function, settings = _field(dataset, where, name, shortest)
+    columns = driven_columns(dataset, FIELD, where, settings) * MOTION
+    span = function.high - function.low
     low, high = (math.log(share * span) for share in (shortest, FIELD_LENGTHS[1]))
-    ranges = {k: v for k, v in settings.items() if k.endswith(("low", "high"))}
     return Component(
-        "time" if name == "time" else "pose", effect, where, columns, MOTION, name,
-        Waves.of(function), (low, high), effect.entry_at(where).size, tuple(ranges.items()),
+        "time" if name == "time" else "pose", FIELD, where, columns, MOTION, name,
+        Waves.of(function), (low, high), FIELD.entry_at(where).size, tuple(settings.items())[2:],
     )  # fmt: skip
 
 
@@ -231,19 +220,19 @@ def without_a_name(
     sums, model = beside(dataset, found, found.noise), dataset.base.model
     chain, cell = model.chain, model.cell
     respond = partial(_response, dataset.columns.torques())
-    wrench_at = {where: wrench for where, _, *wrench in wrenches(dataset)}
+    wrench_at = {where: wrench for where, *wrench in wrenches(dataset)}
     tried: tuple[tuple[Effect, Search], ...] = (
         (ResidualStep(), _step), (TorqueResponse(), respond), (ApproachResponse(), respond),
         (LoadResponse(), partial(_yielding, wrench_at)),
     )  # fmt: skip
     taken = {(p.effect, p.where) for p in model.parameters}
     taken |= {(c.effect.name, c.where) for c in found.components}
-    field, every = ResidualField(), list[Conspicuous]()
-    for where in field.places(chain, cell):
+    every: list[Conspicuous] = []
+    for where in FIELD.places(chain, cell):
         # Of one place at a time: what a large table's entries sum up to would fill the memory.
         grams = Grams(dataset, sums.data, sums.at)
-        if field.name not in without:
-            every += _fields(found, field, grams, where)
+        if FIELD.name not in without:
+            every += _fields(found, grams, where)
         for effect, search in tried:
             free = effect.name not in without and (effect.name, where) not in taken
             if not free or where not in effect.places(chain, cell):
@@ -265,9 +254,7 @@ Tried = tuple[Generic, dict[str, float], float]
 Search = Callable[[Any, Grams, str], Tried | None]
 
 
-def _fields(
-    found: FittedSum, effect: ResidualField, grams: Grams, where: str
-) -> Iterator[Conspicuous]:
+def _fields(found: FittedSum, grams: Grams, where: str) -> Iterator[Conspicuous]:
     dataset = grams.dataset
     follow = ["time"] if recorded(dataset.table, "time") else []
     if not where.startswith("marker"):
@@ -276,8 +263,8 @@ def _fields(
     known = {(c.where, c.follows) for c in found.components}
     for name in follow:
         if where != name and (where, name) not in known:
-            coarse = field_block(dataset, effect, where, name, FIELD_LENGTHS[0] * 2)
-            maker = partial(field_component, dataset, effect, where, name)
+            coarse = field_block(dataset, where, name, FIELD_LENGTHS[0] * 2)
+            maker = partial(field_component, dataset, where, name)
             yield float(grams.of(coarse).evidence()[0]), where, name, maker
 
 
@@ -326,13 +313,13 @@ def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) ->
 
 
 def _yielding(
-    wrench_at: Mapping[str, Sequence[Array]], effect: LoadResponse, grams: Grams, where: str
+    wrench_at: Mapping[str, Sequence[Any]], effect: LoadResponse, grams: Grams, where: str
 ) -> Tried | None:
     """Base or link by force and moment of the load, about the axes of the springs there."""
     base = grams.dataset.base
     if where not in wrench_at:
         return None
-    wrench = wrench_at[where]
+    entry, *wrench = wrench_at[where]
     turned = as_placed(base.model, base.x).model.nominal.base_rotation
     R = np.eye(3) if where != "base" or turned is None else turned
     largest = [float(np.abs(part).max()) or 1.0 for part in wrench]
@@ -340,9 +327,7 @@ def _yielding(
     for own, part, most in zip((slice(3), slice(3, 6)), wrench, largest, strict=True):
         D[:, :, own, own] = R * (part @ R)[:, :, None, :] / most * MOTION
     settings = zip((s.key for s in effect.constants[1:]), largest, strict=True)
-    entry = BaseMotion() if where == "base" else LinkFrame()
-    block = Generic("", effect.name, where, effect.stage, (entry.name, (where,)), D)
-    return block, dict(settings), 0.0
+    return Generic("", effect.name, where, effect.stage, entry, D), dict(settings), 0.0
 
 
 def _as_component(

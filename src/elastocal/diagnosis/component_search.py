@@ -87,7 +87,9 @@ def search_components(
         searched = (i for i in chosen.items if i.known and len(i.settings))
         every = [*moving, *known, *(_component(full, item) for item in searched)]
         curves = [] if JointCurve.name in without else list(joint_curves(full))
-        others = _first(every)
+        # A joint's sag by itself where link weights are not one component, which hold it.
+        shared = any(isinstance(c.effect, LinkWeights) for c in every)
+        others = [c for c in every if not (shared and isinstance(c.effect, GravitySag))]
         tried = [*curves, *others]  # one object, by which a sum knows what completed it
         if not (weighed or open_ or promised(chosen, tried) > PROMISING):
             return None
@@ -137,7 +139,7 @@ def _with_lines_first(
     A curve takes up the lines of its joint as far as few poses show them, and then none of them
     stands out.  A sum without curves is one of the others already.
     """
-    curved = any(c is curve for c in found.components for curve in curves)
+    curved = any(c in curves for c in found.components)
     first, pool = found, tried
     if curved:
         first, pool = fit_sum(found.sums.data, others, instrument), others
@@ -162,11 +164,10 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     one size here: the eccentricity of a joint, which looks like its sag, must not take the weights.
     """
     sizes = found.sizes.size.copy()
-    for kind in found.sums.pool.kinds:
+    for _, kind in found.sums.pool.kinds:
         sizes[kind] = np.median(sizes[kind])
-    widths = [c.width for c in found.components]
-    grown = np.repeat(np.exp(2 * (sizes - found.sizes.size)), widths)
-    alike = replace(found, variances=found.variances * grown)
+    every = found.sums.variances(replace(found.sizes, size=sizes))
+    alike = replace(found, variances=every[len(found.sums.data.precision) :])
     base, beta = dataset.base, project(alike.data, found.noise).beta
     x = dict(zip(base.model.names, base.x - from_centre(base), strict=True))
     width = dict(zip(base.model.names, prior_deviations(base), strict=True))
@@ -187,21 +188,13 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     return about(dataset, at, weights, apart=True)
 
 
-def _first(components: Sequence[Component]) -> list[Component]:
-    """Those that are judged from the start: each joint's sag by itself only where the weights of
-    all links are not one component, and else if these leave something to it."""
-    shared = any(isinstance(c.effect, LinkWeights) for c in components)
-    return [c for c in components if not (shared and isinstance(c.effect, GravitySag))]
-
-
 def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum and the families of lines that stand out beside it, the best first.
 
     With many poses all that stand out come in at once: what one hides from another is little.
     """
     for _ in range(LINE_SEARCHES):
-        stand_out = line_families(dataset, found)
-        wider = None
+        stand_out, wider = line_families(dataset, found), found
         many = len(dataset.blocks.member) > FEW_POSES
         # Where none pays by itself, some do together: what one joint's lines do hides another's.
         some = [[family] for family in stand_out[:TRIED]]
@@ -218,7 +211,7 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
             if fitted.score > found.score + GAINED:
                 wider = fitted
                 break
-        if wider is None:
+        if wider is found:
             break
         found = wider if many else _tuned(dataset, wider)
     return found
@@ -229,9 +222,8 @@ def with_shorter_drifts(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     before = found
     while True:
         lengths = zip(found.components, found.sizes.length.tolist(), strict=True)
-        pairs = [(c, short) for c, at in lengths if (short := shorter(dataset, c, at)) is not None]
-        gone, more = ([pair[k] for pair in pairs] for k in (0, 1))
-        fitted = exchanged(found, gone, more, refit_noise=False) if pairs else found
+        short = {c: new for c, at in lengths if (new := shorter(dataset, c, at)) is not None}
+        fitted = exchanged(found, [*short], [*short.values()], False) if short else found
         if fitted.score <= found.score + GAINED:
             return found if found is before else _refitted(found)
         found = fitted
@@ -240,8 +232,7 @@ def with_shorter_drifts(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
 def with_returned(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     """The sum with components that went under a larger noise and show under this one."""
     for _ in range(RETURNS):
-        taken = {id(c) for c in found.components}
-        away = [c for c in components if id(c) not in taken]
+        away = found.away(components)
         each = evidence_beside(found, away)
         evidence = [e + log_odds(found.components, c) for e, c in zip(each, away, strict=True)]
         order = np.argsort(evidence)[::-1][:MOST_RETURNED]
@@ -317,10 +308,7 @@ def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[C
     sag, has no evidence of its own, and what it may take from the other is uncertain.
     """
     here = {c.effect.name for c in found.components}
-    taken = {id(c) for c in found.components}
-    hidden = [
-        c for c in components if c.effect.name in here and c.fellows > 1 and id(c) not in taken
-    ]
+    hidden = [c for c in found.away(components) if c.effect.name in here and c.fellows > 1]
     sizes = [np.full((1, c.width), np.exp(size_of_fellows(found, c))) for c in hidden]
     each = evidence_beside(found, hidden, np.ones(1), sizes)
     pairs = zip(each, hidden, strict=True)
@@ -351,7 +339,14 @@ def _with_corrections(
 ) -> FittedSum:
     """The sum with what has no name, all that stands out or, where it does not pay together, one of
     the likeliest; where none does, with what stands out if joints scatter no more than usual."""
-    for begun in (found, *_quieter(found)):
+    noise, usual = found.noise, NoiseValues.usual(len(found.noise.joint))
+    # What is missing at a joint that scatters far more than the others let expect has been taken
+    # for its scatter.
+    loud = scatter_beyond(noise) > 0
+    joint = np.where(loud, np.minimum(noise.joint, usual.joint), noise.joint)
+    shared = np.where(loud, np.minimum(noise.shared, usual.shared), noise.shared)
+    quieter = replace(found, noise=replace(noise, joint=joint, shared=shared))
+    for begun in [found, quieter] if loud.any() else [found]:
         more = _without_imitators(begun, without_a_name(dataset, begun, MOST_FIELDS, without))
         some = [more, *([c] for c in more[:TRIED] if few and len(more) > 1)]
         for chosen in filter(None, some):
@@ -359,18 +354,6 @@ def _with_corrections(
             if fitted.score > found.score + GAINED:
                 return fitted
     return found
-
-
-def _quieter(found: FittedSum) -> list[FittedSum]:
-    """The sum where no joint scatters far more than the others let expect, if one does: what is
-    missing there has been taken for its scatter."""
-    noise, usual = found.noise, NoiseValues.usual(len(found.noise.joint))
-    loud = scatter_beyond(noise) > 0
-    joint, shared = (
-        np.where(loud, np.minimum(now, quiet), now)
-        for now, quiet in ((noise.joint, usual.joint), (noise.shared, usual.shared))
-    )
-    return [replace(found, noise=replace(noise, joint=joint, shared=shared))] if loud.any() else []
 
 
 def _without_imitators(found: FittedSum, more: Sequence[Component]) -> list[Component]:
@@ -393,10 +376,11 @@ def exchanged(
     refit_noise: bool = True,
 ) -> FittedSum:  # fmt: skip
     """The sum with `more` components in the place of those `gone`, fitted from where it is."""
-    kept = [k for k, c in enumerate(found.components) if not any(c is other for other in gone)]
-    now, new = found.sizes.chosen(kept), Sizes.start(more)
-    start = Sizes(now.factor, np.append(now.size, new.size), np.append(now.length, new.length))
-    components = [*(found.components[k] for k in kept), *more]
+    kept = [k for k, c in enumerate(found.components) if c not in gone]
+    start, components = (
+        found.sizes.chosen(kept, more),
+        [*(found.components[k] for k in kept), *more],
+    )
     return fit_sum(found.sums.data, components, found.noise, start, refit_noise, found.sums)
 
 
@@ -419,7 +403,7 @@ def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
 
     pool = Pool(found.components)
     score = found.score + pool.cost - sum(c.search for c in found.components)
-    for n, own in zip(pool.places, pool.kinds, strict=True):
+    for n, own in pool.kinds:
         for before, k in enumerate(own):
             fellow = presence_cost(n, before + 1) - presence_cost(n, before)
             paid = -price(found.components[k])
@@ -442,17 +426,14 @@ class Beside:
     """
 
     def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
-        sums = found.sums
-        w, products = sums.weighted, sums.across(columns)
-        self.root = w.prior(np.concatenate([sums.data.precision, 1 / found.variances])) ** -0.5
-        self.sum = Standardised.of(w.products.M, w.products.z, self.root)
-        own = [self.root[:, None] * each.beside for each in products]
-        self.halves = [linalg.solve_triangular(self.sum.L, t, lower=True) for t in own]
-        half = self.sum.L.T @ self.sum.b
-        self.left = [
-            (each.own - t.T @ t, each.z - t.T @ half)
-            for each, t in zip(products, self.halves, strict=True)
-        ]
+        M, z = found.sums.products.M, found.sums.products.z
+        prior = np.concatenate([found.sums.data.precision, 1 / found.variances])
+        self.sum = Standardised.of(M, z, (prior + ROUNDING * np.diag(M)) ** -0.5)
+        L, each = self.sum.L, list(found.sums.across(columns))
+        half, own = L.T @ self.sum.b, (self.sum.root[:, None] * one.beside for one in each)
+        self.halves = [linalg.solve_triangular(L, t, lower=True) for t in own]
+        pairs = zip(each, self.halves, strict=True)
+        self.left = [(one.own - t.T @ t, one.z - t.T @ half) for one, t in pairs]
 
     @cached_property
     def _moved(self) -> list[Array]:
@@ -463,7 +444,7 @@ class Beside:
         """Over none, of what is `gone` beside all others of the sum and of each of the columns."""
         S = np.tril(self.sum.covariance[gone, gone])
         W = np.linalg.inv(S + np.tril(S, -1).T)
-        b, per = W @ self.sum.b[gone], 1 / self.root[gone]
+        b, per = W @ self.sum.b[gone], 1 / self.sum.root[gone]
         groups = [((W - np.eye(len(W))) * per[:, None] * per, b * per)]
         for (A, z), moved in zip(self.left, self._moved, strict=True):
             own = moved[gone]
@@ -541,11 +522,9 @@ def with_likelier_names(
                 for key, evidence in others.items() if key in by_key
             }  # fmt: skip
             likeliest = max(odds, key=lambda key: odds[key], default=None)
-            if likeliest is None or odds[likeliest] <= own + log_odds(rest, c) + GAINED:
-                continue
-            swapped = exchanged(found, [c], [by_key[likeliest]], refit_noise=False)
-            if swapped.score > better.score + GAINED:
-                better = swapped
+            if likeliest and odds[likeliest] > own + log_odds(rest, c) + GAINED:
+                swapped = exchanged(found, [c], [by_key[likeliest]], refit_noise=False)
+                better = swapped if swapped.score > better.score + GAINED else better
         if better is found:
             break
         found = _refitted(better)
@@ -569,25 +548,18 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     many = len(found.sums.data.r) > FEW_POSES
     for _ in range(COMPLETED):
         present = Counter(c.effect.name for c in found.components)
-        taken = {id(c) for c in found.components}
-        away = {n: [c for c in own if id(c) not in taken] for n, own in kinds.items()}
-        shown = _kinds_that_show(found, away, present)
-        if not many:
-            shown |= set(present)
-        else:
-            away = {n: more for n, more in away.items() if n in shown or present[n]}
-        better = None
+        away = {n: found.away(own) for n, own in kinds.items()}
+        shown = _kinds_that_show(found, away, present) | ({*()} if many else {*present})
+        better = found
         for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):
                 gone = [c for c in found.components if c.effect.name == instead]
-                alike = {c.family for c in gone} & {c.family for c in more}
+                alike = not gone or {c.family for c in gone} & {c.family for c in more}
                 hopeless = (many or instead is None) and name not in shown
-                if not more or hopeless or (gone and not alike) or any(c.given for c in gone):
-                    continue
-                fitted = exchanged(found, gone, more, refit_noise=False)
-                if fitted.score > (found if better is None else better).score + GAINED:
-                    better = fitted
-        if better is None:
+                if more and alike and not hopeless and not any(c.given for c in gone):
+                    fitted = exchanged(found, gone, more, refit_noise=False)
+                    better = fitted if fitted.score > better.score + GAINED else better
+        if better is found:
             break
         found = _refitted(better)
     return replace(found, complete=components)
@@ -602,15 +574,13 @@ def _kinds_that_show(
     """Kinds whose evidence at all of these places together is more than what their being there
     costs, beside those that are `present`."""
     every = [c for own in away.values() for c in own]
-    each = dict(zip(map(id, every), evidence_beside(found, every), strict=True))
+    each = dict(zip(every, evidence_beside(found, every), strict=True))
     shown = set()
     for name, own in away.items():
-        gains = [each[id(c)] for c in own if each[id(c)] > 0]
-        if not gains:
-            continue
-        n, more = own[0].fellows, len(gains)
+        gains = [each[c] for c in own if each[c] > 0]
+        n, more = own[0].fellows if own else 0, len(gains)
         k = max(min(present[name], n - more), 0)
-        if sum(gains) > presence_cost(n, k + more) - presence_cost(n, k):
+        if more and sum(gains) > presence_cost(n, k + more) - presence_cost(n, k):
             shown.add(name)
     return shown
 
@@ -697,9 +667,8 @@ def with_equal_noise(dataset: DiagnosisData) -> NoisyData:
     data = dataset.data
     if data.stated:
         return data
-    size = dataset.blocks.size
     variance = np.diagonal(dataset.base.covariance[0]).copy()
-    variance[:3] = variance[:3].mean()
-    variance[3:] = variance[3:].mean() if size > 3 else 0.0
-    equal = np.tile(np.diag(variance[:size]), (dataset.blocks.n, 1, 1))
+    for part in (variance[:3], variance[3:]):
+        part[:] = part.mean() if len(part) else 0.0
+    equal = np.tile(np.diag(variance), (dataset.blocks.n, 1, 1))
     return replace(data, covariance=dataset.blocks.pack_square(equal))

@@ -20,8 +20,8 @@ components of one kind, the share that is present and their common size are unkn
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -130,13 +130,21 @@ class Sizes:
     length: Array
 
     @classmethod
+    def of(cls, theta: Array) -> Sizes:
+        """From all of these one after the other (1 + 2 K,)."""
+        return cls(float(theta[0]), *np.split(theta[1:], 2))
+
+    @classmethod
     def start(cls, components: Sequence[Component]) -> Sizes:
         length = np.array([(2 * c.lengths[0] + c.lengths[1]) / 3 for c in components])
         return cls(0.0, np.zeros(len(components)), length)
 
-    def chosen(self, index: Sequence[int]) -> Sizes:
-        at = np.asarray(index, dtype=np.int64)
-        return Sizes(self.factor, self.size[at], self.length[at])
+    def chosen(self, index: Sequence[int], more: Sequence[Component] = ()) -> Sizes:
+        """Those of some of the components, and of `more` at their start."""
+        at, new = np.asarray(index, dtype=np.int64), Sizes.start(more)
+        size, length = (np.append(a[at], b) for a, b in
+                        ((self.size, new.size), (self.length, new.length)))  # fmt: skip
+        return Sizes(self.factor, size, length)
 
 
 class Pool:
@@ -155,36 +163,34 @@ class Pool:
             place = (c.effect.name, c.follows, c.where)
             kinds.setdefault((*place[:2], ranks[place]), []).append(k)
             ranks[place] += 1
-        self.kinds = tuple(np.array(own) for own in kinds.values())
-        self.places = tuple(
-            max(len(own), max(components[k].fellows for k in own)) for own in self.kinds
-        )
+        # Of each kind the number of its places, and its components.
+        self.kinds = [
+            (max(len(own), *(components[k].fellows for k in own)), np.array(own))
+            for own in kinds.values()
+        ]
         self.sought = np.array([c.sought for c in components])
         self.precision = np.zeros((len(components), len(components)))
-        for own in self.kinds:
-            self.precision[np.ix_(own, own)] = np.linalg.inv(
-                ALONE**2 * np.eye(len(own)) + COMMON**2
-            )
+        for _, own in self.kinds:
+            apart = ALONE**2 * np.eye(len(own)) + COMMON**2
+            self.precision[np.ix_(own, own)] = np.linalg.inv(apart)
 
     @property
     def cost(self) -> float:
         """Nats that all of them have to earn."""
-        return float(self.sought.sum()) + sum(
-            _cost(n, len(own)) for n, own in zip(self.places, self.kinds, strict=True)
-        )
+        return float(self.sought.sum()) + sum(_cost(n, len(own)) for n, own in self.kinds)
 
     @cached_property
     def costs(self) -> Array:
         """Nats (K,) that each has to earn, the others there."""
         out = self.sought.copy()
-        for n, own in zip(self.places, self.kinds, strict=True):
+        for n, own in self.kinds:
             out[own] += _cost(n, len(own)) - _cost(n, len(own) - 1)
         return out
 
     def costs_of(self, earned: Array) -> Array:
         """The same; where a kind as a whole does not earn its cost (K,), its mean for each."""
         out = self.costs.copy()
-        for n, own in zip(self.places, self.kinds, strict=True):
+        for n, own in self.kinds:
             whole = _cost(n, len(own))
             if (earned - self.sought)[own].sum() < whole:
                 out[own] = np.maximum(out[own], whole / len(own) + self.sought[own])
@@ -216,19 +222,15 @@ def presence_cost(n: int, k: int) -> float:
 
 def log_odds(components: Sequence[Component], another: Component) -> float:
     """Prior log odds that another component is there beside these, less what its search cost."""
-    pool = Pool([*components, another])
-    (k, n), *_ = [
-        (len(own), n) for n, own in zip(pool.places, pool.kinds, strict=True)
-        if len(components) in own
-    ]  # fmt: skip
+    kinds = Pool([*components, another]).kinds
+    n, k = next((n, len(own)) for n, own in kinds if len(components) in own)
     return presence_cost(n, k - 1) - presence_cost(n, k) - another.sought
 
 
 class Across(NamedTuple):
     """Of columns C (C, m, k) under a noise: XᵀV⁻¹C (p, k) of those that they stand beside, CᵀV⁻¹C
-    (k, k) and CᵀV⁻¹r (k,).  `columns` are the given ones."""
+    (k, k) and CᵀV⁻¹r (k,)."""
 
-    columns: Array
     beside: Array
     own: Array
     z: Array
@@ -243,82 +245,64 @@ class SumOfComponents:
     """Components beside the data's own columns, under a noise whose factor is free: −2ℓ and its
     slope.
 
-    `weighted` is the data whitened by that `noise`; its M and z hold the components last, which
-    are not kept as rows.
+    Of the data under that `noise` V: `inverse` V⁻¹ (C, m, m), zero where rows do not count;
+    `products` with the components last; and what of −2ℓ no coefficient changes.
     """
 
     data: NoisyData
     components: tuple[Component, ...]
     noise: NoiseValues
-    weighted: Weighted
-    _known: dict[int, Across] = field(init=False, default_factory=dict, repr=False)
-
-    @property
-    def products(self) -> Products:
-        return self.weighted.products
+    inverse: Array
+    products: Products
+    constant: float
 
     @cached_property
     def spans(self) -> tuple[slice, ...]:
         return spans_of([c.width for c in self.components], len(self.products.z))
 
-    @cached_property
-    def waved(self) -> IntArray:
-        """Those components (W,) that have a length."""
-        return np.array([k for k, c in enumerate(self.components) if c.waves is not None], int)
-
-    @cached_property
-    def sized(self) -> Array:
-        """By how much (p + Σ k, K + W) the logarithms of prior variances grow with those of sizes;
-        zero where lengths stand."""
-        out = np.zeros((len(self.products.z), len(self.components) + len(self.waved)))
-        for k, span in enumerate(self.spans):
-            out[span, k] = 2.0
-        return out
-
     def scaled(self, factor: float) -> SumOfComponents:
         """The same under e^factor times the noise."""
-        w, own, a = self.weighted, self.products, float(np.exp(factor))
+        own, a = self.products, float(np.exp(factor))
         products = Products(own.M / a**2, own.z / a**2, own.squares / a**2, own.rows)
-        constant = w.constant + 2 * own.rows * factor
-        weighted = Weighted(w.root / a, w.X / a, w.r / a, products, constant)
         noise = replace(self.noise, factor=self.noise.factor * a, joint=self.noise.joint * a)
-        return replace(self, weighted=weighted, noise=noise)
+        constant = self.constant + 2 * own.rows * factor
+        return replace(
+            self, noise=noise, inverse=self.inverse / a**2, products=products, constant=constant
+        )
 
     def only(self, kept: Sequence[int]) -> SumOfComponents:
         every, own = self.products, np.arange(len(self.data.precision))
         index = np.concatenate([own, np.r_[(slice(0, 0), *(self.spans[k] for k in kept))]])
         products = replace(every, M=every.M[np.ix_(index, index)], z=every.z[index])
-        narrow = replace(self.weighted, products=products)
-        return replace(self, weighted=narrow, components=tuple(self.components[k] for k in kept))
+        return replace(self, components=tuple(self.components[k] for k in kept), products=products)
 
     @cached_property
     def pool(self) -> Pool:
         return Pool(self.components)
 
-    def white(self, columns: Array) -> Array:
-        """V⁻¹C (C·m, k) of other columns C (C, m, k)."""
-        return _rows(self._inverse @ self.data.masked(columns))
+    def _beside(self, columns: Array) -> Across:
+        """Of columns beside the data's own and the components'."""
+        white = _rows(self.inverse @ columns)
+        others = (self.data.X, *(c.columns for c in self.components))
+        across = np.concatenate([_rows(C).T @ white for C in others])
+        return Across(across, _rows(columns).T @ white, white.T @ self.data.r.ravel())
 
-    @cached_property
-    def _inverse(self) -> Array:
-        """V⁻¹ (C, m, m)."""
-        root = self.weighted.root
-        return root.transpose(0, 2, 1) @ root
+    def across(self, columns: Sequence[Array]) -> Iterator[Across]:
+        """Of each of these columns."""
+        for some in (columns[k : k + BUNDLE] for k in range(0, len(columns), BUNDLE)):
+            each = self._beside(side_by_side(self.data, some))
+            for at in spans_of([c.shape[2] for c in some], len(each.z)):
+                yield Across(each.beside[:, at], each.own[at, at], each.z[at])
 
-    def across(self, columns: Sequence[Array]) -> list[Across]:
-        """Of each of these columns beside the data's own and the components'; kept, since a search
-        comes back to the same ones."""
-        if new := [c for c in columns if id(c) not in self._known]:
-            every = side_by_side(self.data, [self.data.X, *(c.columns for c in self.components)])
-            every, r = _rows(every), self.data.r.ravel()
-            for some in (new[k : k + BUNDLE] for k in range(0, len(new), BUNDLE)):
-                joined = side_by_side(self.data, some)
-                white = self.white(joined)
-                across, z = every.T @ white, white.T @ r
-                for c, span in zip(some, spans_of([c.shape[2] for c in some], len(z)), strict=True):
-                    own = _rows(joined[:, :, span]).T @ white[:, span]
-                    self._known[id(c)] = Across(c, across[:, span], own, z[span])
-        return [self._known[id(c)] for c in columns]
+    def joined(self, more: Sequence[Component]) -> SumOfComponents:
+        """The sum with these as well."""
+        out = self
+        for some in (more[k : k + BUNDLE] for k in range(0, len(more), BUNDLE)):
+            new = out._beside(side_by_side(self.data, [c.columns for c in some]))
+            M = np.block([[out.products.M, new.beside], [new.beside.T, new.own]])
+            products = replace(out.products, M=M, z=np.append(out.products.z, new.z))
+            out = replace(out, components=(*out.components, *some), products=products)
+        return out
 
     def variances(self, at: Sizes) -> Array:
         """Prior variances of all coefficients (p + Σ k,)."""
@@ -329,7 +313,7 @@ class SumOfComponents:
     def factored(self, at: Sizes) -> tuple[Standardised, float]:
         """The coefficients under e^factor times the noise, and −2ℓ."""
         found = self.products.at(self.variances(at), at.factor)
-        return found, self.weighted.constant + self.products.value(found)
+        return found, self.constant + self.products.value(found)
 
     def objective(self, theta: Array) -> tuple[float, Array, Array]:
         """−2 log posterior of the logarithms, its slope and its average information (1 + 2 K,
@@ -339,17 +323,13 @@ class SumOfComponents:
         With A the coefficients' precision in units of their prior deviations and b their mean, two
         parameters that change the logarithms of prior variances by s and t share sᵀb(1 − A⁻¹)bt.
         """
-        K, waved = len(self.components), self.waved
-        at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
-        grown = self.sized.copy()  # of the logarithms of prior variances
-        for n, k in enumerate(waved, K):
-            grown[self.spans[k], n] = self.components[k].shares(at.length[k])[1]
-        value, own, between = self.products.objective(self.variances(at), grown, at.factor)
-        index = np.concatenate([np.arange(1 + K), 1 + K + waved])
-        slope, information = np.zeros_like(theta), np.zeros((len(theta), len(theta)))
-        slope[index], information[np.ix_(index, index)] = own, between
+        K, at = len(self.components), Sizes.of(theta)
+        grown = np.zeros((len(self.products.z), 2 * K))  # the logarithms of prior variances
+        for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
+            grown[span, k], grown[span, K + k] = 2.0, c.shares(at.length[k])[1]
+        value, slope, information = self.products.objective(self.variances(at), grown, at.factor)
         prior, of_sizes = self.pool.penalty(at.size)
-        value += self.weighted.constant + prior
+        value += self.constant + prior
         slope[1 : K + 1] += of_sizes
         information[1 : K + 1, 1 : K + 1] += 2 * self.pool.precision
         if self.data.stated:
@@ -370,8 +350,7 @@ class SumOfComponents:
             lower[1:] = np.concatenate([np.full(K, GONE - 1), lengths[:, 0]])
             most = [min(LARGEST, float(np.log(c.effect.most))) for c in self.components]
             upper[1:] = np.concatenate([most, lengths[:, 1]])
-        x = climb(self.objective, theta, lower, upper, enough, STEPS)[0]
-        return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
+        return Sizes.of(climb(self.objective, theta, lower, upper, enough, STEPS)[0])
 
     def earned(self, at: Sizes) -> tuple[Array, Array]:
         """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
@@ -392,8 +371,8 @@ def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
 
 
 # Groups of columns that are multiplied together, since a few columns by themselves wait for memory,
-# and numbers that are whitened at a time.
-BUNDLE, PIECE = 12, 2_000_000
+# and all columns of thousands of poses would take hundreds of megabytes.
+BUNDLE = 12
 
 
 def posed(
@@ -404,41 +383,12 @@ def posed(
 
     What a sum that is `known` of the same data has summed up under this noise is not summed anew.
     """
-    p, widths = data.X.shape[2], [c.width for c in components]
-    total = p + sum(widths)
-    spans = spans_of(widths, total)
-    if known is not None and known.noise is noise:
-        own, old = known.weighted, dict(zip(map(id, known.components), known.spans, strict=True))
-        M, z = np.empty((total, total)), np.empty(total)
-        there = [k for k, c in enumerate(components) if id(c) in old]
-        at = np.r_[(slice(0, p), *(spans[k] for k in there))]
-        before = np.r_[(slice(0, p), *(old[id(components[k])] for k in there))]
-        M[np.ix_(at, at)] = own.products.M[np.ix_(before, before)]
-        z[at] = own.products.z[before]
-        new = [k for k, c in enumerate(components) if id(c) not in old]
-        if new:
-            columns = side_by_side(data, [components[k].columns for k in new])
-            white = known.white(columns)
-            parts = (data.X, *(c.columns for c in components))
-            own_columns = np.r_[tuple(spans[k] for k in new)]
-            M[:, own_columns] = np.concatenate([_rows(X).T @ white for X in parts])
-            M[own_columns], z[own_columns] = M[:, own_columns].T, white.T @ data.r.ravel()
-    else:
-        own, M, z = Weighted.of(data, noise), np.zeros((total, total)), np.zeros(total)
-        # In pieces: all columns of thousands of poses would take hundreds of megabytes.
-        piece = max(1, PIECE // (data.r.shape[1] * total))
-        for some in (slice(k, k + piece) for k in range(0, len(data.r), piece)):
-            X = np.empty((*own.r[some].shape, total))
-            X[:, :, :p] = own.X[some]
-            # Rows that do not count are left out once, not of every component's columns.
-            root = own.root[some] * ~data.left_out[some, None, :]
-            for c, span in zip(components, spans, strict=True):
-                np.matmul(root, c.columns[some], out=X[:, :, span])
-            flat = _rows(X)
-            M += flat.T @ flat
-            z += flat.T @ own.r[some].ravel()
-    summed = replace(own, products=replace(own.products, M=M, z=z))
-    return SumOfComponents(data, tuple(components), noise, summed)
+    if known is None or known.noise is not noise:
+        own = Weighted.of(data, noise)
+        inverse = own.root.transpose(0, 2, 1) @ own.root
+        known = SumOfComponents(data, (), noise, inverse, own.products, own.constant)
+    wide = known.joined([c for c in components if c not in known.components])
+    return wide.only([wide.components.index(c) for c in components])
 
 
 def _rows(columns: Array) -> Array:
@@ -449,13 +399,11 @@ def _rows(columns: Array) -> Array:
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
 
-    `earned` (K,) nats of each; `sums` are those
-    over the rows of the data, which are without their columns, `variances` (Σ k,) their
-    coefficients' prior.  `complete` are the components whose kinds have been tried at all their
-    places beside it.
+    `earned` (K,) nats of each; `sums` are those over the rows of the data, which are without their
+    columns, `variances` (Σ k,) their coefficients' prior.  `complete` are the components whose
+    kinds have been tried at all their places beside it.
     """
 
-    components: tuple[Component, ...]
     sizes: Sizes
     noise: NoiseValues
     earned: Array
@@ -463,6 +411,10 @@ class FittedSum:
     sums: SumOfComponents
     variances: Array
     complete: Sequence[Component] = ()
+
+    @property
+    def components(self) -> tuple[Component, ...]:
+        return self.sums.components
 
     @cached_property
     def data(self) -> NoisyData:
@@ -472,10 +424,10 @@ class FittedSum:
 
     @cached_property
     def _shown(self) -> tuple[Array, ...]:
-        plain, root = self.sums.data, self.sums.weighted.root
+        plain, inverse = self.sums.data, self.sums.inverse
         priors = np.append(1 / plain.precision, self.variances)
         return tuple(
-            _compressed(plain.masked(c.columns), priors[span], root, HARDLY)
+            _compressed(plain.masked(c.columns), priors[span], inverse, HARDLY)
             for c, span in zip(self.components, self.spans, strict=True)
         )
 
@@ -484,13 +436,15 @@ class FittedSum:
         """Where each component's coefficients stand among those of the data, last of all."""
         return self.sums.spans
 
+    def away(self, components: Sequence[Component]) -> list[Component]:
+        """Those of these components that are not in it."""
+        return [c for c in components if c not in self.components]
+
     def without_these(self, some: Sequence[Component] = ()) -> NoisyData:
         """The data beside all but some of the components, these by the directions that show: half
         as many columns, for searches."""
-        columns = [
-            shown for c, shown in zip(self.components, self._shown, strict=True)
-            if not any(c is other for other in some)
-        ]  # fmt: skip
+        every = zip(self.components, self._shown, strict=True)
+        columns = [shown for c, shown in every if c not in some]
         joined = side_by_side(self.sums.data, columns)
         return self.sums.data.with_columns(joined, np.ones(joined.shape[2]))
 
@@ -507,17 +461,15 @@ def fit_sum(
     """Maximise over all sizes; leave out, one after the other, what does not earn its cost.
 
     `known` are the sums of a fit to the same data, which are not summed anew."""
-    components, at = list(components), start or Sizes.start(components)
-    rounds = 2 if refit_noise and start is None else 1
+    at, rounds = start or Sizes.start(components), 2 if refit_noise and start is None else 1
     problem = posed(data, components, noise, known)
     for last in range(rounds):
         enough = ROUGHLY
         for _ in range(ROUNDS):
             at = problem.climbed(at, enough)
             kept = _kept(problem, at, strict=last == rounds - 1)
-            if len(kept) < len(components):
-                components, at = [components[k] for k in kept], at.chosen(kept)
-                problem, enough = problem.only(kept), ROUGHLY
+            if len(kept) < len(problem.components):
+                problem, at, enough = problem.only(kept), at.chosen(kept), ROUGHLY
             elif enough == SETTLED:
                 break
             else:
@@ -525,16 +477,14 @@ def fit_sum(
         problem, at = problem.scaled(at.factor), replace(at, factor=0.0)
         if refit_noise:
             problem = _under_own_noise(problem, at)
-        if not components:
+        if not problem.components:
             break
     return at_maximum(problem, at)
 
 
 def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
-    data = problem.data
-    noise = _noise_beside(data, problem.components, at, problem.noise)
-    found = posed(data, problem.components, noise)
-    if len(data.r) < 2 * SOME:
+    found = posed(problem.data, problem.components, _noise_beside(problem, at))
+    if len(problem.data.r) < 2 * SOME:
         return found
     # Some of the configurations do not tell its size as all do: a sum under it would be worth less
     # than the next one, whose factor is free.
@@ -548,7 +498,7 @@ def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)
     (earned, within), own = problem.earned(at), variances[len(problem.data.precision) :]
     score += float(within.sum())
-    return FittedSum(problem.components, at, problem.noise, earned, score, problem, own)
+    return FittedSum(at, problem.noise, earned, score, problem, own)
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
@@ -567,15 +517,13 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     return [k for k in range(len(spare)) if not gone[k]]
 
 
-def _noise_beside(
-    data: NoisyData, components: Sequence[Component], at: Sizes, noise: NoiseValues
-) -> NoiseValues:
+def _noise_beside(problem: SumOfComponents, at: Sizes) -> NoiseValues:
     """The most probable noise beside the components at their sizes, from SOME configurations."""
+    data, noise, variances = problem.data, problem.noise, problem.variances(at)
     some = data.every(step) if (step := max(1, len(data.r) // SOME)) > 1 else data
-    root = Weighted.of(some, noise).root
     columns = [
-        _compressed(some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], root)
-        for c, s, length in zip(components, at.size, at.length, strict=True)
+        _compressed(some.masked(c.columns[::step]), variances[span], problem.inverse[::step])
+        for c, span in zip(problem.components, problem.spans, strict=True)
     ]
     joined = side_by_side(some, columns)
     wide = some.with_columns(joined, np.ones(joined.shape[2]))
@@ -597,12 +545,11 @@ STANDS_OUT = 2.0  # times its usual scatter: a joint that the data show
 FAINT, HARDLY = 1e-2, 1e-4
 
 
-def _compressed(columns: Array, variances: Array, root: Array, faint: float = FAINT) -> Array:
+def _compressed(columns: Array, variances: Array, inverse: Array, faint: float = FAINT) -> Array:
     """The few directions (C, m, k) of a component that show beside the noise, of unit variance;
-    `root` is K⁻¹ of its V = KKᵀ."""
+    `inverse` is that of its V."""
     scaled = columns * np.sqrt(variances)
-    white = (root @ scaled).reshape(-1, scaled.shape[2])
-    values, vectors = np.linalg.eigh(white.T @ white)
+    values, vectors = np.linalg.eigh(_rows(scaled).T @ _rows(inverse @ scaled))
     return np.asarray(scaled @ vectors[:, values > faint])
 
 
@@ -622,12 +569,9 @@ def _compressed(columns: Array, variances: Array, root: Array, faint: float = FA
 # those along the links are large, all alike, those across them next to nothing.
 
 GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
-SIZES = np.exp(GRID)
+SIZES, LOGS = np.exp(GRID), np.append(GRID, -np.inf)  # the logarithm of none as well
 SPREADS = np.linspace(0.1, 0.9, 9) * SPREAD  # what sizes of a kind may spread by
 SETTLING = 30  # sweeps
-
-# A component's number, and that of its column where each has a size, else 0.
-Key = tuple[int, int]
 
 
 def drawn(
@@ -645,21 +589,23 @@ def drawn(
     L = linalg.cholesky(M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
     across = linalg.solve_triangular(L, M[np.ix_(x, c)], lower=True)
     S = M[np.ix_(c, c)] - across.T @ across
-    kinds = _kinds(components, own)
-    spans = {key: span for kind in kinds for key, span in kind.spans.items()}
-    sizes = {(k, i): float(found.sizes.size[k]) for k, i in spans if k < len(found.components)}
+    logs = np.append(found.sizes.size, np.full(len(hidden), -np.inf))
+    kinds = list(_kinds(components, own, logs))
     sized = np.full(len(c), np.inf)  # prior precisions; infinite where there is nothing
-    for key, size in sizes.items():
-        sized[spans[key]] = np.exp(-2 * size)
+    for kind in kinds:
+        for log, span in zip(kind.logs, kind.spans, strict=True):
+            sized[span] = np.exp(-2 * log)
     out, z = np.zeros((len(prior), n)), linalg.solve_triangular(L, right[x], lower=True)
     t = right[c] - across.T @ z
     for sweep in range(-SETTLING, n):
         for kind in kinds:
-            spread = kind.spread(sizes, rng)
-            for key in kind.spans:
-                sizes.pop(key, None)
-                evidence = np.append(_at_sizes(S, t, sized, spans[key]), 0.0)
-                sized[spans[key]] = np.exp(-2 * kind.choose(key, evidence, sizes, spread, rng))
+            # Any spread is as probable as another beforehand.
+            spread = float(SPREADS[_one_of(_log_density(kind.present, SPREADS), rng)])
+            for k, span in enumerate(kind.spans):
+                kind.logs[k] = -np.inf
+                evidence = np.append(_at_sizes(S, t, sized, span), 0.0)
+                kind.logs[k] = LOGS[_one_of(evidence + kind.log_prior(k, spread), rng)]
+                sized[span] = np.exp(-2 * kind.logs[k])
         if sweep < 0:
             continue
         beta = out[:, sweep]
@@ -676,67 +622,52 @@ def drawn(
 class _Kind:
     """What has sizes that are alike: a kind's components, or an effect's parameters.
 
-    Its members' `spans` of the columns; what finding them `sought`; at how many `places` there may
-    be one, none where it is there in any case.
+    Its members' `spans` of the columns and `logs` (k,) of their sizes, −∞ of none; what finding
+    them `sought` (k,); at how many `places` there may be one, None where it is there in any case.
     """
 
-    spans: Mapping[Key, slice]
-    sought: Mapping[Key, float]
+    spans: Sequence[slice]
+    logs: Array
+    sought: Array
     places: int | None
 
-    def choose(
-        self, key: Key, evidence: Array, sizes: dict[Key, float], spread: float,
-        rng: np.random.Generator,
-    ) -> float:  # fmt: skip
-        """A size of `key` beside `sizes`, to which it is added, by its log evidence at those on the
-        GRID and at none; the logarithm, −∞ of none."""
-        chosen = _one_of(evidence + self.log_prior(key, sizes, spread), rng)
-        if chosen == len(GRID):
-            return -np.inf
-        sizes[key] = float(GRID[chosen])
-        return sizes[key]
+    @property
+    def present(self) -> Array:
+        return self.logs[self.logs > -np.inf]
 
-    def _logs(self, sizes: Mapping[Key, float]) -> Array:
-        return np.array([sizes[key] for key in self.spans if key in sizes])
-
-    def spread(self, sizes: Mapping[Key, float], rng: np.random.Generator) -> float:
-        """One of SPREADS, any of them as probable beforehand."""
-        return float(SPREADS[_one_of(_log_density(self._logs(sizes), SPREADS), rng)])
-
-    def log_prior(self, key: Key, sizes: Mapping[Key, float], spread: float) -> Array:
-        """Of another size on the GRID beside `sizes`, and of none."""
-        others = self._logs(sizes)
+    def log_prior(self, k: int, spread: float) -> Array:
+        """Of every size on the GRID for member k beside those present, and of none."""
         # Of m that have spread² their own and the rest of SPREAD² in common, the next one.
-        m, common = len(others), SPREAD**2 - spread**2
+        m, common = len(self.present), SPREAD**2 - spread**2
         known = common / (spread**2 + m * common)
-        mean, variance = known * others.sum(), spread**2 * (1 + known)
+        mean, variance = known * self.present.sum(), spread**2 * (1 + known)
         out = np.log((GRID[1] - GRID[0]) / np.sqrt(2 * np.pi * variance))
         out = out - 0.5 * (GRID - mean) ** 2 / variance
         if self.places is None:
             return np.append(out, -np.inf)
         cost = presence_cost(self.places, m + 1) - presence_cost(self.places, m)
-        return np.append(out - cost - self.sought[key], 0.0)
+        return np.append(out - cost - self.sought[k], 0.0)
 
 
-def _kinds(components: Sequence[Component], own: Sequence[int]) -> list[_Kind]:
-    """The kinds of these of all components; their spans are those among the columns of `own`."""
+def _kinds(components: Sequence[Component], own: Sequence[int], logs: Array) -> Iterator[_Kind]:
+    """The kinds of these of all components, whose sizes have these `logs`; their spans are those
+    among the columns of `own`."""
     widths = [components[k].width for k in own]
     spans = dict(zip(own, spans_of(widths, sum(widths)), strict=True))
-    pool, out = Pool(components), []
-    for members, places in zip(pool.kinds, pool.places, strict=True):
+    pool = Pool(components)
+    for places, members in pool.kinds:
         mine = [k for k in members.tolist() if k in spans]
+        free = [k for k in mine if not components[k].given]
         for k in (k for k in mine if components[k].given):
             h = components[k].hypothesis
             assert h is not None
             # Of its parameters those that are of similar sizes together.
             words = np.array([p.alike for p in h.parameters])
             for word in np.unique(words):
-                columns = (spans[k].start + np.flatnonzero(words == word)).tolist()
-                out.append(_Kind({(k, i): slice(i, i + 1) for i in columns}, {}, None))
-        free = [k for k in mine if not components[k].given]
-        sought = {(k, 0): float(pool.sought[k]) for k in free}
-        out.append(_Kind({(k, 0): spans[k] for k in free}, sought, places))
-    return out
+                columns = spans[k].start + np.flatnonzero(words == word)
+                same = [slice(i, i + 1) for i in columns.tolist()]
+                yield _Kind(same, np.full(len(same), logs[k]), np.zeros(len(same)), None)
+        yield _Kind([spans[k] for k in free], logs[free], pool.sought[free], places)
 
 
 def _one_of(log_p: Array, rng: np.random.Generator) -> int:
@@ -748,13 +679,9 @@ def _log_density(logs: Array, spread: Array) -> Array:
     """Of the logarithms (k,) of sizes at each spread of their own, but for a constant: k − 1 times
     they vary by it, their mean by what it leaves of SPREAD."""
     k, own = len(logs), spread**2
-    if k == 0:
-        return np.zeros_like(spread)
-    mean = own + k * (SPREAD**2 - own)
-    squares = (logs**2).sum() - logs.sum() ** 2 / k
-    return np.asarray(
-        -0.5 * ((k - 1) * np.log(own) + np.log(mean) + squares / own + logs.sum() ** 2 / k / mean)
-    )
+    mean, of_mean = own + k * (SPREAD**2 - own), logs.sum() ** 2 / max(k, 1)
+    squares = (k - 1) * np.log(own) + ((logs**2).sum() - of_mean) / own
+    return np.asarray(-0.5 * (squares + np.log(mean) + of_mean / mean))
 
 
 def _at_sizes(S: Array, t: Array, sized: Array, span: slice) -> Array:

@@ -126,12 +126,9 @@ def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
         values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
         if hints := effect_of(f.effect).hints(f.where, values):
             model.setdefault("nominal", {}).update(hints)
-        if f.settings:
-            places = model.setdefault("nominal", {}).setdefault("settings", {})
-            places[f.where] = places.get(f.where, {}) | f.settings
-        if f.sizes:
-            places = model.setdefault("nominal", {}).setdefault("sizes", {})
-            places[f.where] = places.get(f.where, {}) | f.sizes
+        for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
+            if found_there:
+                _join(model, {"nominal": {key: {f.where: found_there}}})
 
 
 def _redirect(data: dict[str, Any], old: Path, new: Path) -> None:
@@ -236,7 +233,11 @@ def _diagnosed(
 ) -> Diagnosis:
     given, source = model, table.source
     check_table(model, table)
-    _check_enough(table)
+    if (n := len(np.unique(table.configuration))) < FEWEST:
+        raise InsufficientDataError(
+            f"{source}: {n} configurations are too few to tell a missing effect from noise; "
+            f"measure {FEWEST} at least, better 30 or more"
+        )
     table, told = without_copies(table)
     table, left_out = thinned(table)
     model = with_recorded_drivers(model, table)
@@ -321,7 +322,8 @@ def _sum_of_all(
     if (searched := summed(few.before, {*options.without})) is None:
         return None, 0.0, ()
     answer, over = searched
-    if over > CLEARLY + max(chosen.score - nothing, 0.0) and answer.n_causes >= MANY:
+    n_causes = len({(c.family, c.where) for c in answer.found.components})
+    if over > CLEARLY + max(chosen.score - nothing, 0.0) and n_causes >= MANY:
         return answer, over, ()
     causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
@@ -331,7 +333,9 @@ def _sum_of_all(
         bare = replace(few.before, hypotheses=tuple(known))
         if (searched := summed(bare, {*options.without, *causes})) is not None:
             answer, _ = searched
-    return None, 0.0, answer.without_names
+    # Curves, lines and what has no name correct the arm though the verdict knows no cause of them.
+    correcting = (f for f in answer.effects if corrects(effect_of(f.effect)))
+    return None, 0.0, (*correcting, *answer.fields)
 
 
 def _pieces(
@@ -393,12 +397,3 @@ def _searched(
             progress("searching again without outliers")
             search, found = search_without(faulty)
     return dataset.without(faulty), search, found, suspects
-
-
-def _check_enough(table: Measurements) -> None:
-    n = len(np.unique(table.configuration))
-    if n < FEWEST:
-        raise InsufficientDataError(
-            f"{table.source}: {n} configurations are too few to tell a missing effect from noise; "
-            f"measure {FEWEST} at least, better 30 or more"
-        )

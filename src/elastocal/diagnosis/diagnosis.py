@@ -559,22 +559,13 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
 
 
 def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:
-    near, units = noise.near_repeats, {"revolute": "rad"}
-    return {
-        "stated": noise.stated,
-        "stated_factor": noise.stated_factor,
+    near, joints = noise.near_repeats, zip(noise.repeatability, model.chain.kinds, strict=True)
+    return _in_um(noise, "reading_sigma", "drift", "pure_error") | {
         "ratio_to_stated": noise.ratio_to_stated if noise.stated else None,
-        "reading_sigma_um": _um(noise.reading_sigma),
         "repeatability": [
-            {"where": f"joint{i}", "value": value, "unit": units.get(kind, "m")}
-            for i, (value, kind) in enumerate(
-                zip(noise.repeatability, model.chain.kinds, strict=True), 1
-            )
+            {"where": f"joint{i}", "value": value, "unit": "rad" if kind == "revolute" else "m"}
+            for i, (value, kind) in enumerate(joints, 1)
         ],
-        "shared": noise.shared,
-        "shared_by_joint": noise.shared_by_joint,
-        "drift_um": _um(noise.drift),
-        "pure_error_um": _um(noise.pure_error),
         "near_repeat_um": near and _um(near.scatter),
         "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),
         "faulty": [_in_um(reading, "error") for reading in noise.faulty],

@@ -3,7 +3,7 @@ a name or without."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -145,35 +145,18 @@ class DiagnosisData:
         return np.zeros(0) if time is None else moments_between(time[self.present.ravel()])
 
     def direction(self, h: Hypothesis, settings: Array) -> Array:
-        """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
-        where it is the same in all visits of a configuration."""
+        """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …)."""
         key = *h.key, settings.tobytes()
         known = self.columns.directions
         if key in known:
             return known[key]
-        visits, present = self._driven_visits[h.key]
-        D = self.directions[h.key](visits, settings)
-        D = D.reshape(*present.shape, *D.shape[1:]).transpose(0, 1, 3, 2, 4)
+        D = self.directions[h.key](self.visit_table, settings)
+        D = D.reshape(*self.present.shape, *D.shape[1:]).transpose(0, 1, 3, 2, 4)
         D = np.multiply(D, self.sizes[h.key], order="C")
-        D[~present] = 0.0
+        D[~self.present] = 0.0
         if D.size + sum(other.size for other in known.values()) <= KEPT:
             known[key] = D
         return D
-
-    @cached_property
-    def _driven_visits(self) -> dict[tuple[str, str], tuple[Measurements, BoolArray]]:
-        """Of each driven hypothesis the visits (C·v) that its direction is evaluated at and which
-        of them there are (C, v): one of each configuration where it is the same in the others."""
-        every, present = self.visit_table, self.present
-        first = np.zeros_like(present)
-        first[:, 0] = True
-        one_each = every.take(first.ravel())
-        out = {}
-        for key, direction in self.directions.items():
-            asked = direction.asked(every).reshape(*present.shape, -1)
-            same = (asked == asked[:, :1]) | ~present[:, :, None]
-            out[key] = (one_each, present[:, :1]) if same.all() else (every, present)
-        return out
 
     def packed(self, h: Hypothesis | Generic, settings: Array = NO_SETTINGS.values[0]) -> Array:
         """Columns (C, m, k) of a hypothesis at one value of its `settings` (…,), scaled, or of a
@@ -277,17 +260,14 @@ def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
     It is noise that neighbours in time have in common: left out, it passes for an effect that goes
     with time.
     """
-    observed, blocks = base.observed, base.blocks
-    n, size, found = len(observed.lead), observed.size, []
-    if base.model.cell.noise.drift:
-        some = subset(observed, np.arange(n) < base.n_measured)
-        found = stated_deviations(base.model, some, base.x, (TIME,))
-    if not found:
-        return np.zeros((n, size, 0)), 0.0
-    waves = found[0].waves
-    assert waves is not None
+    observed, member, n = base.observed, base.blocks.member, len(base.observed.lead)
+    some = subset(observed, np.arange(n) < base.n_measured)
+    drifts = base.model.cell.noise.drift > 0
+    found = stated_deviations(base.model, some, base.x, (TIME,)) if drifts else ()
+    if not found or (waves := found[0].waves) is None:
+        return np.zeros((n, observed.size, 0)), 0.0
     drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])
-    loading = found[0].packed(np.where(blocks.member < base.n_measured, blocks.member, -1))
+    loading = found[0].packed(np.where(member < base.n_measured, member, -1))
     return drift, loading @ loading.transpose(0, 2, 1)
 
 
@@ -358,31 +338,25 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
     for i in joints:
         if approach is None:
             break
-        a = approach[:, :, i]
+        a, size = approach[:, :, i], np.abs(torque[:, :, i])
         by = [a] if load is None else [a, a * load]
-        size = np.abs(torque[:, :, i])
         if size.max() > 0:
             by.append(a * size / size.max())
         yield Covariate("approach", f"approach of joint{i + 1}", np.stack(by, axis=2), joint=i)
-    yield from _of_stiffness(q, {i: torque[:, :, i] for i in loaded}, present, slow)
+    # A stiffness that changes with the joint's own angle, or with time.
+    for i in loaded:
+        name, own = f"joint{i + 1} torque", torque[:, :, i, None]
+        tau = own / np.abs(own[present]).max()
+        by_angle = waves(q[:, :, i], present, WAVES - FEW_WAVES) * tau
+        yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
+        if slow is not None:
+            yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
     for i in joints:
         if slow is None:
             break
         product = few[i][:, :, :, None] * slow[:, :, None, :]
         both = product.reshape(*product.shape[:2], -1)
         yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
-
-
-def _of_stiffness(
-    q: Array, torque: Mapping[int, Array], present: BoolArray, slow: Array | None
-) -> Iterator[Covariate]:
-    """A stiffness that changes with the joint's own angle, or with time."""
-    for i, own in torque.items():
-        name, tau = f"joint{i + 1} torque", (own / np.abs(own[present]).max())[:, :, None]
-        by_angle = waves(q[:, :, i], present, WAVES - FEW_WAVES) * tau
-        yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
-        if slow is not None:
-            yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
 
 
 def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Array]]:
@@ -543,15 +517,13 @@ def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:
         rows = np.einsum("nsd,nf->nsdf", columns, functions)
         return dataset.pack(rows.reshape(*columns.shape[:2], -1))
 
-    yield Generic("field", "position in the workspace", "tracker", "tracker",
-                  columns=of_rows(shift, field))  # fmt: skip
+    columns = of_rows(shift, field)
+    yield Generic("field", "position in the workspace", "tracker", "tracker", columns=columns)
     # The unit vector from each marker to the instrument, in the flange frame.
     R = base.model.flange_poses(table, base.x)[:, :3, :3]
-    line = cell.tracker.position - table.position
-    line = line / np.linalg.norm(line, axis=1, keepdims=True)
+    line = -offset / np.linalg.norm(offset, axis=1, keepdims=True)
     view = monomials(np.einsum("nij,ni->nj", R, line)) * MOTION
     for marker in cell.tool.markers:
         place = f"marker:{marker}"
-        E = dataset.columns.entry(("marker_motion", (place,)))
-        yield Generic("view", f"angle of view of {marker}", place, "tool",
-                      columns=of_rows(E, view))  # fmt: skip
+        columns = of_rows(dataset.columns.entry(("marker_motion", (place,))), view)
+        yield Generic("view", f"angle of view of {marker}", place, "tool", columns=columns)

@@ -190,23 +190,18 @@ def with_pool(
     """
     table = base.observed.table
     observed = observe(joined(table, pool.table), base.model.observe)
-    n, size, stated = len(base.observed.lead), observed.size, base.covariance
-    marker = table.marker[base.observed.lead]
-    usual = np.zeros((len(table.marker_names), size, size))
-    usual[:] = stated.mean(axis=0)
-    for k in np.unique(marker):
-        usual[k] = stated[marker == k].mean(axis=0)
-    later = observed.table.marker[observed.lead[n:]]
+    n, stated, marker = len(base.observed.lead), base.covariance, table.marker[base.observed.lead]
+    usual = {k: stated[marker == k].mean(axis=0) for k in np.unique(marker).tolist()}
+    later = observed.table.marker[observed.lead[n:]].tolist()
+    planned = np.array([usual.get(k, stated.mean(axis=0)) for k in later])
     both = replace(
-        base, observed=observed, stated=np.concatenate([stated, usual[later]]),
-        residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
+        base, observed=observed, stated=np.concatenate([stated, planned]), planned=len(later),
+        residual=np.concatenate([base.residual, np.zeros(observed.size * len(later))]),
     )  # fmt: skip
     dataset, noise = as_diagnosed(diagnosis_data_of(both, suspects.hypotheses), suspects.diagnosis)
     hidden = np.concatenate([np.zeros(len(table), dtype=bool), pool.hidden])[observed.lead]
     dataset = dataset.without(dataset.data.faulty | hidden)
-    blocks, measured = dataset.blocks, len(np.unique(table.configuration[base.observed.lead]))
-    planned = np.isin(np.arange(blocks.n), blocks.member[measured:])
-    return dataset, dataset.without(planned | dataset.data.faulty), noise
+    return dataset, dataset.without((np.arange(len(hidden)) >= n) | dataset.data.faulty), noise
 
 
 def discriminations_of(
@@ -275,12 +270,12 @@ def _error(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
 
 def _exchange(tasks: Sequence[Discrimination], chosen: list[int]) -> None:
     for _ in range(ROUNDS if len(chosen) > 1 else 0):
-        changed = False
-        for k, own in enumerate(list(chosen)):
+        before = list(chosen)
+        for k, own in enumerate(before):
             best, error = _best(tasks, chosen[:k] + chosen[k + 1 :])
             if best != own and error < (1 - WORTH) * _error(tasks, chosen):
-                chosen[k], changed = best, True
-        if not changed:
+                chosen[k] = best
+        if chosen == before:
             break
 
 
@@ -430,34 +425,30 @@ def _chosen(
                 f"({option('poses')}), or repeat each of them"
             )
         notes += _pull_notes(base, pool, suspects, seed, tasks, hopeless, len(chosen), after)
+    nothing = _nothing(sets, suspects, notes)
+    found = replace(nothing, pairs=pairs_of(tasks, chosen), inseparable=groups)
     if not worthwhile:
-        nothing = _nothing(sets, suspects, tuple(notes))
-        return replace(nothing, pairs=pairs_of(tasks, chosen), inseparable=groups)
+        return found
     rng, n = np.random.default_rng(seed), len(chosen)
     picks = [rng.choice(len(pool), size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
-    return ExtraPlan(
-        rivals=_names(sets),
-        pairs=pairs_of(tasks, chosen),
+    return replace(
+        found,
         plan=measuring_order(pool, chosen, base.observed.table),
         n_poses=n,
         probability_before=covered * expected(tasks, ()),
         probability_after=covered * after,
         probability_random=covered * float(np.mean([expected(tasks, pick) for pick in picks])),
         separable=True,
-        inseparable=groups,
         advice=(*recording_advice(sets), *notes),
     )
 
 
-def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: tuple[str, ...]) -> ExtraPlan:
+def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: Sequence[str]) -> ExtraPlan:
     likeliest = [float(s.probability.max()) for s in sets]
     p = float(np.prod(likeliest)) if sets else suspects.diagnosis.probability_unknown
     p *= suspects.covered
-    return ExtraPlan(False, (), 0, _names(sets), (), None, p, p, p, notes)
-
-
-def _names(sets: Sequence[RivalSet]) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(name for s in sets for name in s.names))
+    names = tuple(dict.fromkeys(name for s in sets for name in s.names))
+    return ExtraPlan(False, (), 0, names, (), None, p, p, p, tuple(notes))
 
 
 def _pull_notes(

@@ -179,7 +179,7 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
             order = min(max(dict(c.settings)["order_1"] + float(step), LOWEST), HIGHEST / m)
             family = family_component(dataset, c.where, order, m, float(known), c.search)
             components[k] = replace(family, given=c.given)
-        now = replace(now, components=tuple(components))
+        now = replace(now, sums=replace(now.sums, components=tuple(components)))
     return list(found.components) if moved else None
 
 

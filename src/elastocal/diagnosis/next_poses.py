@@ -147,9 +147,13 @@ def next_poses(
     model = model.with_markers_of(table)
     required = model.cell.require.new_poses if require is None else require
     spec = model.cell.design
-    # A joint whose compliance is known at its levels only can be nowhere else.
-    levels = spec.levels or model.cell.model.compliance_levels
-    check_levels(replace(model.cell, design=replace(spec, levels=levels)), "batch", batch)
+    spec = replace(
+        spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,
+        loads=load_forces(table) if spec.loads is None else spec.loads,
+        # A joint whose compliance is known at its levels only can be nowhere else.
+        levels=spec.levels or model.cell.model.compliance_levels,
+    )  # fmt: skip
+    check_levels(replace(model.cell, design=spec), "batch", batch)
     why = None
     if len(np.unique(table.configuration)) >= FEWEST:
         tell("diagnosing")
@@ -160,13 +164,8 @@ def next_poses(
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table)
         error = _error_now(fit, 1.0 if why is None else why.probability_unknown)
-    spec = replace(
-        spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,
-        loads=load_forces(table) if spec.loads is None else spec.loads,
-        levels=levels,
-    )  # fmt: skip
-    cell = replace(model.cell, design=spec)
-    plan = design(cell, DesignOptions("batch", seed, jobs, done=table), progress=tell)
+    cell, options = replace(model.cell, design=spec), DesignOptions("batch", seed, jobs, done=table)
+    plan = design(cell, options, progress=tell)
     assert plan.gain is not None  # the criterion has test poses
     reached = math.inf if error is None else max(plan.gain.sure, error.sure)
     lacking = 0.0 if error is None else error.lacking or 0.0

@@ -76,22 +76,18 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
     if same and p[own] > TOO_NEAR_PROBABILITY:
         # Their columns are the same in these poses; what separates the scores is only how many
         # parameters each would need.
-        spare = p[own] - TOO_NEAR_PROBABILITY
+        p[same] += (p[own] - TOO_NEAR_PROBABILITY) / len(same)
         p[own] = TOO_NEAR_PROBABILITY
-        p[same] += spare / len(same)
     chosen = [own, *same]
     if p[own] < NAMED:
         # Of the blocks only the likeliest: they all say "something else, about there".
-        blocks = [i for i in range(len(p)) if not slot.items[i].known]
-        rest = {*range(len(p))} - {*chosen, *blocks}
-        if blocks:
-            likeliest = max(blocks, key=lambda i: p[i])
-            p[likeliest] = p[blocks].sum()
-            rest.add(likeliest)
-        for i in sorted(rest, key=lambda i: -p[i]):
+        if blocks := [i for i in range(len(p)) if not slot.items[i].known]:
+            likeliest, together = max(blocks, key=lambda i: p[i]), p[blocks].sum()
+            p[blocks], p[likeliest] = 0.0, together
+        for i in sorted({*range(len(p))} - {*chosen}, key=lambda i: -p[i]):
             if len(chosen) >= LARGEST_SET or p[chosen].sum() >= SET or p[i] < 0.01:
                 break
-            chosen.append(int(i))
+            chosen.append(i)
     chosen = [own, *sorted(chosen[1:], key=lambda i: -p[i])]
     return tuple((slot.items[i], float(p[i])) for i in chosen)
 
@@ -253,16 +249,15 @@ class FewAnswer(SumAnswer):
         own = next((k for k, item in enumerate(items) if not item.known), 0)
         slot = self.selected.slots[own]
         each, _ = slot.probabilities()
-        stages: dict[str, float] = defaultdict(float)
-        places: dict[str, float] = defaultdict(float)
-        for item, p in zip(slot.items, each / max(float(each.sum()), 1e-300), strict=True):
-            stages[item.what.stage] += float(p)
-            places[item.what.where] += float(p)
-        what = items[own].what
-        by_stage, by_place = (
-            {key: p for key, p in each.items() if p > 1e-6} for each in (stages, places)
+        each, what = each / max(float(each.sum()), 1e-300), items[own].what
+        by_stage, by_place = defaultdict[str, float](float), defaultdict[str, float](float)
+        for item, p in zip(slot.items, each.tolist(), strict=True):
+            by_stage[item.what.stage] += p
+            by_place[item.what.where] += p
+        stages, places = (
+            {key: p for key, p in one.items() if p > 1e-6} for one in (by_stage, by_place)
         )
-        return Location.of(what.stage, what.where, by_stage, by_place, tests)
+        return Location.of(what.stage, what.where, stages, places, tests)
 
     def curves(self) -> tuple[Curve, ...]:
         """Of the unknown blocks that depend on one number, the largest components first."""
@@ -273,15 +268,14 @@ class FewAnswer(SumAnswer):
             if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
                 continue
             assert block.direction is not None
-            x, direction = block.source.values[present], block.direction[present]
+            x, order = np.unique(block.source.values[present], return_index=True)
+            direction = block.direction[present]
             motion = direction @ at.beta[span]  # (visits, d)
             deviation = np.linalg.norm(direction @ at.beta_deviation.T[span], axis=2)
-            _, order = np.unique(x, return_index=True)
             largest = np.argsort(-(motion.std(axis=0) / deviation.mean(axis=0)))
             for k in largest[:MOST_CURVES]:
-                name, unit = COMPONENTS[motion.shape[1]][k]
-                y = motion[order, k]
-                xyd = (tuple(v.tolist()) for v in (x[order], y - y.mean(), deviation[order, k]))
+                (name, unit), y = COMPONENTS[motion.shape[1]][k], motion[order, k]
+                xyd = (tuple(v.tolist()) for v in (x, y - y.mean(), deviation[order, k]))
                 entry = f"{block.where}{name}"
                 out.append(Curve(block.covariate, block.source.unit, entry, unit, *xyd))
         return tuple(out)
