@@ -157,59 +157,45 @@ NONE_NAMED = (
 
 def diagnosis_headline(d: Diagnosis) -> str:
     if d.groups:
-        return say.capital(headline_of_causes(d))
-    likely = []  # each effect with its probability and, where it happened once, when
-    for f in d.effects:
-        moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
-        when = f"; {settings_of(d, moments)}" if moments else ""
-        likely.append(f"{say.effect_at(f)} (probability {say.probability(f.probability)}{when})")
-    if d.verdict == "explained":
-        one = "s" * (len(d.effects) == 1)
-        return f"{say.capital(say.together(likely))} explain{one} the remaining error."
-    if d.verdict == "ambiguous":
-        sets = [
-            f"either {say.together([say.effect_at(e) for e in s], 'or')}"
-            for s in d.indistinguishable
+        large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
+        told = [
+            f"{say.effect_at_places(g.name, g.places)} "
+            f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
+            for k, g in enumerate(large)
         ]
-        verb = "causes" if len(sets) == 1 else "cause"
-        told = say.capital(say.together(sets))
-        return f"{told} {verb} the remaining error; these data cannot decide."
-    if d.verdict != "unknown_effect":
-        none = f"probability of none: {say.probability(d.probability_nothing)}"
-        if d.doubtful:
-            return f"{NONE_NAMED} ({none})."
-        return f"No further effect exceeds the noise; {none}."
-    where = location_text(d.location) if d.location else ""
-    if likely:
-        verb = "cause" if len(likely) > 1 else "causes"
-        text = f"{say.capital(say.together(likely))} {verb} part of the remaining error; an effect "
-        return f"{text}outside the catalogue acts{f' {where}' if where else ''}."
-    text = "An effect outside the catalogue causes the remaining error"
-    return f"{text}, {where}." if where else f"{text}; the data do not show where."
-
-
-def headline_of_causes(d: Diagnosis) -> str:
-    large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
-    told = [
-        f"{say.effect_at_places(g.name, g.places)} "
-        f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
-        for k, g in enumerate(large)
-    ]
-    if more := len(d.groups) - len(told):
-        told.append(say.counted(more, "smaller cause"))
-    first = d.groups[0]
-    several = len(d.groups) > 1 or len(first.places) > 1 or first.name.endswith("errors")
-    text, one = say.together(told), "s" * (not several)
+        if more := len(d.groups) - len(told):
+            told.append(say.counted(more, "smaller cause"))
+        first, n = d.groups[0], len(d.indistinguishable)
+        one = max(len(d.groups), len(first.places)) == 1 and not first.name.endswith("errors")
+        open_ = f"leave {'one effect' if n == 1 else f'{n} effects'} of it open"
+        at = say.places(dict.fromkeys(c.where for c in d.components if not c.named))
+        where = f"at {at}" if at else ""
+    else:
+        told, open_ = [], "cannot decide"
+        for f in d.effects:  # with its probability and, where it happened once, when
+            moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
+            when = f"; {settings_of(d, moments)}" if moments else ""
+            told.append(f"{say.effect_at(f)} (probability {say.probability(f.probability)}{when})")
+        if d.verdict == "ambiguous":
+            told = [
+                f"either {say.together([say.effect_at(e) for e in s], 'or')}"
+                for s in d.indistinguishable
+            ]
+        one, where = len(told) == 1, location_text(d.location) if d.location else ""
+    s, text = "s" * one, say.capital(say.together(told))
     if d.verdict == "explained":
-        return f"{text} explain{one} the remaining error."
+        return f"{text} explain{s} the remaining error."
     if d.verdict == "ambiguous":
-        n = len(d.indistinguishable)
-        names = "one effect" if n == 1 else f"{n} effects"
-        return f"{text} cause{one} the remaining error; these data leave {names} of it open."
-    at = say.places(dict.fromkeys(c.where for c in d.components if not c.named))
+        return f"{text} cause{s} the remaining error; these data {open_}."
+    if d.groups or (told and d.verdict == "unknown_effect"):
+        text += f" cause{s} part of the remaining error; an effect outside the catalogue acts"
+        return f"{text}{f' {where}' if where else ''}."
+    if d.verdict == "unknown_effect":
+        text = "An effect outside the catalogue causes the remaining error"
+        return f"{text}, {where}." if where else f"{text}; the data do not show where."
+    none = f"probability of none: {say.probability(d.probability_nothing)}"
     return (
-        f"{text} cause{one} part of the remaining error; an effect outside the catalogue acts"
-        f"{f' at {at}' if at else ''}."
+        f"{NONE_NAMED} ({none})." if d.doubtful else f"No further effect exceeds the noise; {none}."
     )
 
 
@@ -250,21 +236,20 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
                 "the last move is that from the visit before, in the order of the rows; if they "
                 "were not measured so, do not rely on effects of the last move.",
             )
-        yield "Chance", f"{say.size_of(d.p_value)}{chance}"
-        return
-    for curve in d.curves if unknown else ():
-        moved = f"{say.driver_name(curve.driver)} moves {say.driver_name(curve.entry)}"
-        yield "Shape", f"{moved} by {curve_span(curve)} in all."
-    open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
-    for f in d.effects if d.open else ():  # beside the open question, or its likeliest answer
-        text = f"{say.effect_at(f)} (probability {say.probability(f.probability)}"
-        text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
-        yield "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
-    if d.verdict == "nothing_significant":
-        for text in sensitivity(d):
-            yield "Sensitivity", text
-    elif d.verdict == "ambiguous" and d.location is not None:
-        yield "Location", f"{location_text(d.location)}."
+    else:
+        for curve in d.curves if unknown else ():
+            moved = f"{say.driver_name(curve.driver)} moves {say.driver_name(curve.entry)}"
+            yield "Shape", f"{moved} by {curve_span(curve)} in all."
+        open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
+        for f in d.effects if d.open else ():  # beside the open question, or its likeliest answer
+            text = f"{say.effect_at(f)} (probability {say.probability(f.probability)}"
+            text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
+            yield "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
+        if d.verdict == "nothing_significant":
+            for text in sensitivity(d):
+                yield "Sensitivity", text
+        elif d.verdict == "ambiguous" and d.location is not None:
+            yield "Location", f"{location_text(d.location)}."
     yield "Chance", f"{say.size_of(d.p_value)}{chance}"
 
 

@@ -216,7 +216,7 @@ def plan_lines(plan: Plan) -> Told:
     told = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in hardest if n)
     rules = f"; removed by {told}." if told else "; no rule removed any."
     yield "Candidates", f"{c.feasible} feasible of {c.tried} tried{rules}"
-    yield from _certificate_lines(plan)
+    yield from (("Certificate", text) for text in _certificate(plan))
     yield from _execution_lines(plan)
     s = plan.scheduled
     if s is not None and s.test_poses is not None and s.without is not None:
@@ -321,41 +321,37 @@ def _chance_lines(plan: Plan) -> Told:
     yield "Chance", "; ".join([text] * bool(text) + [lost] * (not text or c.n > c.determined)) + "."
 
 
-def _certificate_lines(plan: Plan) -> Told:
+def _certificate(plan: Plan) -> Iterator[str]:
     c, name, unit = plan.certificate, _criterion(plan), f" {plan.unit}" if plan.unit else ""
     found, bound = c.efficiency_pool, plan.bound_reported
     if found is None:
         reason = CRITERIA[plan.criterion].without_bound
-        yield "Certificate", f"none: {plan.criterion} {reason}, so no bound is known."
+        yield f"none: {plan.criterion} {reason}, so no bound is known."
         return
     told = "" if bound is None else f" (bound {name} = {bound:.4g}{unit})"
     efficiency = f"{found:.1g}" if c.vain else f"{found:.4f}"
     yield (
-        "Certificate",
         f"certified on the pool: efficiency {efficiency} (in readings) against the best subset of "
-        f"the {c.pool} candidates with the same number per level{told}.",
+        f"the {c.pool} candidates with the same number per level{told}."
     )
     if c.vain:
         yield (
-            "Certificate",
             "with so few poses the bound says nothing: the relaxation spreads weights over many "
-            "candidates.",
+            "candidates."
         )
         return
     if c.efficiency_continuum is not None:
         yield (
-            "Certificate",
             f"estimated on the continuum: efficiency {c.efficiency_continuum:.4f}, after "
             f"{c.searched} more poses and {c.ascents} local searches; a better pose may "
-            "have been missed.",
+            "have been missed."
         )
     if c.starts and bound is not None:
         ends = " to ".join(dict.fromkeys(f"{e:.4g}" for e in (min(c.starts), max(c.starts))))
         yield (
-            "Certificate",
             f"{say.counted(len(c.starts), 'start')} of the search ended with {name} = "
             f"{ends}{unit}, the bound is {bound:.4g}{unit}. The difference is what no start "
-            "found, or what only weights can reach: the fewer poses, the more of the latter.",
+            "found, or what only weights can reach: the fewer poses, the more of the latter."
         )
 
 
