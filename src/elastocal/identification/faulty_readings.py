@@ -77,11 +77,6 @@ class FaultyGroup:
     moves_most: str
     p_left: float = 0.0
 
-    @property
-    def explained(self) -> bool:
-        """Whether one common shift accounts for all of its errors."""
-        return self.pattern == "common" and self.p_left >= FALSE_ALARM
-
     def __str__(self) -> str:
         name = {"block": f"lines {self.name}"}.get(self.level, f"{self.level} {self.name}")
         return f"{name} by {self.error * 1e3:.3g} mm"
@@ -105,7 +100,8 @@ class OutlierReport:
     @property
     def shifted(self) -> list[FaultyGroup]:
         """Groups, most of them beyond the noise, whose errors one common shift accounts for."""
-        return [f for f in self.findings if f.explained and 2 * f.beyond >= len(f.readings)]
+        common = (f for f in self.findings if f.pattern == "common" and f.p_left >= FALSE_ALARM)
+        return [f for f in common if 2 * f.beyond >= len(f.readings)]
 
     def to_json(self) -> dict[str, Any]:
         """Its fields, but for how many readings were used instead of which."""

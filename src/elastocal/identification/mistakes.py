@@ -268,11 +268,8 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
     shifts, flange = np.arange(-most, most + 1), nominal_flanges(model.chain, table.q)
     to = rows[:, None] + shifts
     beyond, to = (to < 0) | (to >= len(rows)), np.clip(to, 0, len(rows) - 1)
-
-    def placed_by(rows: IntArray, shift: IntArray | int) -> Registration:
-        return Registration.of(model, _moved(table, rows, shift))
-
-    placed = (placed_by(*block) for block in _blocks(table, flange, visit, shifts))
+    nearest = _blocks(table, flange, visit, shifts)
+    placed = (Registration.of(model, _moved(table, *block)) for block in nearest)
     found = next((one for one in placed if one.error <= NEAR / 2), None)
     if found is None:
         return
@@ -282,14 +279,15 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
         path = _path(distance / np.clip(6 * found.error, NEAREST, NEAR))
         moved = shifts[path]
         inside = np.flatnonzero(~beyond[rows, path])
-        found = placed_by(inside, moved[inside])
+        slipped = _moved(table, inside, moved[inside])
+        found = Registration.of(model, slipped)
     starts = np.flatnonzero(np.r_[True, np.diff(moved) != 0])
     if len(starts) * FEWEST > visits or not moved.any():
         return
     good = distance[rows, path] <= NEAR
     later = visit[to[rows, path]] - visit
     blocks = [(b, np.unique(later[b[good[b]]])) for b in np.split(rows, starts[1:])]
-    yield _slipped_words(table, moved, blocks), _moved(table, inside, moved[inside])
+    yield _slipped_words(table, moved, blocks), slipped
 
 
 def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:

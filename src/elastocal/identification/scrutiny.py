@@ -350,9 +350,8 @@ def uncertainty_budget(
     own, left = mean_squares(arm, B, fit.observations.size)
     visits, readings = (fit.noise_parts.get(part, 0.0) for part in ("visits", "readings"))
     lack = min(max(arm.lacking**2 - visits, 0.0), readings)
-    parameters, open_, shared, single, beyond = np.sqrt(
-        [own, left, visits, readings - lack, lack]
-    ).tolist()
+    squares = (own, left, visits, readings - lack, lack)
+    parameters, open_, shared, single, beyond = np.sqrt(squares).tolist()
     return UncertaintyBudget(parameters, open_, shared, single, beyond, at)
 
 

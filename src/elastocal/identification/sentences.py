@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from elastocal.errors import option
-from elastocal.identification.outliers import Outlier, named_runs
+from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
 from elastocal.text import counted, gathered, listed
 
@@ -136,19 +136,6 @@ SENTENCES = {
         "load state, marker or region. {remedy}"
     ),
 }
-# Readings beyond the noise that had a part in the fit, and those set apart.
-FAULTY = (
-    (
-        "outliers", ("lies", "lie"),
-        "{} beyond what the noise explains (lines {}); they are in the fit. Check them; {drop} "
-        "excludes them.",
-    ),
-    (
-        "excluded", ("was", "were"),
-        "{} excluded as outliers (lines {}). They are mistakes, or signs of a missing effect. All "
-        "are listed in the result under 'excluded'; {keep} keeps them.",
-    ),
-)  # fmt: skip
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
     "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
@@ -168,14 +155,19 @@ def warning_sentences(result: Calibration) -> dict[str, str]:
 def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
     f = same[0]
     if f.kind == "faulty_readings":
-        for readings, verbs, text in FAULTY:
-            found: tuple[Outlier, ...] = getattr(result, readings)
-            if n := len(found):
-                told = text.format(
-                    f"{counted(n, 'reading')} {verbs[n > 1]}", _runs(o.line for o in found),
-                    drop=option("outliers", "drop"), keep=option("outliers", "keep"),
-                )  # fmt: skip
-                yield told
+        if kept := result.outliers:
+            yield (
+                f"{counted(len(kept), 'reading lies', 'readings lie')} beyond what the noise "
+                f"explains (lines {_runs(o.line for o in kept)}); they are in the fit. Check "
+                f"them; {option('outliers', 'drop')} excludes them."
+            )
+        if apart := result.excluded:
+            yield (
+                f"{counted(len(apart), 'reading was', 'readings were')} excluded as outliers "
+                f"(lines {_runs(o.line for o in apart)}). They are mistakes, or signs of a missing "
+                "effect. All are listed in the result under 'excluded'; "
+                f"{option('outliers', 'keep')} keeps them."
+            )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
             k: ", ".join(one if isinstance(one, str) else f"{one:.3g}" for one in v)
