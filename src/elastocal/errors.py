@@ -186,14 +186,13 @@ def _of_plugin(error: Exception) -> str:
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         file, mine = frame.f_code.co_filename, frame.f_locals.values()
         kinds = [v if isinstance(v, type) else type(v) for v in mine]
-        plugin = next((kind for kind in kinds if kind in loader.REGISTERED), None)
-        if plugin is None and file not in ran:
-            continue
-        if plugin is None:
+        for plugin in (kind for kind in kinds if kind in loader.REGISTERED):
+            home = getattr(sys.modules.get(plugin.__module__), "__file__", file)
+            at = f"{home}, line {line}" if file == home else home
+            name = getattr(plugin, "name", plugin.__name__)
+            return f"{at}: '{name}': {what}; correct the plug-in"
+        if file in ran:
             return f"{file}, line {line}: {what}; correct the plug-in"
-        home = getattr(sys.modules.get(plugin.__module__), "__file__", file)
-        at = f"{home}, line {line}" if file == home else home
-        return f"{at}: '{getattr(plugin, 'name', plugin.__name__)}': {what}; correct the plug-in"
     return ""
 
 

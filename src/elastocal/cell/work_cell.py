@@ -179,17 +179,12 @@ class HangingLoad:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        axis, angle = "rope_axis" in table, "max_angle_deg" in table
-        given, other, takes = (
-            ("rope_axis", "max_angle_deg", "the angle that it may deviate from the vertical")
-            if axis
-            else ("max_angle_deg", "rope_axis", "the direction in which the rope leaves the tool")
-        )
-        spot.require(
-            axis == angle,
-            f"key {spot.key(given)} has no meaning without {spot.key(other)}, {takes}; give both "
-            "or none",
-        )
+        for given, other, takes in (
+            ("rope_axis", "max_angle_deg", "the angle that it may deviate from the vertical"),
+            ("max_angle_deg", "rope_axis", "the direction in which the rope leaves the tool"),
+        ):
+            told = f"key {spot.key(given)} has no meaning without {spot.key(other)}, {takes}"
+            spot.require(other in table or given not in table, f"{told}; give both or none")
         return {"solid": from_table(Solid, table, spot, name="load")}
 
 
