@@ -450,94 +450,85 @@ class ClusterLostError(ElastocalError):
     exit_code = 1
 
 
-class Processes:
-    """joblib's, by default one per core, for so many tasks at most; where one alone is asked for it
-    is this process, for a debugger."""
+def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int | None) -> Lines:
+    """Lines of results of joblib's processes, by default one per core; where one alone is asked for
+    it is this process, for a debugger."""
+    from joblib.externals import loky
 
-    name = "this machine"
+    jobs = jobs or loky.cpu_count()
+    env = {name: os.environ.get(name, "1") for name in ONE_THREAD}
+    # Of a pool that is started anew where a process died.
+    pool = partial(loky.get_reusable_executor, min(jobs, len(tasks)), initializer=IGNORING, env=env)
 
-    def __init__(self, jobs: int | None = None, most: int = MAX_TASKS) -> None:
-        from joblib.externals import loky
-
-        jobs = jobs or loky.cpu_count()
-        env = {name: os.environ.get(name, "1") for name in ONE_THREAD}
-        # The processes, started anew where one of them died.
-        self._pool = None if jobs == 1 else lambda: loky.get_reusable_executor(
-            min(jobs, most), initializer=IGNORING, env=env)  # fmt: skip
-        self.room = lambda: jobs
-
-    def submit(self, *call: Any) -> Future[Row]:
-        if self._pool is not None:
-            found: Future[Row] = self._pool().submit(*call)
-            return found
+    def at_once(*call: Any) -> Future[Row]:
         done = Future[Row]()
         done.set_result(call[0](*call[1:]))
         return done
 
-    def end(self, running: bool) -> None:
-        if running and self._pool is not None:
-            self._pool().shutdown(kill_workers=True)
+    try:
+        submit = at_once if jobs == 1 else lambda *call: pool().submit(*call)
+        yield from _lines(study, tasks, stop, submit, lambda: jobs)
+    finally:
+        if jobs > 1 and tasks:
+            pool().shutdown(kill_workers=True)
 
 
-class Cluster:
-    """Dask's workers.  No task waits at one: what is out is what is waited for on Ctrl-C."""
+def on_cluster(
+    study: Study, tasks: Sequence[Row], stop: StudyStop, client: Any, tell: Callable[[str], None]
+) -> Lines:
+    """The same of a Dask cluster's workers.  No task waits at one: what is out is what is waited
+    for on Ctrl-C."""
 
-    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
-        self._client, self._tell = client, tell
-        self.name = f"the scheduler at {client.scheduler.address}"
-        # No call may answer for another one.
-        self.submit = client.get_executor(pure=False).submit
-
-    def room(self) -> int:
+    def room() -> int:
         # Without a limit a scheduler that goes away while it is asked is waited for for ever.
-        threads = sum(self._client.nthreads(callback_timeout=6 * ANSWER).values())
+        threads = sum(client.nthreads(callback_timeout=6 * ANSWER).values())
         if not threads:
-            self._tell("the cluster has no worker; waiting for one")
+            tell("the cluster has no worker; waiting for one")
         return max(threads, 1)
 
-    def end(self, running: bool) -> None:
-        self._client.close()
+    try:  # no call may answer for another one, so none is pure
+        yield from _lines(study, tasks, stop, client.get_executor(pure=False).submit, room)
+    except (CancelledError, OSError):
+        raise ClusterLostError(
+            f"the scheduler at {client.scheduler.address} went away or cancelled the tasks; "
+            "what was done is kept, and the same command goes on with the rest"
+        ) from None
+    finally:
+        client.close()
 
 
-def lines_of(
-    study: Study, tasks: Iterable[Row], stop: StudyStop, workers: Processes | Cluster
-) -> Lines:
-    """The tasks' lines of results as they come; none begins once `stop` is asked for.
+def _lines(
+    study: Study, tasks: Sequence[Row], stop: StudyStop, submit: Callable[..., Future[Row]],
+    room: Callable[[], int],
+) -> Lines:  # fmt: skip
+    """The lines as they come, none twice; no task begins once `stop` is asked for.
 
     Where a process dies joblib ends them all: what ran is repeated, one task after the other, so
     that it is known whose process dies each time.  Dask gives the tasks of a dead worker to
     another, and gives up a task that killed more than distributed.scheduler.allowed-failures.
     """
     waiting, out, died = deque(tasks), dict[Future[Row], Row](), Counter[int]()
-    try:
-        while out or (waiting and not stop.asked):
-            room = workers.room() if waiting and not stop.asked else 0
-            while waiting and len(out) < (1 if died[waiting[0]["task"]] else room):
-                task = waiting.popleft()
-                out[workers.submit(execute, study.sources, task)] = task
-            for future in wait(out, return_when=FIRST_COMPLETED).done:
-                task = out.pop(future)
-                try:
-                    yield future.result()
-                except BrokenExecutor:
-                    died[task["task"]] += 1
-                    if died[task["task"]] < TRIES:
-                        waiting.appendleft(task)
-                    else:
-                        yield line_of(task, error=DIED.format(TRIES))
-                except (CancelledError, OSError):
-                    raise
-                except Exception as error:  # execute() returns what a task raises
-                    deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
-                    told = f"the worker could not run it: {type(error).__name__}: {error}"
-                    yield line_of(task, error=told if deaths is None else DIED.format(deaths + 1))
-    except (CancelledError, OSError):
-        raise ClusterLostError(
-            f"{workers.name} went away or cancelled the tasks; what was done is kept, and the same "
-            "command goes on with the rest"
-        ) from None
-    finally:
-        workers.end(bool(out))
+    while out or (waiting and not stop.asked):
+        most = room() if waiting and not stop.asked else 0
+        while waiting and len(out) < min(most, 1 if died[waiting[0]["task"]] else most):
+            task = waiting.popleft()
+            out[submit(execute, study.sources, task)] = task
+        for future in wait(out, return_when=FIRST_COMPLETED).done:
+            task = out.pop(future)
+            try:
+                yield future.result()
+            except BrokenExecutor:
+                died[task["task"]] += 1
+                if died[task["task"]] < TRIES:
+                    waiting.appendleft(task)
+                else:
+                    yield line_of(task, error=DIED.format(TRIES))
+            except (CancelledError, OSError):
+                raise
+            except Exception as error:  # execute() returns what a task raises
+                deaths = getattr(error, "allowed_failures", None)  # as a KilledWorker has
+                told = f"the worker could not run it: {type(error).__name__}: {error}"
+                yield line_of(task, error=told if deaths is None else DIED.format(deaths + 1))
 
 
 def _security(
@@ -643,10 +634,10 @@ def run_study(
         there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
         left = [task for task in wanted if task["task"] not in there]
-        workers: Processes | Cluster = Processes(jobs, len(left))
+        runner = partial(on_processes, study, left, stop, jobs)
         if cluster is not None and left:
             # Before results are discarded: one that cannot be reached must not cost them.
-            workers = Cluster(connect(cluster, **way), tell)
+            runner = partial(on_cluster, study, left, stop, connect(cluster, **way), tell)
         for name in OURS if restart else ():
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
@@ -662,7 +653,7 @@ def run_study(
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
         progress(total, ended, failed)
         try:
-            with closing(lines_of(study, left, stop, workers)) as lines:
+            with closing(runner()) as lines:
                 for line in lines:
                     stop.check()
                     add_line(folder, line)

@@ -9,12 +9,11 @@ from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
 from elastocal.studies import (
-    Cluster,
     ClusterLostError,
     StudyStop,
     _security,
     connect,
-    lines_of,
+    on_cluster,
     read_results,
 )
 
@@ -74,8 +73,8 @@ def marked(tmp_path, lethal=None, count=12, sleep=0.02):
 
 
 def at(address):
-    workers = Cluster(connect(address), print)
-    return lambda study: lambda tasks: lines_of(study, tasks, StudyStop(), workers)
+    client = connect(address)
+    return lambda study: lambda tasks: on_cluster(study, tasks, StudyStop(), client, print)
 
 
 def begun(marks):

@@ -9,16 +9,8 @@ from unittest.mock import patch
 
 import pandas as pd
 
-from elastocal.studies import (
-    Ending,
-    Processes,
-    Study,
-    StudyStop,
-    execute,
-    lines_of,
-    read_results,
-    read_study,
-)
+from elastocal.studies import Ending, Study, StudyStop, execute, read_results, read_study
+from elastocal.studies import on_processes as processes
 from elastocal.studies import run_study as run_prepared
 
 SCRIPT = """\
@@ -63,7 +55,7 @@ def here(study: Study, order: Callable[[list[Any]], list[Any]] = list, stop_afte
 
 
 def on_processes(study: Study, workers: int, stop: StudyStop | None = None):
-    return lambda tasks: lines_of(study, tasks, stop or StudyStop(), Processes(workers))
+    return lambda tasks: processes(study, tasks, stop or StudyStop(), workers)
 
 
 def run_study(
@@ -72,7 +64,7 @@ def run_study(
     """The study in `folder` run into `results` by `runner(study)`, by default in this process."""
     study = read_study(folder, seed)
     made = (runner or here)(study)
-    with patch("elastocal.studies.lines_of", lambda study, tasks, *_: made(tasks)):
+    with patch("elastocal.studies.on_processes", lambda study, tasks, *_: made(tasks)):
         return run_prepared(study, results, **how)
 
 
