@@ -20,7 +20,6 @@ from elastocal.diagnosis.evidence import (
     Item,
     Scan,
     exceedance,
-    log_prior_odds,
     scan,
 )
 from elastocal.diagnosis.hypotheses import Hypothesis, compute_columns, with_keys
@@ -265,7 +264,7 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
     spec = model.cell.model
     for item in items:
         if item.known:
-            spec = spec.with_effect(*item.key, settings_of(item))
+            spec = spec.with_effect(*item.what.key, settings_of(item))
     key = "extended", spec.effects, repr(spec.nominal.settings)
     cell: Cell = replace(model.cell, model=spec)
     return made_once(model, key, lambda: Model.assembled(model.chain, cell))
@@ -628,9 +627,8 @@ class ForwardSelection:
         """All candidates beside the set; with flips of what is left `beside` another, where one is
         given: they hold nothing of what this one explains."""
         flips = None if beside is None else (self.signs, beside.at.scattered)
-        something = ANOTHER if current.items else SOMETHING
-        prior = log_prior_odds(self.dataset.hypotheses, self.generic, something)
-        return scan(self.dataset, self.generic, prior, current.data, noise or current.noise, flips)
+        something, noise = ANOTHER if current.items else SOMETHING, noise or current.noise
+        return scan(self.dataset, self.generic, something, current.data, noise, flips)
 
     def _best_addition(
         self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND

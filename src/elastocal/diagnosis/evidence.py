@@ -334,11 +334,6 @@ class Item:
     def known(self) -> bool:
         return self.what.known
 
-    @property
-    def key(self) -> tuple[str, str]:
-        """(effect, place); a block without a name is an unknown effect at its place."""
-        return self.what.key
-
 
 @dataclass(frozen=True)
 class Scan:
@@ -362,10 +357,12 @@ class Scan:
 
 
 def scan(
-    dataset: DiagnosisData, generic: list[Generic], prior: Array, data: NoisyData,
+    dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
     noise: NoiseValues, flips: Flips | None = None,
 ) -> Scan:  # fmt: skip
-    """Score all hypotheses and blocks, of log odds `prior`, beside the columns in `data`."""
+    """Score all hypotheses and blocks beside the columns in `data`, where `something` is missing
+    with this probability."""
+    prior = log_prior_odds(dataset.hypotheses, generic, something)
     grams = Grams(dataset, data, project(data, noise), flips)
     items, distance, rows = list[Item](), list[float](), list[Array]()
     covariates: dict[str, Array] = {}

@@ -252,20 +252,20 @@ def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -
 
 def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
     """Probability that the right one of every set is named after the chosen visits."""
-    each = [c.probability(c.squared(c.gram(chosen))) for c in tasks]
+    each = [c.probability(c.squared(chosen)) for c in tasks]
     return float(np.prod(each))
 
 
 def _best(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, float]:
     """The candidate not chosen yet that lowers the error most, and the error with it."""
-    error = np.array(sum(c.error_bound(c.squared_with_each(c.gram(chosen))) for c in tasks))
+    error = np.array(sum(c.error_bound(c.squared_with_each(chosen)) for c in tasks))
     error[list(chosen)] = np.inf
     best = int(np.argmin(error))
     return best, float(error[best])
 
 
 def _error(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
-    return sum(float(c.error_bound(c.squared(c.gram(chosen)))) for c in tasks)
+    return sum(float(c.error_bound(c.squared(chosen))) for c in tasks)
 
 
 def _exchange(tasks: Sequence[Discrimination], chosen: list[int]) -> None:

@@ -39,8 +39,8 @@ from elastocal.model.effects.placements import ThermalExpansion
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, observe, rows_needed, subset
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.model.observations import observe, rows_needed, subset
+from elastocal.units import Array, BoolArray
 
 # What each need of an effect asks the user to record.
 RECORD = {
@@ -359,69 +359,36 @@ MOST_STEPS = 40  # of the refinement
 SAME = 0.05  # of χ²: a difference that is none
 
 
-def with_tangents(
-    full: Model,
-    places: dict[tuple[str, str], slice],
-    hypotheses: list[Hypothesis],
-    base: Baseline,
-    x: Array,
-    B: Array,
-) -> tuple[Array, Array, dict[tuple[str, str], float]]:
-    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none, in
-    place, x with the best start in it, and of each such effect the log of its mean likelihood over
-    all starts relative to that at the best one."""
-    shares: dict[tuple[str, str], float] = {}
-    for h in hypotheses:
-        own = places[h.key]
-        shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
-        if shown.all() or shown.sum() != 1:
-            continue
-        search = StartSearch.of(full, h, base, x, B)
-        x, shares[h.key] = x.copy(), search.screened[1]
-        x[own], B[:, :, own] = next(search.tangents())
-    return B, x, shares
-
-
-@dataclass(frozen=True)
 class StartSearch:
-    """The starts of one hypothesis against the residual of the fitted arm.
+    """The starts of one hypothesis against the residual of the fitted arm, about x (K,) and B
+    (n_rows, size, K) of `full`.
 
     `part` are some of the observations, from the table's `rows`.  `X` (equations, parameters) are
     the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
     equation for the prior of each fitted parameter; `whitening` (N, size, size) divides by the
-    noise.  The effect's first parameter is the amplitude that the others have no columns without.
+    noise.  Of the effect's parameters, whose numbers are `own`, the first is the amplitude that the
+    others have no columns without.
     """
 
-    full: Model
-    h: Hypothesis
-    base: Baseline
-    x: Array
-    part: Observations
-    rows: IntArray
-    whitening: Array
-    X: Array
-    r: Array
-
-    @classmethod
-    def of(cls, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> StartSearch:
-        """x (K,) and B (n_rows, size, K) are those of `full`."""
-        names = {name: k for k, name in enumerate(full.names)}
-        fitted = [names[name] for name in base.model.names]
-        size = base.observed.size
+    def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
+        self.full, self.h, self.base, self.x = full, h, base, x
+        self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in full.parameters])
+        fitted, size = [full.names.index(name) for name in base.model.names], base.observed.size
         # What is only planned has no residual yet that a spring could answer for.
         last = base.n_measured - 1
         chosen = np.zeros(len(base.observed.lead), dtype=bool)
         chosen[np.linspace(0, last, min(ROWS // size, last + 1)).astype(int)] = True
-        part, rows = subset(base.observed, chosen), rows_needed(base.observed, chosen)
-        whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[chosen]))
+        self.part = subset(base.observed, chosen)
+        self.rows = rows_needed(base.observed, chosen)
+        self.whitening = np.linalg.inv(np.linalg.cholesky(base.covariance[chosen]))
         width = prior_deviations(base)
-        X = part.apply(B[rows][:, :, fitted]) * width
+        X = self.part.apply(B[self.rows][:, :, fitted]) * width
         r = base.residual.reshape(-1, size, 1)[chosen]
         r = r + X @ (from_centre(base) / width)[:, None]
-        X, r = ((whitening @ each).reshape(len(part.lead) * size, -1) for each in (X, r))
-        r = np.append(r[:, 0], np.zeros(X.shape[1]))
-        X = np.vstack([X, np.eye(X.shape[1])])
-        return cls(full, h, base, x, part, rows, whitening, X, r)
+        rows = len(self.part.lead) * size
+        X, r = ((self.whitening @ each).reshape(rows, -1) for each in (X, r))
+        self.r = np.append(r[:, 0], np.zeros(X.shape[1]))
+        self.X = np.vstack([X, np.eye(X.shape[1])])
 
     @cached_property
     def starts(self) -> tuple[dict[str, float], ...]:
@@ -431,7 +398,7 @@ class StartSearch:
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
         effect's parameters (k,) and their columns (n_rows, size, k)."""
-        own, table = np.array(own_columns(self.full, self.h)), self.base.observed.table
+        own, table = self.own, self.base.observed.table
         for start in self.screened[0]:
             at, column = self._amplitude(start, table)
             at[own[0]] += self._fits(column[self.rows][:, :, None])[1][0]
@@ -444,12 +411,11 @@ class StartSearch:
     def _amplitude(self, start: Mapping[str, float], table: Measurements) -> tuple[Array, Array]:
         """x (K,) at a start, and the column (n_rows, size) of the amplitude there, from none."""
         at = self.x.copy()
-        at[own_columns(self.full, self.h)[0]] = self.h.parameters[0].nominal
+        at[self.own[0]] = self.h.parameters[0].nominal
         for key, value in start.items():
             at[self.full.names.index(f"{self.h.where}.{key}")] = value
-        own = np.array(own_columns(self.full, self.h)[:1])
         observed = observe(table, self.full.observe)
-        column = self.full.regressor(table, at, own, observed).B
+        column = self.full.regressor(table, at, self.own[:1], observed).B
         return at, column.reshape(len(table), observed.size)
 
     @cached_property
@@ -558,10 +524,6 @@ class StartSearch:
         return self._unexplained @ self._unexplained - explained**2, explained / size, C
 
 
-def own_columns(full: Model, h: Hypothesis) -> list[int]:
-    return [k for k, p in enumerate(full.parameters) if (p.effect, p.where) == h.key]
-
-
 # Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
 
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
@@ -576,7 +538,8 @@ class Columns:
 
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
     an effect (or entry) at a place.  `full` is the model with all of them, at x (K,); `shares`
-    are what effects that were looked for from many starts pay for them, see `with_tangents`.
+    are of effects that were looked for from many starts the logarithms of their mean likelihood
+    over all of these relative to that at the best one, which is in x.
     """
 
     base: Baseline
@@ -654,7 +617,14 @@ def compute_columns(
     for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
-    B, x, shares = with_tangents(full, places, direct, base, x, B)
+    shares: dict[tuple[str, str], float] = {}
+    for h in direct:
+        own = places[h.key]
+        shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
+        if not shown.all() and shown.sum() == 1:
+            search = StartSearch(full, h, base, x, B)
+            shares[h.key] = search.screened[1]
+            x[own], B[:, :, own] = next(search.tangents())
     return Columns(base, B, places, full, x, shares)
 
 

@@ -317,11 +317,20 @@ def fit_noise(
     """
     if start is None and len(data.r) >= 2 * SOME:
         start = fit_noise(data.every(len(data.r) // SOME))
-    if start is not None:
-        return _climbed(data, start, enough)
-    starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [balanced(data)])]
-    ends = [fit_noise(data, one, enough) for one in starts]
-    return min(ends, key=lambda end: posterior(data, end))
+    if start is None:
+        starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [balanced(data)])]
+        ends = [fit_noise(data, one, enough) for one in starts]
+        return min(ends, key=lambda end: posterior(data, end))
+    # By steps in log a, log c and log s: the latter are known apart from each other.
+    to = doubled(data.G.shape[2])
+
+    def objective(logs: Array) -> tuple[float, Array, Array]:
+        value, slope, information = data.model.objective(to @ logs)
+        return value, to.T @ slope, to.T @ information @ to
+
+    begin: Array = linalg.solve(to, start.logs())
+    found = climb(objective, begin, begin - FARTHEST, begin + FARTHEST, enough, STEPS)[0]
+    return NoiseValues.of(np.exp(to @ found))
 
 
 def balanced(data: NoisyData) -> NoiseValues:
@@ -335,16 +344,3 @@ def balanced(data: NoisyData) -> NoiseValues:
     moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
     joint = np.clip(np.sqrt(0.5 * square / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
     return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, np.full_like(joint, SHARED))
-
-
-def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
-    """By steps in log a, log c and log s: the latter are known apart from each other."""
-    to = doubled(data.G.shape[2])
-
-    def objective(logs: Array) -> tuple[float, Array, Array]:
-        value, slope, information = data.model.objective(to @ logs)
-        return value, to.T @ slope, to.T @ information @ to
-
-    begin: Array = linalg.solve(to, start.logs())
-    found = climb(objective, begin, begin - FARTHEST, begin + FARTHEST, enough, STEPS)[0]
-    return NoiseValues.of(np.exp(to @ found))

@@ -138,7 +138,7 @@ class Suspects:
 
     def _rivals(self) -> list[tuple[str, str]]:
         items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
-        keys = [item.key for item in items] + self._found
+        keys = [item.what.key for item in items] + self._found
         return keys + self._likeliest() if self.unknown else keys
 
     @property
@@ -225,7 +225,7 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
             of_rival = fit_set(dataset, (rival, *s.beside), noise)
             found = distances(dataset, of_rival, 0)
             near |= {key: min(near[key], d) for key, d in found.items()}
-        taken = {item.key for item in (*s.rivals, *s.beside)}
+        taken = {item.what.key for item in (*s.rivals, *s.beside)}
         free = [
             key
             for key, p in chance.items()
@@ -235,7 +235,7 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
         rivals = [*s.rivals, *(items[key] for key in free)]
         # Those named have their probability given that there is something, as these need, too.
         something = max(1 - diagnosis.probability_nothing, 1e-9)
-        probable = [chance[item.key] for item in s.rivals]
+        probable = [chance[item.what.key] for item in s.rivals]
         probable += [chance[key] / something for key in free]
         out.append(RivalSet.of(rivals, probable, s.beside))
     return tuple(out)
@@ -255,7 +255,7 @@ def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
         what.where, model.chain, model.cell
     ):
         return []
-    starts = StartSearch.of(of.full, what, of.base, of.x, of.rows).tangents()
+    starts = StartSearch(of.full, what, of.base, of.x, of.rows).tangents()
     return [dataset.pack(C) * dataset.sizes_in(what, C) for _, C in starts]
 
 
@@ -394,19 +394,20 @@ class Discrimination:
     def open(self) -> bool:
         return bool(np.any(self.classes != self.classes[0]))
 
-    def gram(self, chosen: Sequence[int]) -> Array:
+    def _gram(self, chosen: Sequence[int]) -> Array:
         """Gram matrix (w, w) of the data so far and the chosen candidates."""
         H = self.pool[list(chosen)].reshape(-1, len(self.known))
         return self.known + H.T @ H
 
-    def squared(self, gram: Array) -> Array:
-        """d² (…, rivals, rivals, draws) of every ordered pair by gram (…, w, w); zero of a rival
-        with itself."""
-        return self._apart(eliminated(gram, self.nuisance))
+    def squared(self, chosen: Sequence[int]) -> Array:
+        """d² (rivals, rivals, draws) of every ordered pair by the data so far and the chosen
+        candidates; zero of a rival with itself."""
+        return self._apart(eliminated(self._gram(chosen), self.nuisance))
 
-    def squared_with_each(self, gram: Array) -> Array:
-        """d² (N, rivals, rivals, draws) with each candidate added to the visits behind `gram`."""
-        return self.squared(gram + self.pool.transpose(0, 2, 1) @ self.pool)
+    def squared_with_each(self, chosen: Sequence[int]) -> Array:
+        """d² (N, rivals, rivals, draws) with each candidate added to those chosen."""
+        each = self._gram(chosen) + self.pool.transpose(0, 2, 1) @ self.pool
+        return self._apart(eliminated(each, self.nuisance))
 
     def _apart(self, S: Array) -> Array:
         n = len(self.draws)
@@ -505,7 +506,7 @@ def judged(
     with their distance in all of it."""
     out, hopeless = [], {}
     for c in tasks:
-        d = c.distances(c.squared(c.gram(range(len(c.pool)))))
+        d = c.distances(c.squared(range(len(c.pool))))
         near = d < APART_AT_LAST
         classes = connected_components(near, directed=False)[1].astype(np.int64)
         out.append(replace(c, classes=classes))
@@ -525,7 +526,7 @@ def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
 def pairs_of(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
     out = []
     for c in tasks:
-        before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))
+        before, after = c.distances(c.before), c.distances(c.squared(chosen))
         names = c.rivals.names
         for a, b in zip(*np.triu_indices(len(names), 1), strict=True):
             out.append(RivalPair(names[a], names[b], float(before[a, b]), float(after[a, b])))

@@ -68,7 +68,7 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
     same = [
         i
         for i, other in enumerate(slot.items)
-        if other.known and id(other.what) not in taken and near[other.key] < TOO_NEAR
+        if other.known and id(other.what) not in taken and near[other.what.key] < TOO_NEAR
     ]
     # More than so many are no answer; the others stand among the candidates.
     same = sorted(same, key=lambda i: -each[i])[: LARGEST_SET - 1]
@@ -150,7 +150,7 @@ class FewAnswer(SumAnswer):
     @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         several = (rivals for rivals in self.rivals if len(rivals) > 1)
-        return tuple(tuple(EffectAt(*item.key) for item, _ in rivals) for rivals in several)
+        return tuple(tuple(EffectAt(*item.what.key) for item, _ in rivals) for rivals in several)
 
     @property
     def _named(self) -> list[int]:
@@ -159,7 +159,7 @@ class FewAnswer(SumAnswer):
     @property
     def effects(self) -> tuple[FoundEffect, ...]:
         own = ((k, *self.rivals[k][0]) for k in self._named)
-        found = tuple(self._found_effect(*item.key, [k], p) for k, item, p in own)
+        found = tuple(self._found_effect(*item.what.key, [k], p) for k, item, p in own)
         return beside_unknown(found) if self.selected.chosen.unknown else found
 
     @cached_property
