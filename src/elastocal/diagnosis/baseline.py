@@ -158,21 +158,14 @@ def fit_baseline(
     observed = observe(table, model.observe)
     free = np.arange(len(model.parameters))
     weights = weights_for(observed, model.cell.tracker, "auto")
-    started = x0 is not None
+    nominal = np.full(len(observed.value), np.nan)
+    begun = start_values(model, table, seed) if x0 is None else x0
+    problem = posed(model, observed, weights, begun, free)
     if x0 is None:
-        x0 = start_values(model, table, seed)
-    problem = posed(model, observed, weights, x0, free)
-    nominal = None
-    if not started:
         problem, nominal = with_placed(problem, PLACING)
-    if len(free):
-        found = tied_fit(problem, TOLERANCE)
-        x, residual = found.x, found.residual
-    else:
-        x, residual = x0, problem.residual(x0)
-    nominal = np.full_like(residual, np.nan) if nominal is None else nominal
+    found = tied_fit(problem, TOLERANCE)
     stated = stated_by_observation(observed, model.cell.tracker)
-    return Baseline(model, observed, x, problem.sizes, residual, nominal, stated)
+    return Baseline(model, observed, found.x, problem.sizes, found.residual, nominal, stated)
 
 
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough

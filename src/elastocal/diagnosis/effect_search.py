@@ -22,7 +22,7 @@ from elastocal.diagnosis.evidence import (
     exceedance,
     scan,
 )
-from elastocal.diagnosis.hypotheses import Hypothesis, compute_columns, with_keys
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import (
     SHARED,
     NoiseValues,
@@ -214,11 +214,9 @@ def with_items(
     dataset: DiagnosisData, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> NoisyData:
     """The data with the items' columns at the given scales."""
-    if not items:
-        return dataset.data
-    columns = np.concatenate([dataset.packed(item.what, item.settings) for item in items], axis=2)
-    p = len(dataset.data.precision)
-    return dataset.data.with_columns(columns, _precision(dataset.data, items, scales)[p:])
+    data = dataset.data
+    X = np.concatenate([data.X, *(dataset.packed(i.what, i.settings) for i in items)], axis=2)
+    return replace(data, X=X, precision=_precision(data, items, scales))
 
 
 # Which other effects would look the same in these poses: what no size of noise can tell apart.
@@ -246,16 +244,15 @@ def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[st
     return out
 
 
-def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array | None:
+def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array:
     """Settings (G, …) at which a rival may imitate an item: those of the search and, where both
-    have the same kind of constant, the item's own, which was refined between them.  None where
-    the rival has none."""
-    if not rival.settings:
-        return None
-    values = dataset.grids[rival.key].values
-    same_kinds = [s.kind for s in rival.settings] == [s.kind for s in item.what.settings]
-    within = same_kinds and all(
-        s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
+    have the same kind of constant, the item's own, which was refined between them."""
+    values = dataset.grids.get(rival.key, NO_SETTINGS).values
+    kinds, own = ([s.kind for s in what.settings] for what in (rival, item.what))
+    within = (
+        bool(kinds)
+        and kinds == own
+        and all(s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True))
     )
     return np.vstack([values, item.settings]) if within else values
 
@@ -335,8 +332,7 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     """Play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
-    evidence = [float(grams.of(h).evidence(h.scales).max()) for h in play]
-    likeliest = play[int(np.argmax(evidence))]
+    likeliest = max(play, key=lambda h: float(grams.of(h).evidence(h.scales).max()))
     return fit_set(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 
 

@@ -290,7 +290,7 @@ def alternatives(
             out.append(())
             continue
         lists = [settings_to_try(dataset, what, rivals.rivals[a]) for a in others]
-        tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
+        tried = np.unique(np.vstack(lists), axis=0)
         size = float(what.scales.max())
         explained = np.array([grams[a].of(what, tried).explained(size) for a in others])
         short = explained.max(axis=1, keepdims=True) - explained
