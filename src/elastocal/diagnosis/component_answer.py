@@ -42,7 +42,6 @@ from elastocal.diagnosis.stated_floor import (
     each_left_out,
     rms_with_interval,
     squared_lengths,
-    supported_floor,
     with_intervals,
 )
 from elastocal.identification.scrutiny import BudgetStep
@@ -209,7 +208,7 @@ class SumAnswer:
         """What of the noise beside the sum is noise, and what is unexplained."""
         squares, count = self._left_out
         best = math.sqrt(squares.sum() / count.sum())
-        return supported_floor(self.dataset, self.found.data, self.found.noise, best)
+        return SupportedFloor(self.dataset, self.found.data, self.found.noise, best)
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:

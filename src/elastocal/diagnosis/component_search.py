@@ -38,9 +38,9 @@ from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.lines import (
     FEW_POSES,
+    OrderPosterior,
     families_of,
     line_families,
-    order_posterior,
     ripples,
     sharpened,
     with_scatter,
@@ -263,12 +263,12 @@ def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSu
     one order is more probable than all others and none together; the most probable first."""
     while lined := {family.where for family in families_of(found)}:
         others = (h for h in ripples(dataset) if h.where not in lined)
-        each = [order_posterior(dataset, found, h) for h in others]
+        each = [OrderPosterior(dataset, found, h) for h in others]
         chances = [p.probability(p.likeliest_line[0]) for p in each]
         if max(chances, default=0.0) <= PROBABLE:
             break
         likeliest = each[int(np.argmax(chances))]
-        family = likeliest.family(dataset, *likeliest.likeliest_line)
+        family = likeliest.family(*likeliest.likeliest_line)
         noise = with_scatter(found.noise, index(family.where), likeliest.scatter)
         found = _tuned(dataset, exchanged(replace(found, noise=noise), [], [family]))
     return found
@@ -290,10 +290,10 @@ def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
             if len(own) != 1:
                 continue
             now, lines = dict(own[0].settings)["order_1"], len(own[0].settings) // 2
-            orders = order_posterior(dataset, found, h, own)
+            orders = OrderPosterior(dataset, found, h, own)
             best, m = orders.best
             if abs(best - now) > orders.resolution or m != lines:
-                other = replace(orders.family(dataset, best, m), search=own[0].search)
+                other = replace(orders.family(best, m), search=own[0].search)
                 found = _tuned(dataset, exchanged(found, own, [other], refit_noise=False))
         if found is before:
             break

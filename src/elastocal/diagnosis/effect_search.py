@@ -19,8 +19,6 @@ from elastocal.diagnosis.evidence import (
     Grams,
     Item,
     Scan,
-    exceedance,
-    scan,
 )
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import (
@@ -45,19 +43,37 @@ from elastocal.units import Array, IntArray
 REFINED_ROUNDS = 3  # of settings that depend on each other
 
 
-@dataclass(frozen=True)
 class ModelSet:
     """Additions `items` to the fitted model, noise fitted beside them, and the log posterior.
 
     `score` = log evidence at the fitted noise, sizes mixed, + log prior of noise and items.
-    `data` holds the items' columns at the best of their scales, `scales` (items,).
+    `data` holds the items' columns at the best of their scales, `scales` (items,).  The noise is
+    fitted from `start`, twice where the best scale is not the typical one; the items' columns, of
+    typical size, stand last in `joined`.
     """
 
-    items: tuple[Item, ...]
-    noise: NoiseValues
-    data: NoisyData
-    score: float
-    scales: tuple[float, ...]
+    def __init__(
+        self, dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None,
+        joined: NoisyData | None = None,
+    ) -> None:  # fmt: skip
+        noise, scales = start, (1.0,) * len(items)
+        data = joined = joined or with_items(dataset, items, scales)
+        for _ in range(2):
+            noise = fit_noise(data, noise)
+            weighted = Weighted.of(joined, noise)
+            best, score = _mixed_scales(dataset.data, weighted, items, scales)
+            if best == scales:
+                break
+            scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
+        assert noise is not None
+        self.items, self.noise, self.data, self.scales = items, noise, data, scales
+        at = weighted.projection(data.precision)
+        z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
+        for item, span in zip(items, self.spans, strict=True):
+            score += item.log_prior
+            if isinstance(item.what, Hypothesis):
+                score += within_bounds(z[span][item.what.bounded])
+        self.score = score - 0.5 * log_prior(dataset.data.stated, noise)
 
     @cached_property
     def at(self) -> Projection:
@@ -99,32 +115,6 @@ def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
     """Where groups of so many coefficients each stand, the last of `total`."""
     ends = np.cumsum([total - sum(widths), *widths]).tolist()
     return tuple(slice(*pair) for pair in pairwise(ends))
-
-
-def fit_set(
-    dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None,
-    joined: NoisyData | None = None,
-) -> ModelSet:  # fmt: skip
-    """Fit the noise beside the items, twice where their best scale is not the typical one; their
-    columns, of typical size, stand last in `joined`."""
-    noise, scales = start, (1.0,) * len(items)
-    data = joined = joined or with_items(dataset, items, scales)
-    for _ in range(2):
-        noise = fit_noise(data, noise)
-        weighted = Weighted.of(joined, noise)
-        best, score = _mixed_scales(dataset.data, weighted, items, scales)
-        if best == scales:
-            break
-        scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
-    assert noise is not None
-    at = weighted.projection(data.precision)
-    z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
-    for item, span in zip(items, spans_of([i.what.width for i in items], len(z)), strict=True):
-        score += item.log_prior
-        if isinstance(item.what, Hypothesis):
-            score += within_bounds(z[span][item.what.bounded])
-    score -= 0.5 * log_prior(dataset.data.stated, noise)
-    return ModelSet(items, noise, data, score, scales)
 
 
 def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ...]) -> Array:
@@ -207,7 +197,7 @@ def _refined(
     if not searched:
         return None
     refined = replace(item, settings=settings)
-    return fit_set(dataset, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), noise)
+    return ModelSet(dataset, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), noise)
 
 
 def with_items(
@@ -333,7 +323,7 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
     likeliest = max(play, key=lambda h: float(grams.of(h).evidence(h.scales).max()))
-    return fit_set(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
+    return ModelSet(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 
 
 def doubt(better: ModelSet, other: ModelSet) -> float:
@@ -523,7 +513,7 @@ class ForwardSelection:
 
     def run(self) -> SelectedEffects:
         dataset = self.dataset
-        nothing = current = fit_set(dataset, (), dataset.data.noise)
+        nothing = current = ModelSet(dataset, (), dataset.data.noise)
         first = alone = scanned = self._scan(nothing, beside=nothing)
         slots, visited, p = list[Slot](), set[frozenset[int]](), None
         while True:
@@ -544,18 +534,17 @@ class ForwardSelection:
                 break
             if current.items and slot.probabilities()[1] > DOUBT_MORE:
                 break
-            chance = exceedance(observed.odds[1:], float(observed.odds[0]))
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
-            if chance > self.level or key in visited:
+            if observed.chance > self.level or key in visited:
                 break
             visited.add(key)
-            p = chance if p is None else p
+            p = observed.chance if p is None else p
             current = best
             slots.append(slot)
             if (anew := relinearised(self.dataset, current)) is not self.dataset:
                 self._turn_to(anew)
-                current = fit_set(anew, current.items, current.noise)
+                current = ModelSet(anew, current.items, current.noise)
             if len(current.items) > 1:
                 current, slots = self._reexamined(current, slots)
             if len(current.items) + 1 >= MANY:
@@ -565,7 +554,7 @@ class ForwardSelection:
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
         if not current.items or p is None:
-            current, p = nothing, exceedance(first.odds[1:], float(first.odds[0]))
+            current, p = nothing, first.chance
             self.dataset = dataset
         self._turn_to(self.dataset)
         slots = slots or [start]
@@ -606,7 +595,7 @@ class ForwardSelection:
             noise = current.noise.of_instrument()
             together = left_out_together(self.dataset, current)
             without = [
-                fit_set(self.dataset, current.without(k), current.noise)
+                ModelSet(self.dataset, current.without(k), current.noise)
                 for k in range(len(current.items))
             ]
             now = left_out_square(current.data, noise, together)
@@ -624,7 +613,7 @@ class ForwardSelection:
         given: they hold nothing of what this one explains."""
         flips = None if beside is None else (self.signs, beside.at.scattered)
         something, noise = ANOTHER if current.items else SOMETHING, noise or current.noise
-        return scan(self.dataset, self.generic, something, current.data, noise, flips)
+        return Scan(self.dataset, self.generic, something, current.data, noise, flips)
 
     def _best_addition(
         self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND
@@ -662,7 +651,7 @@ class ForwardSelection:
         new = {key: items for key, items in zip(keys, sets, strict=True) if key not in self._fitted}
 
         def fitted(joined: tuple[tuple[Item, ...], NoisyData]) -> ModelSet:
-            return fit_set(dataset, joined[0], current.noise, joined[1])
+            return ModelSet(dataset, joined[0], current.noise, joined[1])
 
         columns = ((s, with_items(dataset, s, (1.0,) * len(s))) for s in new.values())
         for key, found in zip(new, ahead(fitted, columns, dataset.data.threads), strict=True):
@@ -681,7 +670,7 @@ class ForwardSelection:
         for _ in range(2):
             changed, k = False, 0
             while k < len(current.items):
-                others = fit_set(self.dataset, current.without(k), current.noise)
+                others = ModelSet(self.dataset, current.without(k), current.noise)
                 scanned = self._scan(others, current.noise)
                 best, slot = self._best_addition(others, scanned, BEHIND_COMPLETE)
                 slots[k] = slot
@@ -693,7 +682,7 @@ class ForwardSelection:
                 if other and best.score > current.score + 1e-6:
                     items = list(best.items)
                     items.insert(k, items.pop())
-                    current = fit_set(self.dataset, tuple(items), best.noise)
+                    current = ModelSet(self.dataset, tuple(items), best.noise)
                     changed = True
                 k += 1
             if not changed:

@@ -335,9 +335,9 @@ class Item:
         return self.what.known
 
 
-@dataclass(frozen=True)
 class Scan:
-    """Everything scored under one noise, and the odds of all together.
+    """Everything scored under one `noise` beside the columns in `data`, where `something` is
+    missing with this probability, and the odds of all together.
 
     `items` are hypotheses, then blocks, each at its best settings, of log posterior `scores` (W,)
     over the model without it, up to what they share; `distance` (W,) is d of a typical size there,
@@ -347,41 +347,33 @@ class Scan:
     log marginal likelihood of the data beside which they were scored.
     """
 
-    items: tuple[Item, ...]
-    scores: Array
-    distance: Array
-    odds: Array
-    covariates: dict[str, Array]
-    marginal: float
-    noise: NoiseValues
+    def __init__(
+        self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
+        noise: NoiseValues, flips: Flips | None = None,
+    ) -> None:  # fmt: skip
+        prior = log_prior_odds(dataset.hypotheses, generic, something)
+        grams = Grams(dataset, data, project(data, noise), flips)
+        items, distance, rows = list[Item](), list[float](), list[Array]()
+        self.covariates: dict[str, Array] = {}
+        whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
+        for what, w in zip(whats, prior.tolist(), strict=True):
+            grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
+            each = spectra.evidences(what.scales)
+            weighed = each + grid.log_prior[:, None]
+            evidence, k = log_sum(weighed, axis=0), int(np.argmax(weighed[:, 0]))
+            rows.append(evidence)
+            # What the search over settings costs stays with the item.
+            items.append(Item(what, grid.values[k], w + float(evidence[0] - each[k, 0])))
+            distance.append(float(spectra.distance[k]))
+            if isinstance(what, Generic):
+                largest = self.covariates.get(what.covariate, evidence)
+                self.covariates[what.covariate] = np.maximum(largest, evidence)
+        scores = prior[:, None] + np.array(rows)
+        self.items, self.scores, self.distance = tuple(items), scores[:, 0], np.array(distance)
+        self.odds = log_sum(scores, axis=0) - float(logsumexp(prior))
+        self.marginal, self.noise = grams.at.marginal, noise
 
-
-def scan(
-    dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
-    noise: NoiseValues, flips: Flips | None = None,
-) -> Scan:  # fmt: skip
-    """Score all hypotheses and blocks beside the columns in `data`, where `something` is missing
-    with this probability."""
-    prior = log_prior_odds(dataset.hypotheses, generic, something)
-    grams = Grams(dataset, data, project(data, noise), flips)
-    items, distance, rows = list[Item](), list[float](), list[Array]()
-    covariates: dict[str, Array] = {}
-    whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
-    for what, w in zip(whats, prior.tolist(), strict=True):
-        grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
-        each = spectra.evidences(what.scales)
-        weighed = each + grid.log_prior[:, None]
-        evidence, k = log_sum(weighed, axis=0), int(np.argmax(weighed[:, 0]))
-        rows.append(evidence)
-        # What the search over settings costs stays with the item.
-        items.append(Item(what, grid.values[k], w + float(evidence[0] - each[k, 0])))
-        distance.append(float(spectra.distance[k]))
-        if isinstance(what, Generic):
-            covariates[what.covariate] = np.maximum(
-                covariates.get(what.covariate, -np.inf), evidence
-            )
-    scores = prior[:, None] + np.array(rows)
-    odds = log_sum(scores, axis=0) - float(logsumexp(prior))
-    return Scan(
-        tuple(items), scores[:, 0], np.array(distance), odds, covariates, grams.at.marginal, noise
-    )
+    @property
+    def chance(self) -> float:
+        """p-value of the odds among those that the flips yield."""
+        return exceedance(self.odds[1:], float(self.odds[0]))

@@ -277,24 +277,45 @@ class KnownFamily:
     size: float
 
 
-@dataclass(frozen=True, eq=False)
 class OrderPosterior:
-    """Of the joint of `h`: what the odds are against no family of `orders` (G,), the lowest one
-    of `multiples` (G,) lines: `log_odds` (G,), prior and width of the grid included, of which
-    `presence` is that of any family; `evidence` (G,) over none.  `grams` score lines of these
-    `scales` under the `scatter` of the joint that is the likeliest with them.
+    """Of the lines of the joint of the ripple `h` beside the sum without the family `own`: what the
+    odds are against no family of `orders` (G,), the lowest one of `multiples` (G,) lines.
+
+    `log_odds` (G,) has prior and width of the grid in it, of which `presence` is that of any
+    family; `evidence` (G,) is over none.  `grams` score lines of these `scales` under the `scatter`
+    of the joint that is the likeliest with them.
     """
 
-    h: Hypothesis
-    orders: Array
-    multiples: IntArray
-    log_odds: Array
-    presence: float
-    evidence: Array
-    resolution: float
-    grams: Grams
-    scales: Array
-    scatter: tuple[float, float]
+    def __init__(
+        self, dataset: DiagnosisData, found: FittedSum, h: Hypothesis,
+        own: Sequence[Component] = (),
+    ) -> None:  # fmt: skip
+        i, unit = index(h.where), _apart(dataset, h.where)
+        grid = [np.arange(LOWEST, HIGHEST / m, FINE * unit / m) for m in MULTIPLES]
+        self.h, self.resolution, self.orders = h, SAME * unit, np.concatenate(grid)
+        self.multiples = np.repeat(MULTIPLES, [len(part) for part in grid])
+        fellows = [f for f in families_of(found) if f.where != h.where]
+        mean, variance = alike(np.array([f.size for f in fellows]), 0.0, ALONE)
+        spread = np.sqrt(variance) * ndtri((np.arange(SIZES) + 0.5) / SIZES)
+        self.scales = np.exp(mean + spread)
+        n, k = len(turning_joints(dataset.base.model.chain)), len(fellows)
+        self.presence = presence_cost(n, k) - presence_cost(n, k + 1)
+        # What is not known of its lines counts as scatter of the joint.
+        none, each, grams_of = [], [], []
+        tried = [scatter_of(found.noise, i), *less_scatter(found.noise, i)]
+        for scatter in tried:
+            noise = with_scatter(found.noise, i, scatter)
+            grams = beside(dataset, found, noise, own)
+            none.append(grams.at.marginal - 0.5 * log_prior(grams.data.stated, noise))
+            gains = [family_evidence(grams, h, part, m, self.scales)
+                     for m, part in zip(MULTIPLES, grid, strict=True)]  # fmt: skip
+            each.append(none[-1] + np.concatenate(gains))
+            grams_of.append(grams)
+        self.evidence = logsumexp(each, axis=0) - float(logsumexp(none))
+        prior = log_prior_of(self.orders, self.multiples, unit, fellows)
+        self.log_odds = self.evidence + self.presence + prior
+        likeliest = int(np.argmax([e[np.argmax(self.log_odds)] for e in each]))
+        self.grams, self.scatter = grams_of[likeliest], tried[likeliest]
 
     def odds_near(self, order: float, m: int | None = None) -> float:
         """Log odds of a family at this order, as far as these data resolve it, against none; of m
@@ -337,7 +358,7 @@ class OrderPosterior:
             its |= (np.abs(k * self.orders - order) <= self.resolution) & (self.multiples >= k)
         return math.exp(self._odds(its) - np.logaddexp(0.0, logsumexp(self.log_odds)))
 
-    def family(self, dataset: DiagnosisData, order: float, m: int) -> Component:
+    def family(self, order: float, m: int) -> Component:
         """The family of m lines near this order, where it fits best.
 
         The nats that its search costs are those that make of its evidence, and of the odds that
@@ -350,41 +371,9 @@ class OrderPosterior:
         lowest, sd, _ = refined_order(self.grams, self.h, at, m, width, self.scales)
         own = float(logit(min(self.probability(order), CERTAIN)))
         search = max(float(self.evidence[k]) + self.presence - own, 0.0)
-        return replace(family_component(dataset, self.h.where, lowest, m, sd, search), given=True)
-
-
-def order_posterior(
-    dataset: DiagnosisData, found: FittedSum, h: Hypothesis, own: Sequence[Component] = ()
-) -> OrderPosterior:
-    """Of the lines of the joint of the ripple `h` beside the sum without the family `own`."""
-    i = index(h.where)
-    unit = _apart(dataset, h.where)
-    grid = [np.arange(LOWEST, HIGHEST / m, FINE * unit / m) for m in MULTIPLES]
-    orders = np.concatenate(grid)
-    multiples = np.repeat(MULTIPLES, [len(part) for part in grid])
-    fellows = [f for f in families_of(found) if f.where != h.where]
-    mean, variance = alike(np.array([f.size for f in fellows]), 0.0, ALONE)
-    scales = np.exp(mean + np.sqrt(variance) * ndtri((np.arange(SIZES) + 0.5) / SIZES))
-    n, k = len(turning_joints(dataset.base.model.chain)), len(fellows)
-    presence = presence_cost(n, k) - presence_cost(n, k + 1)
-    # What is not known of its lines counts as scatter of the joint.
-    none, each, grams_of = [], [], []
-    tried = [scatter_of(found.noise, i), *less_scatter(found.noise, i)]
-    for scatter in tried:
-        noise = with_scatter(found.noise, i, scatter)
-        grams = beside(dataset, found, noise, own)
-        none.append(grams.at.marginal - 0.5 * log_prior(grams.data.stated, noise))
-        gains = [family_evidence(grams, h, part, m, scales)
-                 for m, part in zip(MULTIPLES, grid, strict=True)]  # fmt: skip
-        each.append(none[-1] + np.concatenate(gains))
-        grams_of.append(grams)
-    evidence = logsumexp(each, axis=0) - float(logsumexp(none))
-    log_odds = evidence + presence + log_prior_of(orders, multiples, unit, fellows)
-    likeliest = int(np.argmax([e[np.argmax(log_odds)] for e in each]))
-    return OrderPosterior(
-        h, orders, multiples, log_odds, presence, evidence, SAME * unit,
-        grams_of[likeliest], scales, tried[likeliest],
-    )  # fmt: skip
+        return replace(
+            family_component(self.grams.dataset, self.h.where, lowest, m, sd, search), given=True
+        )
 
 
 def log_prior_of(

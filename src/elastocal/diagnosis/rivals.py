@@ -21,8 +21,8 @@ from elastocal.diagnosis.diagnosis_data import (
 )
 from elastocal.diagnosis.effect_search import (
     PLAUSIBLE,
+    ModelSet,
     distances,
-    fit_set,
     settings_to_try,
     spans_of,
     with_items,
@@ -222,7 +222,7 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
     for s in suspects.sets:
         near = dict.fromkeys(items, np.inf)
         for rival in s.rivals:
-            of_rival = fit_set(dataset, (rival, *s.beside), noise)
+            of_rival = ModelSet(dataset, (rival, *s.beside), noise)
             found = distances(dataset, of_rival, 0)
             near |= {key: min(near[key], d) for key, d in found.items()}
         taken = {item.what.key for item in (*s.rivals, *s.beside)}

@@ -4,7 +4,7 @@ out of the fit."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse, special
@@ -247,17 +247,47 @@ def scatter_beyond(noise: NoiseValues) -> Array:
     return np.maximum(scatter - most_scatter(noise.joint) ** 2, 0.0)
 
 
-@dataclass(frozen=True)
 class SupportedFloor:
-    """3-D rms (m) that is `noise`, and the rest of the fitted noise, which is `unexplained`; the
-    mean squares (m²) of it that each of the `joints` and the `instrument` has.  `stands_out`:
-    whether a joint scatters more than the others let expect."""
+    """How much of the fitted noise is noise: 3-D rms (m) that is `noise`, and the rest of it, which
+    is `unexplained`; the mean squares (m²) of it that each of the `joints` and the `instrument`
+    has.  `stands_out`: whether a joint scatters more than the others let expect.
 
-    noise: float
-    unexplained: float
-    joints: Array
-    instrument: float
-    stands_out: bool
+    `best` (m) is the smallest error left at held-out poses, which no noise exceeds.  Repeats and
+    near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted variance σ²
+    where νs²/σ² is below the χ² quantile; they are then the floor themselves.
+    """
+
+    def __init__(
+        self, dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
+    ) -> None:
+        at = project(data, noise)
+        fitted = min(noise_rms(data, noise), best)
+        size = min(data.blocks.size, 3)
+        scatter = noise.joint**2 * (1 + noise.shared**2)
+        smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
+        above, excess = 0.0, np.zeros_like(scatter)
+        if data.stated:  # else what joints do and what the instrument does are not to be told apart
+            excess = scatter_beyond(noise)
+            smooth = np.maximum(smooth, excess)
+            above = max(noise.factor**2 - MOST_STATED**2, 0.0)
+        stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
+        moved = np.moveaxis(data.G * np.sqrt(smooth), 2, 0)
+        self.joints = np.array([mean_square(data, g) for g in moved])
+        self.instrument = above * mean_square(data, stated)
+        variance = max(fitted**2 - self.joints.sum() - self.instrument, 0.0)
+        total, dof = repeats(dataset, come_back=True)
+        near = near_repeats(dataset, data, at)
+        if near is not None:
+            total += near.scatter**2 * near.independent * size
+            dof += near.independent * size
+        if dof:
+            shown = size * total / dof
+            low = float(special.chdtri(dof, 1 - CONTRADICTED)) / dof
+            high = float(special.chdtri(dof, CONTRADICTED)) / dof
+            if shown < low * fitted**2 or shown > high * variance:
+                variance = shown
+        self.noise, self.stands_out = min(float(np.sqrt(variance)), fitted), bool(excess.any())
+        self.unexplained = float(np.sqrt(max(fitted**2 - self.noise**2, 0.0)))
 
     @property
     def open(self) -> bool:
@@ -286,46 +316,6 @@ def mean_square(data: NoisyData, packed: Array) -> float:
     """Mean over the readings of the squared 3-D length of `packed` (C, m)."""
     squares, count = squared_lengths(data, packed)
     return float(squares.sum() / count.sum())
-
-
-def supported_floor(
-    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
-) -> SupportedFloor:
-    """How much of the fitted noise is noise; `best` (m) is the smallest error left at held-out
-    poses, which no noise exceeds.
-
-    Repeats and near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted
-    variance σ² where νs²/σ² is below the χ² quantile; they are then the floor themselves.
-    """
-    at = project(data, noise)
-    fitted = min(noise_rms(data, noise), best)
-    size = min(data.blocks.size, 3)
-    scatter = noise.joint**2 * (1 + noise.shared**2)
-    smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
-    above, excess = 0.0, np.zeros_like(scatter)
-    if data.stated:  # else what joints do and what the instrument does are not to be told apart
-        excess = scatter_beyond(noise)
-        smooth = np.maximum(smooth, excess)
-        above = max(noise.factor**2 - MOST_STATED**2, 0.0)
-    stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
-    moved = np.moveaxis(data.G * np.sqrt(smooth), 2, 0)
-    joints = np.array([mean_square(data, g) for g in moved])
-    instrument = above * mean_square(data, stated)
-    variance = max(fitted**2 - joints.sum() - instrument, 0.0)
-    total, dof = repeats(dataset, come_back=True)
-    near = near_repeats(dataset, data, at)
-    if near is not None:
-        total += near.scatter**2 * near.independent * size
-        dof += near.independent * size
-    if dof:
-        shown = size * total / dof
-        low = float(special.chdtri(dof, 1 - CONTRADICTED)) / dof
-        high = float(special.chdtri(dof, CONTRADICTED)) / dof
-        if shown < low * fitted**2 or shown > high * variance:
-            variance = shown
-    floor = min(float(np.sqrt(variance)), fitted)
-    unexplained = float(np.sqrt(max(fitted**2 - floor**2, 0.0)))
-    return SupportedFloor(floor, unexplained, joints, instrument, bool(excess.any()))
 
 
 # Errors on configurations, or blocks of time, left out of the fit, in closed form.
