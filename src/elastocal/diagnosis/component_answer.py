@@ -84,7 +84,7 @@ class SumAnswer:
 
     @cached_property
     def at(self) -> Projection:
-        return self._weighted.projection(self._wide.precision)
+        return Projection(self._weighted, self._wide.precision)
 
     @cached_property
     def _fitted(self) -> Projection:

@@ -67,7 +67,7 @@ class ModelSet:
             scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
         assert noise is not None
         self.items, self.noise, self.data, self.scales = items, noise, data, scales
-        at = weighted.projection(data.precision)
+        at = Projection(weighted, data.precision)
         z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
         for item, span in zip(items, self.spans, strict=True):
             score += item.log_prior

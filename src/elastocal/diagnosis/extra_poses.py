@@ -22,7 +22,7 @@ from elastocal.diagnosis.rivals import (
     Suspects,
     as_diagnosed,
     check_open,
-    judged,
+    inseparable,
     pairs_of,
     together,
     with_neighbours,
@@ -210,7 +210,7 @@ def discriminations_of(
     dataset, so_far, noise = with_pool(base, pool, suspects)
     sets = [*suspects.sets, *([suspects.unknown_set(so_far, noise)] if suspects.unknown else [])]
     return [
-        Discrimination.of(dataset, so_far, noise, len(pool), s, np.random.default_rng(seed))
+        Discrimination(dataset, so_far, noise, len(pool), s, np.random.default_rng(seed))
         for s in sets
     ]
 
@@ -392,9 +392,9 @@ def _chosen(
     progress: Progress,
 ) -> ExtraPlan:  # fmt: skip
     progress("extra poses: columns of the candidates")
-    drawn = discriminations_of(base, pool, suspects, seed)
-    sets = [c.rivals for c in drawn]
-    tasks, hopeless = judged(drawn)
+    tasks = discriminations_of(base, pool, suspects, seed)
+    sets = [c.rivals for c in tasks]
+    hopeless = inseparable(tasks)
     groups = tuple(group for c in tasks for group in together(c))
     for group in groups:
         near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
@@ -479,9 +479,10 @@ def _pull_notes(
             f"pulley, would separate {apart}: measure poses under it, too"
         )
     if pulled and n:
-        same = [replace(p, classes=c.classes) for p, c in zip(pulled, tasks, strict=True)]
-        chosen = fewest(same, n)
-        reached = expected(same, chosen)
+        for same, c in zip(pulled, tasks, strict=True):
+            same.classes = c.classes
+        chosen = fewest(pulled, n)
+        reached = expected(pulled, chosen)
         as_many = expected(tasks, fewest(tasks, math.ceil(more * n)))
         if reached > max(after, as_many) + GAIN:
             poses = counted(len(chosen), "pose")

@@ -206,20 +206,26 @@ def _precision(n: int, apart: float, common: float) -> Array:
 # (restricted likelihood where Λ → 0; Patterson and Thompson 1971).
 
 
-@dataclass(frozen=True)
 class Projection:
-    """The data under one noise: V⁻¹ (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
+    """The data under one noise, their coefficients under a prior of precision Λ (p,): V⁻¹ (C, m, m)
+    and H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
 
     P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
     likelihood ℓ; `beta_deviation` L⁻¹ (p, p), so that the posterior covariance of β is L⁻ᵀL⁻¹.
     """
 
-    inverse: Array
-    H: Array
-    u: Array
-    beta: Array
-    marginal: float
-    beta_deviation: Array
+    def __init__(self, weighted: Weighted, precision: Array) -> None:
+        at, self.marginal = weighted.factored(precision)
+        back, self.beta_deviation = weighted.root.transpose(0, 2, 1), at.inverse * at.root
+        # As one product: a small one for each configuration waits for memory.
+        flat = weighted.X.reshape(-1, len(at.L))
+        turned = linalg.blas.dtrmm(1.0, self.beta_deviation, flat.T, lower=1).T
+        self.H = back @ turned.reshape(weighted.X.shape)
+        self.u = (back @ weighted.r[..., None])[..., 0] - self.H @ (at.L.T @ at.b)
+        self.beta, self.inverse = at.root * at.b, back @ weighted.root
+        # What does not count has a unit variance of its own.
+        diagonal = np.einsum("cii->ci", self.inverse)
+        diagonal[diagonal == 0] = 1.0
 
     @cached_property
     def P(self) -> Array:
@@ -278,22 +284,9 @@ class Weighted:
     def marginal(self, precision: Array) -> float:
         return self.factored(precision)[1]
 
-    def projection(self, precision: Array) -> Projection:
-        at, marginal = self.factored(precision)
-        back, scaled = self.root.transpose(0, 2, 1), at.inverse * at.root
-        # As one product: a small one for each configuration waits for memory.
-        turned = linalg.blas.dtrmm(1.0, scaled, self.X.reshape(-1, len(at.L)).T, lower=1).T
-        H = back @ turned.reshape(self.X.shape)
-        u = (back @ self.r[..., None])[..., 0] - H @ (at.L.T @ at.b)
-        inverse = back @ self.root
-        # What does not count has a unit variance of its own.
-        diagonal = np.einsum("cii->ci", inverse)
-        diagonal[diagonal == 0] = 1.0
-        return Projection(inverse, H, u, at.root * at.b, marginal, scaled)
-
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
-    return Weighted.of(data, noise).projection(data.precision)
+    return Projection(Weighted.of(data, noise), data.precision)
 
 
 def posterior(data: NoisyData, noise: NoiseValues) -> float:

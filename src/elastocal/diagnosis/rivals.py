@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, islice, permutations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.sparse.csgraph import connected_components
 
@@ -35,7 +34,7 @@ from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model
-from elastocal.units import Array, IntArray
+from elastocal.units import Array
 
 # The noise that a diagnosis found, and the readings that it left out, in the campaign's terms.
 
@@ -60,24 +59,19 @@ FEWEST_KNOWN, MOST_KNOWN, BLOCKS, PLACES = 2, 6, 2, 2
 LEAST_PROBABILITY, LEAST_PROBABILITY_UNKNOWN = 0.01, 0.05
 
 
-@dataclass(frozen=True)
 class RivalSet:
     """Items of which one is at work, `beside` other items that are.
 
-    `probability` (rivals,) of each given that it is one of them.
+    `probability` (rivals,) of each given that it is one of them, none below the `smallest`.
     """
 
-    rivals: tuple[Item, ...]
-    probability: NDArray[np.float64]
-    beside: tuple[Item, ...]
-
-    @classmethod
-    def of(
-        cls, rivals: Sequence[Item], probability: Sequence[float], beside: Sequence[Item],
+    def __init__(
+        self, rivals: Sequence[Item], probability: Sequence[float], beside: Sequence[Item],
         smallest: float = LEAST_PROBABILITY,
-    ) -> RivalSet:  # fmt: skip
+    ) -> None:  # fmt: skip
+        self.rivals, self.beside = tuple(rivals), tuple(beside)
         p = np.maximum(probability, smallest)
-        return cls(tuple(rivals), p / p.sum(), tuple(beside))
+        self.probability = p / p.sum()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -121,7 +115,7 @@ class Suspects:
                 "table cannot test; plan with those that were diagnosed",
             )
         self.sets = tuple(
-            RivalSet.of(
+            RivalSet(
                 [self.items[key] for key in keys], [self.p[key] for key in keys],
                 [self.items[key] for key in self._found if key not in keys],
             ) for keys in groups if len(keys) > 1
@@ -175,7 +169,7 @@ class Suspects:
         best = np.argsort(-evidence, kind="stable")[:BLOCKS]
         share = self.diagnosis.probability_unknown * special.softmax(evidence[best])
         keys = self._likeliest()
-        return RivalSet.of(
+        return RivalSet(
             [*(items[k] for k in best), *(self.items[key] for key in keys)],
             [*share, *(self.p[key] for key in keys)],
             [self.items[key] for key in self._found],
@@ -237,7 +231,7 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
         something = max(1 - diagnosis.probability_nothing, 1e-9)
         probable = [chance[item.what.key] for item in s.rivals]
         probable += [chance[key] / something for key in free]
-        out.append(RivalSet.of(rivals, probable, s.beside))
+        out.append(RivalSet(rivals, probable, s.beside))
     return tuple(out)
 
 
@@ -326,36 +320,23 @@ def eliminated(gram: Array, nuisance: int) -> Array:
 DRAWS = 32  # of each sign
 
 
-@dataclass(frozen=True)
 class Discrimination:
-    """One set of rivals to be told apart, with everything that judges a choice of candidates.
+    """One set of rivals to be told apart, with everything that judges a choice of candidates, which
+    stand last in the dataset, `so_far` without them.
 
-    With whitened columns W, `known` (w, w) is WᵀV⁻¹W of the data so far with the nuisance's prior
-    precision, `pool` (N, m, w) V^−½W of each candidate.  The `nuisance` first columns are those of
-    the fitted parameters and of the effects beside the rivals.  Counted from there come each
-    rival's own, at `groups`, and at `alternatives` those with which it may imitate others instead:
-    at other settings or about other starts, each by itself.  `draws`: γ (draws, k) of each rival;
-    `before` (rivals, rivals, draws) d² in the data so far; `classes` (rivals,): those with the same
-    number are not asked to be told apart.
+    With columns W whitened by V, the covariance of each configuration, `known` (w, w) is WᵀV⁻¹W of
+    the data so far with the nuisance's prior precision, `pool` (N, m, w) V^−½W of each candidate.
+    The `nuisance` first columns are those of the fitted parameters and of the effects beside the
+    rivals.  Counted from there come each rival's own, at `groups`, and at `alternatives` those with
+    which it may imitate others instead: at other settings or about other starts, each by itself.
+    `draws`: γ (draws, k) of each rival; `before` (rivals, rivals, draws) d² in the data so far;
+    `classes` (rivals,): those with the same number are not asked to be told apart.
     """
 
-    rivals: RivalSet
-    known: Array
-    pool: Array
-    nuisance: int
-    groups: tuple[slice, ...]
-    alternatives: tuple[tuple[slice, ...], ...]
-    draws: tuple[Array, ...]
-    before: Array
-    classes: IntArray
-
-    @classmethod
-    def of(
-        cls, dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, candidates: int,
+    def __init__(
+        self, dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, candidates: int,
         rivals: RivalSet, rng: np.random.Generator,
-    ) -> Discrimination:  # fmt: skip
-        """Columns of the rivals whitened by V, the covariance of each configuration; of those of
-        the dataset the last are `candidates`."""
+    ) -> None:  # fmt: skip
         data, measured = dataset.data, len(dataset.data.X) - candidates
         searched = alternatives(so_far, noise, rivals)
 
@@ -371,24 +352,24 @@ class Discrimination:
         own = [packed(rival) for rival in rivals.rivals]
         own += chain.from_iterable(others)
         fitted, n = data.X.shape[2], len(rivals.rivals)
-        nuisance = fitted + sum(C.shape[2] for C in beside)
+        self.rivals, self.nuisance = rivals, fitted + sum(C.shape[2] for C in beside)
         W = np.concatenate([data.X, *beside, *own, data.r[:, :, None]], axis=2)
         L = np.linalg.cholesky(data.V(noise))
         white = np.linalg.solve(L, data.masked(W))
         known = white[:measured].reshape(-1, W.shape[2])
         gram = known.T @ known
-        gram[np.diag_indices(nuisance)] += np.append(data.precision, np.ones(nuisance - fitted))
+        own_precision = np.append(data.precision, np.ones(self.nuisance - fitted))
+        gram[np.diag_indices(self.nuisance)] += own_precision
+        self.known, self.pool = gram[:-1, :-1], white[measured:, :, :-1]
         widths = [C.shape[2] for C in own]
         spans = spans_of(widths, sum(widths))
-        groups, rest = spans[:n], iter(spans[n:])
-        by = tuple(tuple(islice(rest, len(each))) or (groups[b],) for b, each in enumerate(others))
-        S = eliminated(gram, nuisance)
-        draws = _posterior_draws(rivals, groups, S, rng)
-        start = cls(
-            rivals, gram[:-1, :-1], white[measured:, :, :-1], nuisance, groups, by,
-            draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n),
-        )  # fmt: skip
-        return replace(start, before=start._apart(S[:-1, :-1]))
+        self.groups, rest = spans[:n], iter(spans[n:])
+        self.alternatives = [
+            list(islice(rest, len(each))) or [own] for own, each in zip(spans, others, strict=False)
+        ]
+        S = eliminated(gram, self.nuisance)
+        self.draws = _posterior_draws(rivals, self.groups, S, rng)
+        self.before, self.classes = self._apart(S[:-1, :-1]), np.arange(n)
 
     @property
     def open(self) -> bool:
@@ -499,21 +480,18 @@ HOPE = 0.9
 APART_AT_LAST = 2 * float(special.ndtri(HOPE))  # the distance that it takes
 
 
-def judged(
-    tasks: Sequence[Discrimination],
-) -> tuple[list[Discrimination], dict[tuple[str, str], float]]:
-    """Each set in classes that the whole pool could tell apart, and the pairs that it could not,
-    with their distance in all of it."""
-    out, hopeless = [], {}
+def inseparable(tasks: Sequence[Discrimination]) -> dict[tuple[str, str], float]:
+    """The pairs that the whole pool could not tell apart, with their distance in all of it; such
+    rivals are of one class from now on."""
+    hopeless = {}
     for c in tasks:
         d = c.distances(c.squared(range(len(c.pool))))
         near = d < APART_AT_LAST
-        classes = connected_components(near, directed=False)[1].astype(np.int64)
-        out.append(replace(c, classes=classes))
+        c.classes = connected_components(near, directed=False)[1].astype(np.int64)
         names = c.rivals.names
         for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
             hopeless[names[a], names[b]] = float(d[a, b])
-    return out, hopeless
+    return hopeless
 
 
 def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
