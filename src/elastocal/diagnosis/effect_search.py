@@ -522,7 +522,7 @@ class ForwardSelection:
             if best is not None:
                 # Score all again under the noise beside the winner: an effect that is still missing
                 # looks like noise, and hides others with it.
-                if current.items or (best.noise.logs() != scanned.noise.logs()).any():
+                if len(scanned.odds) == 1 or (best.noise.logs() != scanned.noise.logs()).any():
                     observed = self._scan(current, best.noise, best)
                 if not current.items:
                     alone = observed

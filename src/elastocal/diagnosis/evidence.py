@@ -166,8 +166,9 @@ Flips = tuple[Array, Array]
 
 
 class Residuals(NamedTuple):
-    """T residuals: V⁻¹e, of which `signs` (T, C) flip each configuration's, less what the fit takes
-    of them, V⁻¹e − H hᵀ with h (T, p); or what `of` a direction V⁻¹e is (C, …), as it stands."""
+    """T residuals that differ by the `signs` (T, C) of their configurations: P times one of them is
+    s V⁻¹e − H h, with `of` V⁻¹e (C, m), or its products (C, …) with the motions of an entry, and
+    h (T, p)."""
 
     signs: Array
     of: Array
