@@ -591,17 +591,6 @@ def _by_method(course: Course) -> MethodResult:
 # or the bound where it lies beyond.  What the readings say of it is the interval.
 
 
-def hardly_shown(found: MethodResult) -> dict[int, tuple[float, float]]:
-    """The 95 % intervals, by parameter, of those fitted that reach beyond a physical bound and
-    stand alone."""
-    solution, reach = found.solution, {}
-    for k, c in enumerate(solution.reduction.kept.tolist()):
-        p, (terms, _, (low, high)) = solution.problem.model.parameters[c], found.told(k)
-        if (low <= p.lower < np.inf or -np.inf < p.upper <= high) and not p.shrunk and not terms:
-            reach[c] = (low, high)
-    return reach
-
-
 def with_limits(every: Solution, found: MethodResult, options: Options) -> MethodResult:
     """The result with the parameters that the readings hardly show held, and the others fitted
     anew with the weights and the kind of noise found.
@@ -612,12 +601,17 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
     not, and nothing is held.
     """
     fitted = found.method in ("reml", "wls", "ols")
-    limits: dict[int, tuple[float, float]] = {}
+    limits: dict[int, tuple[float, float]] = {}  # held ones keep what was found of them
     while True:
-        limits = hardly_shown(found) | limits  # held ones keep what was found of them
         held, fit = {}, found.solution.fit
-        for c in set(limits) & set(fit.columns.tolist()) if fitted else ():
-            p, (low, high), x = fit.problem.model.parameters[c], limits[c], float(fit.x[c])
+        for k, c in enumerate(found.solution.reduction.kept.tolist()):
+            p, (terms, _, (low, high)) = fit.problem.model.parameters[c], found.told(k)
+            beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
+            if beyond and not p.shrunk and not terms:
+                limits.setdefault(c, (low, high))
+            if c not in limits or not fitted:
+                continue
+            (low, high), x = limits[c], float(fit.x[c])
             if p.nominal != 0 and low <= p.nominal <= high:
                 held[c] = p.nominal
             elif not p.lower <= x <= p.upper and low < p.upper and p.lower < high:

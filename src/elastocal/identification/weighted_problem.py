@@ -96,7 +96,17 @@ def weights_for(
     """
     chosen = _available(observed, tracker) if kind == "auto" and covariance is None else kind
     if covariance is not None or chosen == "covariance":
-        return _given(observed, covariance)
+        need(covariance is not None, f"weights 'covariance' need a matrix ({option('covariance')})")
+        matrix, n = np.asarray(covariance, dtype=float), len(observed.value)
+        need(
+            matrix.shape == (n, n),
+            f"the covariance is {matrix.shape}, but there are {n} rows (observations × components)",
+        )
+        need(
+            bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
+            f"{option('covariance')} is not finite and symmetric; correct the matrix",
+        )
+        return Weights("covariance", whitener(sparse.csr_array(matrix)), True, "given covariance")
     if chosen == "none":
         return Weights("none", None, False, "unit weights (ordinary least squares)")
     blocks, text = stated_covariance(observed, tracker, chosen)
@@ -147,20 +157,6 @@ def _available(observed: Observations, tracker: Tracker) -> str:
     if observed.kind == "pose" and tracker.rotation_sigma is None:
         return "none"
     return available_noise(observed.table, tracker)
-
-
-def _given(observed: Observations, covariance: Array | None) -> Weights:
-    need(covariance is not None, f"weights 'covariance' need a matrix ({option('covariance')})")
-    matrix, n = np.asarray(covariance, dtype=float), len(observed.value)
-    need(
-        matrix.shape == (n, n),
-        f"the covariance is {matrix.shape}, but there are {n} rows (observations × components)",
-    )
-    need(
-        bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
-        f"{option('covariance')} is not finite and symmetric; correct the matrix",
-    )
-    return Weights("covariance", whitener(sparse.csr_array(matrix)), True, "given covariance")
 
 
 def block_diagonal(blocks: Array) -> sparse.csr_array:
