@@ -102,7 +102,7 @@ class Whitened:
         self.pack = pack
         R = np.asarray(np.linalg.cholesky(pack.V(theta)), dtype=np.float64)
         self.log_det = 2 * float(np.log(np.einsum("cii->ci", R)).sum())
-        self.root = np.linalg.inv(R)
+        self.root = np.asarray(np.linalg.inv(R), dtype=np.float64)
         if pack.absent.any():
             self.root *= ~pack.absent[:, None, :]
         self.B = self.root @ pack.B

@@ -179,7 +179,7 @@ def inverse_factor(blocks: Array) -> Array:
             "the noise covariance is not positive definite; check what states it: "
             f"{option('covariance')}, the sigma columns of the table, or [tracker] of the cell"
         ) from None
-    return np.linalg.inv(factor)
+    return np.asarray(np.linalg.inv(factor), dtype=np.float64)
 
 
 def same_size(codes: NDArray[np.integer]) -> Iterator[IntArray]:

@@ -404,7 +404,7 @@ def import_files(
             text=text,
         )
     except InputError as error:  # of a line of the table, and where that came from
-        row = int(found[1]) - 2 if (found := re.search(r"line (\d+)", str(error))) else -1
+        row = int(line[1]) - 2 if (line := re.search(r"line (\d+)", str(error))) else -1
         told = f" (from {points.where(row)})" if 0 <= row < len(points) else ""
         raise InputError(f"{error}{told}") from None
     fit, refused = (
