@@ -384,10 +384,9 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
         if found is not None and math.isfinite(found.unchecked):
             numbers = {"unchecked_um": found.unchecked, "rms_um": found.rms}
         little = found is not None and found.unchecked**2 <= MOSTLY * found.rms**2
-        if little or result.test is not None:
-            yield _note("not_held_out", **numbers)
-        else:
-            yield _care("not_held_out", more_poses(), **numbers)
+        checked = little or result.test is not None
+        say, doing = (_note, "") if checked else (_care, more_poses())
+        yield say("not_held_out", doing, **numbers)
 
 
 def _against_stated_noise(result: Calibration) -> Iterator[Finding]:

@@ -124,26 +124,25 @@ def eq14(
                 f"{np.shape(group)}"
             )
         group = np.unique(group, return_inverse=True)[1].ravel()
-    sigma = _sigma(first.residual, group)
-    history = [ols(B, dp, np.maximum(sigma, SMALLEST))]
+
+    def sigma_of(found: PublishedFit) -> Array:
+        residual = found.residual
+        return np.abs(residual) if group is None else group_sigma(residual, group)
+
+    history = [ols(B, dp, np.maximum(sigma_of(first), SMALLEST))]
+    method = "eq14 per residual" if group is None else "eq14 by group"
     for _ in range(iterations):
-        w = eq14_weights(sigma, sigma_0, lam)
-        found = wls(B, dp, w)
+        before, sigma = history[-1], sigma_of(history[-1])
         stated = wls(B, dp, 1 / np.maximum(sigma, SMALLEST)).covariance
-        method = "eq14 per residual" if group is None else "eq14 by group"
-        history.append(PublishedFit(method, found.x, stated, w, found.residual, False))
-        sigma = _sigma(found.residual, group)
-        before, now = history[-2], history[-1]
+        now = wls(B, dp, eq14_weights(sigma, sigma_0, lam))
+        now = replace(now, method=method, covariance=stated, converged=False)
+        history.append(now)
         moved = np.abs(now.x - before.x) / np.maximum(np.abs(now.x), 1e-300)
         widened = np.abs(now.std - before.std) / now.std
         if len(history) > 2 and max(moved.max(), widened.max()) < tolerance:
             history[-1] = replace(now, converged=True)
             break
     return history
-
-
-def _sigma(residual: Array, group: NDArray[np.int64] | None) -> Array:
-    return np.abs(residual) if group is None else group_sigma(residual, group)
 
 
 def _finite(name: str, values: Array, dimensions: int) -> Array:

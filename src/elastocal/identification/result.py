@@ -358,12 +358,9 @@ class Calibration(scrutiny.FoundFit, Result):
     def verdict(self) -> Verdict:
         """The judgement that terminal, page, notebook and JSON give."""
         doubts = (f for f in self.findings if f.kind != "trust" and f.severity in ("care", "poor"))
-        trust = self.finding("trust")
-        return Verdict(
-            "care" if trust is None else trust.severity,
-            None if self.predicted is None else self.predicted.ci95[1],
-            tuple(doubts),
-        )
+        trust, found = self.finding("trust"), self.predicted
+        at = None if found is None else found.ci95[1]
+        return Verdict("care" if trust is None else trust.severity, at, tuple(doubts))
 
     def unmet(self, **limits: float | None) -> tuple[str, ...]:
         """What of the required accuracy is not kept, a sentence for each; empty where all is.
