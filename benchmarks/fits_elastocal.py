@@ -15,7 +15,7 @@ from bench_tools import Clock
 
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.identification.solve import posed, settle
+from elastocal.identification.solve import posed, solve
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
@@ -29,9 +29,9 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
     every = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
     problem = posed(model, observed, weights, start_values(model, table), every)
-    found, reduction, _ = settle(problem)
-    found.cofactor()
-    return found.x, len(reduction.kept)
+    found = solve(problem, try_wider=False)
+    found.fit.cofactor()
+    return found.fit.x, len(found.reduction.kept)
 
 
 def fit(how: str, folder: Path, clock: Clock) -> tuple[np.ndarray, int]:
