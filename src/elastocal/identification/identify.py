@@ -37,7 +37,7 @@ from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
     linearised,
-    over_times,
+    not_knowing_times,
     weights_of,
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
@@ -474,7 +474,7 @@ def _adapted(
             solution, noise, now, readings = fewer
     assert noise is not None
     final = readings.take(now)
-    return solution, over_times(estimate_noise(final, like=noise), final), now
+    return solution, not_knowing_times(estimate_noise(final, like=noise)), now
 
 
 def _linearised(problem: Problem, x: Array, kept: IntArray, kind: str) -> Readings:
@@ -642,7 +642,7 @@ def _holding(
         readings = linearised(problem.model, observed, fit.x, reduction.kept)
         if len(problem.observations.lead) < len(found.good):
             readings = readings.take(found.good)
-        noise = over_times(estimate_noise(readings, like=noise), readings)
+        noise = not_knowing_times(estimate_noise(readings, like=noise))
     spread = spread_of(solution, options.intervals, noise)
     return replace(found, solution=solution, spread=spread, noise=noise)
 

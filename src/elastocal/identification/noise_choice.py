@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -270,7 +271,7 @@ def fitted(
     if TIME not in kind.parts:
         lasting = None
     elif (record := readings.visits) is not None:
-        if not record.drifts:
+        if not record.lasting:
             raise InputError(
                 "no drift can be recognised in these readings: the model itself has what changes "
                 "with time, or successive poses are near each other; visit poses in random order"
@@ -398,19 +399,36 @@ class NoiseTest:
 class NoiseFit:
     """The noise model that was chosen, the estimate under it, and what else was tried.
 
-    `x` (p,) is the generalised least-squares estimate of the readings' Δx, `covariance` that of
-    Kenward and Roger; `kind` is the name of a `Kind`.  `fit` is in orthonormal parameters, which
-    shifts all its log-likelihoods by one constant.
+    `kind` is the name of a `Kind`.  `fit` is in orthonormal parameters, B T with T (p, p), which
+    shifts all its log-likelihoods by one constant.  Neither the units of the parameters nor their
+    correlation then cost digits, and columns that depend on each other are found out.
     """
 
     kind: str
     fit: Fitted
-    x: Array
-    covariance: Covariance
-    trials: tuple[Trial, ...]
-    reason: str
+    T: Array
+    trials: tuple[Trial, ...] = ()
+    reason: str = "as asked for"
     tests: tuple[NoiseTest, ...] = ()
     to_longest: float = 0.0  # log-likelihood that the longest time tried is short of the best
+    over_times: Covariance | None = None  # `covariance` as `not_knowing_times` makes it
+
+    @cached_property
+    def _estimate(self) -> tuple[Array, Array, Array]:
+        return self.fit.estimate(self.T)
+
+    @property
+    def x(self) -> Array:
+        """The generalised least-squares estimate (p,) of the readings' Δx."""
+        return self._estimate[0]
+
+    @property
+    def covariance(self) -> Covariance:
+        """That of Kenward and Roger."""
+        if self.over_times is not None:
+            return self.over_times
+        text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
+        return Covariance("kenward-roger", *self._estimate[1:], text)
 
     @property
     def description(self) -> str:
@@ -448,14 +466,13 @@ def estimate_noise(
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
-    basis, T = _orthonormal(readings)
+    Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
+    basis = replace(readings, B=Q.reshape(readings.B.shape))
     if like is not None:
         found = fitted(basis, Kind.parsed(like.kind), like.fit)
-        return _result(like.kind, found, T, like.trials, like.reason, like.tests)
+        return replace(like, fit=found, T=T, to_longest=0.0, over_times=None)
     asked = Kind.of(kind)
-    if kind == "auto":
-        return _chosen(basis, T)
-    return _result(kind, fitted(basis, asked), T, (), "as asked for")
+    return _chosen(basis, T) if kind == "auto" else NoiseFit(kind, fitted(basis, asked), T)
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:
@@ -470,7 +487,7 @@ def _chosen(readings: Readings, T: Array) -> NoiseFit:
     except ElastocalError:  # the sample does not show all parameters, or not all labels
         return _Choice(readings).result(T)
     why = f"{found.reason}; chosen from {len(some)} readings at random, estimated from all"
-    return _result(again.kind.name, again, T, found.trials, why, found.tests)
+    return replace(found, kind=again.kind.name, fit=again, reason=why)
 
 
 def supported(readings: Readings) -> list[str]:
@@ -505,9 +522,8 @@ class _Choice:
             pass
         best = self.best
         trials, kind = tuple(self.trials.values()), best.kind.name
-        reason, tests = _reason(kind, trials), tuple(self.tests.values())
         again = fitted(self.readings, best.kind, best, best.lasting)
-        return _result(kind, again, T, trials, reason, tests)
+        return NoiseFit(kind, again, T, trials, _reason(kind, trials), tuple(self.tests.values()))
 
     def attempt(
         self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
@@ -537,7 +553,8 @@ class _Choice:
         before, record = self.least, self.readings.visits
         together = np.unique(self.readings.configuration, return_counts=True)[1]
         rows = int(together.max()) * self.readings.size
-        visits = np.zeros(1) if record is None else record.per_visit
+        visited = np.zeros(0, dtype=np.int64) if record is None else record.visit
+        visits = np.unique(visited[visited >= 0], return_counts=True)[1]
         known = len(visits) >= FEWEST_VISITS and rows <= MOST_TOGETHER
         for part in PARTS:
             assert self.best is not None
@@ -553,7 +570,7 @@ class _Choice:
             # both change from pose to pose, as the model's own errors do.
             elif part == JOINTS and EACH not in kind.parts and np.median(visits) >= SEVERAL:
                 self._look_for(part, kind, (self.best.lasting,))
-            elif part == TIME and record.drifts:
+            elif part == TIME and record.lasting:
                 self._look_for(part, kind, record.lasting)
         return self.least < before
 
@@ -599,41 +616,20 @@ def _reason(label: str, trials: Sequence[Trial]) -> str:
     )
 
 
-def _orthonormal(readings: Readings) -> tuple[Readings, Array]:
-    """Readings with B T in the place of B, (B T)ᵀ(B T) = I, and T (p, p).
-
-    Neither the units of the parameters nor their correlation then cost digits, and columns that
-    depend on each other are found out.
-    """
-    Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
-    return replace(readings, B=Q.reshape(readings.B.shape)), T
-
-
-def _result(
-    label: str, found: Fitted, T: Array, trials: tuple[Trial, ...], reason: str,
-    tests: tuple[NoiseTest, ...] = (),
-) -> NoiseFit:  # fmt: skip
-    x, matrix, dof = found.estimate(T)
-    text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
-    covariance = Covariance("kenward-roger", matrix, dof, text)
-    return NoiseFit(label, found, x, covariance, trials, reason, tests)
-
-
-def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
+def not_knowing_times(found: NoiseFit) -> NoiseFit:
     """The same fit with a covariance that does not take for known how long what drifts lasts, where
     the cell does not say: the mean over the correlation times tried, Σ = Σ_m w_m Σ_m.
 
     w_m ∝ the restricted likelihoods.  To what the degrees of freedom f_m leave unknown,
     Σ_m w_m/f_m, comes what the models differ by (`Covariance.tails`), most for base and tracker.
     """
+    readings, T, fits = found.fit.noisy.readings, found.T, [found.fit]
     if found.lasting is None or readings.visits is None:
         return found
-    basis, T = _orthonormal(readings)
-    fits = [found.fit]
     for lasting in readings.visits.lasting:
         if lasting != found.lasting:
             with suppress(ElastocalError, np.linalg.LinAlgError):
-                fits.append(fitted(basis, Kind.parsed(found.kind), found.fit, lasting))
+                fits.append(fitted(readings, Kind.parsed(found.kind), found.fit, lasting))
     level = np.array([one.log_likelihood for one in fits])
     longest = [v for one, v in zip(fits, level, strict=True) if one.lasting == LONGEST]
     weight = np.exp(level - level.max()) / np.exp(level - level.max()).sum()
@@ -644,7 +640,7 @@ def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
     left = weight @ (1 / dof) + between
     dof = np.divide(1, left, out=np.full(len(left), np.inf), where=left > 0)
     short = float(level.max()) - max(longest, default=-math.inf)
-    return replace(found, covariance=replace(mean, dof=dof), to_longest=short)
+    return replace(found, over_times=replace(mean, dof=dof), to_longest=short)
 
 
 # Between a fit and its noise: readings linearised at the fit, weights from an estimated noise.

@@ -43,12 +43,12 @@ class VisitRecord:
     `visit` (N, m) numbers the arm's visits to a pose (−1: no such row), `motion` (N, m, size,
     joints) is ∂(reading)/∂q there, `share` (N, m) the row's factor in the reading, `place` (N, m)
     its time as a share of the campaign's `span` in s; where the table has no times (`timed`), the
-    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.  No
-    drift of the noise is looked for (`drifts`) where the model itself has what changes with time,
-    and, unless the cell states one, where readings follow each other from pose to neighbouring
-    pose: they err alike because of what the model lacks, and a drift in its place would leave the
-    base as uncertain as it is large.  `lasting`: the correlation times of a drift that may be, as
-    shares of the span; the cell's own alone, where it states a drift and the table has times.
+    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.
+    `lasting`: the correlation times of a drift that may be, as shares of the span; the cell's own
+    alone, where it states a drift and the table has times.  None are where the model itself has
+    what changes with time, and, unless the cell states one, where readings follow each other from
+    pose to neighbouring pose: they err alike because of what the model lacks, and a drift in its
+    place would leave the base as uncertain as it is large.
     """
 
     visit: IntArray
@@ -58,17 +58,11 @@ class VisitRecord:
     turning: BoolArray
     timed: bool
     span: float
-    drifts: bool = True
     lasting: tuple[float, ...] = LASTING
 
     def take(self, chosen: BoolArray | IntArray) -> VisitRecord:
         names = ("visit", "motion", "share", "place")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
-
-    @cached_property
-    def per_visit(self) -> IntArray:
-        """Readings to each visit."""
-        return np.unique(self.visit[self.visit >= 0], return_counts=True)[1]
 
     def waves(self, lasting: float) -> Array:
         """Loadings (N, k) on independent deviations of variance 1, which add up to a random course
@@ -114,11 +108,13 @@ def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord 
     turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
     visit = np.where(place, visits(table)[row], -1)
     noise = model.cell.noise
-    stated = noise.drift > 0
-    drifts = stated or in_random_order(table.take(np.argsort(when, kind="stable")))
-    lasting = (noise.lasting / span,) if stated and timed else LASTING
+    lasting: tuple[float, ...] = LASTING
+    if noise.drift > 0 and timed:
+        lasting = (noise.lasting / span,)
+    elif not (noise.drift > 0 or in_random_order(table.take(np.argsort(when, kind="stable")))):
+        lasting = ()
     motion = motion[row] * share[:, :, None, None]
-    return VisitRecord(visit, motion, share, when[row], turning, timed, span, drifts, lasting)
+    return VisitRecord(visit, motion, share, when[row], turning, timed, span, lasting)
 
 
 SYSTEMATIC = 0.01

@@ -341,7 +341,7 @@ class _Search:
         # parameters already.
         bare = linearised(self.model, self.observed, every.fit.x, np.zeros(0, dtype=np.int64))
         column = np.random.default_rng(0).normal(size=(*bare.e.shape, 1))
-        visits = None if bare.visits is None else replace(bare.visits, drifts=False)
+        visits = None if bare.visits is None else replace(bare.visits, lasting=())
         self.readings: Readings = replace(bare, B=column, visits=visits)
         self.standard = np.zeros(bare.e.shape)  # residuals free of the fit's part in them
         self.alike = np.zeros(len(bare), dtype=bool)  # as readings of other configurations
