@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -24,7 +23,6 @@ from elastocal.diagnosis.components import (
     SOME,
     Component,
     FittedSum,
-    Pool,
     Sizes,
     at_maximum,
     fit_sum,
@@ -401,9 +399,8 @@ def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
     def price(c: Component) -> float:
         return usual if c.hypothesis is None else odds.get(c.hypothesis.key, usual)
 
-    pool = Pool(found.components)
-    score = found.score + pool.cost - sum(c.search for c in found.components)
-    for n, own in pool.kinds:
+    score = found.score + found.sums.pool.cost - sum(c.search for c in found.components)
+    for n, own in found.sums.pool.kinds:
         for before, k in enumerate(own):
             fellow = presence_cost(n, before + 1) - presence_cost(n, before)
             paid = -price(found.components[k])
@@ -429,16 +426,12 @@ class Beside:
         M, z = found.sums.products.M, found.sums.products.z
         prior = np.concatenate([found.sums.data.precision, 1 / found.variances])
         self.sum = Standardised.of(M, z, (prior + ROUNDING * np.diag(M)) ** -0.5)
-        L, each = self.sum.L, list(found.sums.across(columns))
-        half, own = L.T @ self.sum.b, (self.sum.root[:, None] * one.beside for one in each)
-        self.halves = [linalg.solve_triangular(L, t, lower=True) for t in own]
-        pairs = zip(each, self.halves, strict=True)
-        self.left = [(one.own - t.T @ t, one.z - t.T @ half) for one, t in pairs]
-
-    @cached_property
-    def _moved(self) -> list[Array]:
-        L = self.sum.L
-        return [linalg.solve_triangular(L, t, lower=True, trans="T") for t in self.halves]
+        self.left, self.moved = list[tuple[Array, Array]](), list[Array]()
+        for t in found.sums.across(columns):
+            scaled = self.sum.root[:, None] * t.beside
+            self.moved.append(linalg.cho_solve((self.sum.L, True), scaled))
+            left = t.own - scaled.T @ self.moved[-1], t.z - scaled.T @ self.sum.b
+            self.left.append(left)
 
     def evidence_instead(self, gone: slice) -> list[float]:
         """Over none, of what is `gone` beside all others of the sum and of each of the columns."""
@@ -446,7 +439,7 @@ class Beside:
         W = np.linalg.inv(S + np.tril(S, -1).T)
         b, per = W @ self.sum.b[gone], 1 / self.sum.root[gone]
         groups = [((W - np.eye(len(W))) * per[:, None] * per, b * per)]
-        for (A, z), moved in zip(self.left, self._moved, strict=True):
+        for (A, z), moved in zip(self.left, self.moved, strict=True):
             own = moved[gone]
             groups.append((A + own.T @ W @ own, z + own.T @ b))
         return evidence_of_groups(groups, WIDE)
@@ -549,7 +542,7 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     for _ in range(COMPLETED):
         present = Counter(c.effect.name for c in found.components)
         away = {n: found.away(own) for n, own in kinds.items()}
-        shown = _kinds_that_show(found, away, present) | ({*()} if many else {*present})
+        shown = _kinds_that_show(found, away, present) | (set() if many else present.keys())
         better = found
         for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):

@@ -204,9 +204,9 @@ def _error_now(fit: Calibration, unknown: float) -> PredictedError | None:
 def _in_doubt(why: Diagnosis) -> tuple[tuple[str, str, float], ...]:
     """What may be missing beside or instead of what was found: effect, place and probability."""
     found = {(f.effect, f.where) for f in why.effects}
-    left = [c for c in why.candidates if (c.effect, c.where) not in found and c.probability > DOUBT]
-    left.sort(key=lambda c: -c.probability)
-    return tuple((c.effect, c.where, c.probability) for c in left)
+    every = ((c.effect, c.where, c.probability) for c in why.candidates)
+    left = [c for c in every if c[:2] not in found and c[2] > DOUBT]
+    return tuple(sorted(left, key=lambda c: -c[2]))
 
 
 def verdict_of(
