@@ -165,7 +165,7 @@ def log_prior_odds(
 Flips = tuple[Array, Array]
 
 
-class Residuals(NamedTuple):
+class SignedResiduals(NamedTuple):
     """T residuals that differ by the `signs` (T, C) of their configurations: P times one of them is
     s V⁻¹e − H h, with `of` V⁻¹e (C, m), or its products (C, …) with the motions of an entry, and
     h (T, p)."""
@@ -180,15 +180,15 @@ class Residuals(NamedTuple):
         return own @ self.signs.T - Z.T @ self.h.T
 
 
-def residuals_of(at: Projection, flips: Flips | None = None) -> tuple[Residuals, ...]:
+def residuals_of(at: Projection, flips: Flips | None = None) -> tuple[SignedResiduals, ...]:
     """The readings', which is P r already, and the flipped ones where they are asked for."""
     C, _, p = at.H.shape
-    own = Residuals(np.ones((1, C)), at.u, np.zeros((1, p)))
+    own = SignedResiduals(np.ones((1, C)), at.u, np.zeros((1, p)))
     if flips is None:
         return (own,)
     signs, e = flips[0], flips[1][..., None]
     h = signs @ (at.H.transpose(0, 2, 1) @ e)[..., 0]
-    return own, Residuals(signs, (at.inverse @ e)[..., 0], h)
+    return own, SignedResiduals(signs, (at.inverse @ e)[..., 0], h)
 
 
 @dataclass(frozen=True)
@@ -198,11 +198,11 @@ class EntrySums:
 
     local: Array
     H: Array
-    residuals: tuple[Residuals, ...]
+    residuals: tuple[SignedResiduals, ...]
 
     @classmethod
     def of(
-        cls, E: Array, blocks: Blocks, at: Projection, residuals: Sequence[Residuals]
+        cls, E: Array, blocks: Blocks, at: Projection, residuals: Sequence[SignedResiduals]
     ) -> EntrySums:
         """E (C, m, d): the entry's packed columns, zero in rows that do not count."""
         C, m, d = E.shape
@@ -267,7 +267,7 @@ def _each_with_each(a: Array, b: Array) -> Array:
     return np.asarray(a.transpose(1, 2, 0) @ b.transpose(1, 0, 2))
 
 
-def direct(C: Array, at: Projection, residuals: Sequence[Residuals] = ()) -> Spectrum:
+def direct(C: Array, at: Projection, residuals: Sequence[SignedResiduals] = ()) -> Spectrum:
     """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count."""
     k = C.shape[2]
     A = C.reshape(-1, k).T @ (at.inverse @ C).reshape(-1, k)
@@ -293,7 +293,7 @@ class Grams:
     _entries: dict[EntryKey, EntrySums] = field(init=False, default_factory=dict)
 
     @cached_property
-    def _residuals(self) -> tuple[Residuals, ...]:
+    def _residuals(self) -> tuple[SignedResiduals, ...]:
         return residuals_of(self.at, self.flips)
 
     def entry(self, key: EntryKey) -> EntrySums:

@@ -96,11 +96,13 @@ def _figures(d: Diagnosis) -> Iterator[say.Figure]:
 
 
 def _residuals(d: Diagnosis) -> Iterator[say.Block]:
+    from elastocal.report.arm_view import residual_arm
+
     base = d.calibrated
     assert base is not None
     residuals = Residuals(base.model, base.observed, base.x, base.residual)
     yield say.Sentence("What the model leaves before the effects found are added.")
-    yield residuals.on_the_arm()
+    yield residual_arm(*residuals.of_what)
     yield from residuals.figures()
     yield from residuals.over_time()
     yield residuals.table()

@@ -493,11 +493,6 @@ class Residuals:
         yield self.by_configuration()
         yield self.over_joints()
 
-    def on_the_arm(self) -> say.Figure:
-        from elastocal.report.arm_view import residual_arm
-
-        return residual_arm(*self.of_what)
-
     def _thinned(self, drawn: int) -> str:
         total = len(self.value)
         if drawn >= total:

@@ -101,7 +101,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: [residuals.on_the_arm(), *residuals.over_time(), residuals.table()],
+        lambda: _on_the_arm(residuals),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -137,6 +137,12 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
         yield found
+
+
+def _on_the_arm(residuals: Residuals) -> list[say.Block]:
+    from elastocal.report.arm_view import residual_arm
+
+    return [residual_arm(*residuals.of_what), *residuals.over_time(), residuals.table()]
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:
