@@ -331,10 +331,12 @@ def posed(
     problem = Problem(model, observed, weights, x0, free, np.ones(len(x0)))
     # What is shrunk has its size from its prior.
     every = np.flatnonzero(~model.shrunk | np.isin(np.arange(len(model.shrunk)), free))
-    largest = np.zeros((1, len(x0)))
-    for B in problem.each(lambda part: problem.regressor(part, x0, every).B):
-        largest[0, every] = np.maximum(largest[0, every], np.abs(B).max(axis=0))
-    problem = replace(problem, sizes=np.where(is_placed(model), PLACED, model.sizes(largest)))
+    largest, placed = np.zeros((1, len(x0))), is_placed(model)
+    # Only the size of what states none needs B, which takes long on large tables.
+    if any(p.typical is None and not own for p, own in zip(model.parameters, placed, strict=True)):
+        for B in problem.each(lambda part: problem.regressor(part, x0, every).B):
+            largest[0, every] = np.maximum(largest[0, every], np.abs(B).max(axis=0))
+    problem = replace(problem, sizes=np.where(placed, PLACED, model.sizes(largest)))
     rows, p = len(observed.value), len(free)
     if rows > p:  # more equations than unknowns need no rank
         return problem
