@@ -77,9 +77,9 @@ def csv_lines(
         nonlocal number
         number += 1
         line = handle.readline(MAX_LINE + 1)
-        if line.startswith(UTF16) and number == 1:
+        if number == 1 and line.startswith(UTF16):
             raise InputError(f"{source}: is UTF-16; save the table as CSV in UTF-8")
-        if line.startswith(ARCHIVE) and number == 1:
+        if number == 1 and line.startswith(ARCHIVE):
             raise InputError(f"{source}: is a workbook or archive; export the sheet as CSV")
         if b"\0" in line:
             raise refused("NUL bytes, so this is no UTF-8 text; save the table as CSV in UTF-8")

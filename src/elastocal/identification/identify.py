@@ -16,15 +16,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from elastocal.errors import ElastocalError
-from elastocal.identification import published
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged
 from elastocal.identification.knowledge import Constraints
-from elastocal.identification.knowledge_fit import (
-    KnownFit,
-    fit_with_knowledge,
-    intervals_with_knowledge,
-)
 from elastocal.identification.least_squares import (
     Covariance,
     PriorRows,
@@ -65,7 +59,6 @@ from elastocal.identification.residuals import (
 from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.sentences import warning_sentences
-from elastocal.identification.smooth_fit import fit_smooth
 from elastocal.identification.solve import (
     Solution,
     bent,
@@ -523,6 +516,8 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     if kind in ("auto", "classical"):
         return classical
     if kind == "profile":
+        from elastocal.identification.knowledge_fit import KnownFit, intervals_with_knowledge
+
         free = Constraints().resolve([problem.model.names[c] for c in fit.columns])
         known = PriorRows(np.zeros((0, len(fit.columns))), np.zeros(0), free)
         many = np.zeros(len(fit.columns), dtype=bool)
@@ -552,11 +547,15 @@ def run_method(course: Course) -> MethodResult:
     that the method ends with."""
     options, smooth = course.options, course.every.problem.model.shrunk[course.free].any()
     if smooth:
+        from elastocal.identification.smooth_fit import fit_smooth  # few models have any
+
         found = fit_smooth(course)
     else:
         alone = replace(options, constraints=None, prior=None, intervals="auto")
         found = _by_method(replace(course, options=alone) if options.knows else course)
     if options.knows:
+        from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
+
         return fit_with_knowledge(found, options, course.progress)
     return found if smooth else with_limits(course.every, found, options)
 
@@ -709,6 +708,8 @@ def _held_out_rms(solution: Solution, judge: Solution) -> float:
 
 def _published(course: Course, start: Solution) -> MethodResult:
     """Eq. (14) on the linearised model, and a fit of the exact one with the weights it ends at."""
+    from elastocal.identification import published
+
     course.progress("iterating the weights of eq. (14)")
     observed, fit, options = start.problem.observations, start.fit, course.options
     method, good, group = options.resolved, ~course.faulty, None

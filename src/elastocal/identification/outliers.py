@@ -143,7 +143,8 @@ class FitToGood:
 
     def __init__(self, B: Array, y: Array, good: BoolArray, variance: float) -> None:
         self.good = good
-        rows = np.vstack([*B[good], np.sqrt(variance) * np.eye(B.shape[2])])
+        p = B.shape[2]
+        rows = np.vstack([B[good].reshape(-1, p), np.sqrt(variance) * np.eye(p)])
         self.R = np.asarray(np.linalg.qr(rows, mode="r"))
         self.T = self.coordinates(B)
         fitted = np.einsum("nij,ni->j", self.T[good], y[good])
@@ -158,8 +159,8 @@ class FitToGood:
 
     def coordinates(self, B: Array) -> Array:
         """T of further observations."""
-        flat = np.concatenate(B).T
-        return np.asarray(linalg.solve_triangular(self.R, flat, trans="T").T).reshape(B.shape)
+        flat = B.reshape(-1, B.shape[2])
+        return np.asarray(linalg.solve_triangular(self.R, flat.T, trans="T").T).reshape(B.shape)
 
     def p_values(self, T: Array, e: Array, good: BoolArray) -> Array:
         """p-value (n,) of each error e (n, size), as if its observation had been left out of the
