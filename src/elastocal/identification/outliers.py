@@ -143,8 +143,8 @@ class FitToGood:
 
     def __init__(self, B: Array, y: Array, good: BoolArray, variance: float) -> None:
         self.good = good
-        p = B.shape[2]
-        rows = np.vstack([B[good].reshape(-1, p), np.sqrt(variance) * np.eye(p)])
+        (_, size, p), n = B.shape, int(good.sum())
+        rows = np.vstack([B[good].reshape(n * size, p), np.sqrt(variance) * np.eye(p)])
         self.R = np.asarray(np.linalg.qr(rows, mode="r"))
         self.T = self.coordinates(B)
         fitted = np.einsum("nij,ni->j", self.T[good], y[good])
@@ -159,7 +159,7 @@ class FitToGood:
 
     def coordinates(self, B: Array) -> Array:
         """T of further observations."""
-        flat = B.reshape(-1, B.shape[2])
+        flat = B.reshape(len(B) * B.shape[1], B.shape[2])
         return np.asarray(linalg.solve_triangular(self.R, flat.T, trans="T").T).reshape(B.shape)
 
     def p_values(self, T: Array, e: Array, good: BoolArray) -> Array:

@@ -459,7 +459,8 @@ def predicted_error(
     std = np.sqrt(np.diag(arm.covariance))
     # The rounding of large variances would drown what small ones do.
     unit = np.maximum(std, 1e-300) if std.min() < APART * std.max() else np.ones(len(std))
-    root = unit[:, None] * root_of(arm.covariance / np.outer(unit, unit))
+    scaled = arm.covariance / np.outer(unit, unit)
+    root = unit[:, None] * root_of((scaled + scaled.T) / 2)
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each
     F = F.reshape(-1, F.shape[2])
