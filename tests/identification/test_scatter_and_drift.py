@@ -13,6 +13,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
 from elastocal.identification.noise_structure import in_random_order
 from elastocal.identification.options import Options
+from elastocal.identification.sentences import warning_sentences
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation import simulate
@@ -118,7 +119,7 @@ def test_the_stated_noise_is_all_that_the_cell_states():
         assert fit.finding("residual_agrees_with_stated_noise") is not None
         assert 0.85 < fit.noise.ratio_to_stated < 1.15
         # But that on wls, whose intervals do not count what readings share.
-        told = [w for w in fit.warnings if w.kind != "lack_of_fit"]
+        told = [w for w, kind in warning_sentences(fit).items() if kind != "lack_of_fit"]
         assert not any("State it" in w or "an effect is missing" in w for w in told)
     fit = identified(scatter=SCATTER, drift=DRIFT)
     assert (

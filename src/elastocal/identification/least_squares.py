@@ -309,6 +309,15 @@ def root_of(covariance: Array) -> Array:
     return np.asarray(axes * np.sqrt(np.maximum(value, 0.0))[..., None, :])
 
 
+def drawing_root(covariance: Array) -> Array:
+    """L (p, p) with L Lᵀ = covariance, for draws: triangular, since alike eigenvalues turn their
+    axes, and the draws with them, by their last digits; by way of correlations, since the rounding
+    of large variances would drown small ones."""
+    unit = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
+    upper = np.linalg.qr(root_of(covariance / np.outer(unit, unit)).T, mode="r")
+    return np.asarray(unit[:, None] * (upper * np.where(np.diag(upper) < 0, -1, 1)[:, None]).T)
+
+
 def t_quantile(level: float, dof: Array) -> Array:
     """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level; infinite at
     dof 0."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
 from elastocal.identification.knowledge import ActiveConstraint, Constraints, GaussianPrior
-from elastocal.identification.least_squares import LEVEL, Covariance, root_of, t_quantile
+from elastocal.identification.least_squares import LEVEL, Covariance, drawing_root, t_quantile
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.solve import Solution
@@ -104,7 +104,7 @@ class SmoothPart:
             for c, m in zip(own, mean, strict=True):
                 mine = slice(c * k, (c + 1) * k)
                 covariance = self.covariance[mine, mine]
-                drawn = rng.normal(size=(DRAWS, k)) @ root_of(covariance).T @ waves.T
+                drawn = rng.normal(size=(DRAWS, k)) @ drawing_root(covariance).T @ waves.T
                 total += ((m + drawn) ** 2).mean(axis=1)
                 spread += float(((waves @ covariance) * waves).sum(axis=1).mean())
             rms = np.sqrt(total / (1 if basis is None else len(own)))

@@ -27,7 +27,7 @@ from scipy import special
 from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
-from elastocal.identification.least_squares import Covariance, root_of, variance_of
+from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import EXACT, Solution, reduce
@@ -283,7 +283,6 @@ def position_at(
 MOST_LOADS, MOST_VISITS = 100, 400  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
-APART = 1e-6  # standard deviations in SI units, one of another, whose variances round differently
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
 
 
@@ -456,11 +455,7 @@ def predicted_error(
     if not len(weight):
         return None
     known, off = _moves(arm, B[:, :3])
-    std = np.sqrt(np.diag(arm.covariance))
-    # The rounding of large variances would drown what small ones do.
-    unit = np.maximum(std, 1e-300) if std.min() < APART * std.max() else np.ones(len(std))
-    scaled = arm.covariance / np.outer(unit, unit)
-    root = unit[:, None] * root_of((scaled + scaled.T) / 2)
+    root = drawing_root(arm.covariance)
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each
     F = F.reshape(-1, F.shape[2])
@@ -472,7 +467,7 @@ def predicted_error(
     (dof,), (share,) = spread.tails((known * each).reshape(1, -1, n))
     wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
     z[:, :n] *= np.sqrt(share * wide * inflated)[:, None]
-    squares = ((z @ root_of(G)) ** 2).sum(axis=1) + missing.squared
+    squares = (z @ G * z).sum(axis=1) + missing.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())
     rest = float(np.trace(G[n:, n:]))
     alone = np.inf
