@@ -314,8 +314,8 @@ def drawing_root(covariance: Array) -> Array:
     axes, and the draws with them, by their last digits; by way of correlations, since the rounding
     of large variances would drown small ones."""
     unit = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
-    upper = np.linalg.qr(root_of(covariance / np.outer(unit, unit)).T, mode="r")
-    return np.asarray(unit[:, None] * (upper * np.where(np.diag(upper) < 0, -1, 1)[:, None]).T)
+    lower = np.asarray(np.linalg.qr(root_of(covariance / np.outer(unit, unit)).T, mode="r")).T
+    return np.asarray(unit[:, None] * lower * np.where(np.diag(lower) < 0, -1, 1))
 
 
 def t_quantile(level: float, dof: Array) -> Array:
