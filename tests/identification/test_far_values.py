@@ -55,7 +55,9 @@ def sentence(fit: ec.Calibration) -> str:
 def test_where_a_marker_is_guessed_is_no_evidence(guess):
     folder = CASES / "marker_guess"
     fit = ec.identify(folder / f"{guess}.toml", folder / "train.csv", test=folder / "test.csv")
-    assert fit.verdict.trusted and fit.verdict.at == pytest.approx(42.7e-6, rel=0.01)
+    # A hundred thousand draws have the upper end at 43.7 µm; two thousand know it to 2 %.
+    assert fit.verdict.trusted and fit.verdict.at == pytest.approx(43.7e-6, rel=0.02)
+    assert fit.predicted.rms == pytest.approx(28.2e-6, rel=0.005)
 
 
 def test_a_joint_that_lost_its_zero_is_to_be_remastered_and_trusted():
