@@ -16,7 +16,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Se
 from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO, StringIO
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, TextIO
 
@@ -64,77 +64,88 @@ def csv_lines(
 
     `comments`: lines that begin with # are passed over, and so are lines of empty cells.
     """
-    number = 0
+    lines = _sound_lines(source, handle, what)
+    told = (one for one in lines if not (comments and _says_nothing(one[1])))
+    number, line = next(told, (0, b""))
+    if not line:
+        raise InputError(f"{source}: empty file; the first line names the columns")
+    first = _text(source, number, line).removeprefix("\ufeff")
+    if not first.strip():
+        raise InputError(f"{source}: line 1 is blank; the first line must name the columns")
+    delimiter = max(DELIMITERS, key=first.count)
+    header = tuple(name.strip() for name in _split(source, number, first, delimiter))
+    return header, delimiter != ",", _rows(source, told, header, delimiter)
 
-    def refused(told: str) -> InputError:
-        return InputError(f"{source}, line {number}: {told}")
 
-    def says_nothing(line: bytes, blank: bytes) -> bool:
-        bare = line.removeprefix(b"\xef\xbb\xbf").strip(b' \t\r\n,;"' if comments else blank)
-        return not bare or (comments and bare.startswith(b"#"))
-
-    def next_line() -> bytes:
-        nonlocal number
-        number += 1
+def _sound_lines(source: str, handle: BinaryIO, what: str) -> Iterator[tuple[int, bytes]]:
+    """The lines of a file that may be CSV in UTF-8, by number."""
+    for number in count(1):
         line = handle.readline(MAX_LINE + 1)
+        where = f"{source}, line {number}"
+        if not line:
+            return
         if number == 1 and line.startswith(UTF16):
             raise InputError(f"{source}: is UTF-16; save the table as CSV in UTF-8")
         if number == 1 and line.startswith(ARCHIVE):
             raise InputError(f"{source}: is a workbook or archive; export the sheet as CSV")
         if b"\0" in line:
-            raise refused("NUL bytes, so this is no UTF-8 text; save the table as CSV in UTF-8")
+            raise InputError(
+                f"{where}: NUL bytes, so this is no UTF-8 text; save the table as CSV in UTF-8"
+            )
         if len(line) > MAX_LINE:
-            raise refused(f"longer than {MAX_LINE // 1024} KiB; this is no {what}")
+            raise InputError(f"{where}: longer than {MAX_LINE // 1024} KiB; this is no {what}")
         # A lone CR would end a line for some readers and not for others.
         if b"\r" in line and b"\r" in line.removesuffix(b"\n").removesuffix(b"\r"):
-            raise refused(
-                "a carriage return inside the line; save the table with ordinary line ends (LF or "
-                "CRLF)"
+            raise InputError(
+                f"{where}: a carriage return inside the line; save the table with ordinary line "
+                "ends (LF or CRLF)"
             )
-        return line
+        yield number, line
 
-    def text(line: bytes) -> str:
-        remedy = "save the table as CSV in UTF-8"
-        return decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n")
 
-    def split(line: str) -> list[str]:
-        if '"' not in line:
-            return line.split(delimiter)
-        try:
-            return next(csv.reader([line], delimiter=delimiter, strict=True, skipinitialspace=True))
-        except csv.Error:
-            raise refused(
-                f"quotation marks do not match in {quoted(line)}; close them on the same line"
-            ) from None
+def _says_nothing(line: bytes) -> bool:
+    """Whether a line is a comment, or has empty cells alone."""
+    bare = line.removeprefix(b"\xef\xbb\xbf").strip(b' \t\r\n,;"')
+    return not bare or bare.startswith(b"#")
 
-    def rows() -> Iterator[Row]:
-        blank, rows = b" \r\n" if delimiter == "\t" else b" \t\r\n", 0
-        while line := next_line():
-            if says_nothing(line, blank):
-                continue
-            rows, cells = rows + 1, split(text(line))
-            if len(cells) != len(header):
-                commas = len(cells) > len(header) and delimiter == ","
-                hint = "where decimals are written with a comma, separate the columns by ';'"
-                raise InputError(
-                    f"{source}: line {number} has {len(cells)} fields, header has "
-                    f"{len(header)}; {hint if commas else 'correct the line'}"
-                )
-            yield number, cells
-        if not rows:
-            raise InputError(f"{source}: has a header but no rows; add them below it")
 
-    line = next_line()
-    while comments and line and says_nothing(line, b" \t\r\n"):
-        line = next_line()
-    if not line:
-        raise InputError(f"{source}: empty file; the first line names the columns")
-    first = text(line).removeprefix("\ufeff")
-    if not first.strip():
-        raise InputError(f"{source}: line 1 is blank; the first line must name the columns")
-    delimiter = max(DELIMITERS, key=first.count)
-    header = tuple(name.strip() for name in split(first))
-    return header, delimiter != ",", rows()
+def _text(source: str, number: int, line: bytes) -> str:
+    remedy = "save the table as CSV in UTF-8"
+    return decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n")
+
+
+def _split(source: str, number: int, line: str, delimiter: str) -> list[str]:
+    """The cells of a line.  Raises InputError where quotes do not close or are stray."""
+    if '"' not in line:
+        return line.split(delimiter)
+    try:
+        return next(csv.reader([line], delimiter=delimiter, strict=True, skipinitialspace=True))
+    except csv.Error:
+        raise InputError(
+            f"{source}, line {number}: quotation marks do not match in {quoted(line)}; close them "
+            "on the same line"
+        ) from None
+
+
+def _rows(
+    source: str, lines: Iterator[tuple[int, bytes]], header: tuple[str, ...], delimiter: str
+) -> Iterator[Row]:
+    """The lines that are not blank, each with as many cells as the header."""
+    blank, rows = b" \r\n" if delimiter == "\t" else b" \t\r\n", 0
+    for number, line in lines:
+        if not line.strip(blank):
+            continue
+        rows, cells = rows + 1, _split(source, number, _text(source, number, line), delimiter)
+        if len(cells) != len(header):
+            commas = len(cells) > len(header) and delimiter == ","
+            hint = "where decimals are written with a comma, separate the columns by ';'"
+            raise InputError(
+                f"{source}: line {number} has {len(cells)} fields, header has {len(header)}; "
+                f"{hint if commas else 'correct the line'}"
+            )
+        yield number, cells
+    if not rows:
+        raise InputError(f"{source}: has a header but no rows; add them below it")
 
 
 def first_bad_cell(
@@ -258,9 +269,9 @@ def match_columns(
                 f"{source}: column {i} of {len(header)} has no name in the header; name it or "
                 "remove the separator too many"
             )
-    for text, count in Counter(header).items():
-        if count > 1:
-            raise InputError(f"{source}: column {quoted(text)} appears {count} times; keep one")
+    for text, times in Counter(header).items():
+        if times > 1:
+            raise InputError(f"{source}: column {quoted(text)} appears {times} times; keep one")
     meaning = {
         column(stem, unit): (family, stem, unit)
         for family in known.values()

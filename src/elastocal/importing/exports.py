@@ -140,22 +140,11 @@ def table_rows(
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
     named = any(isinstance(part, str) for c in asked if c.required for part in c.at)
-    marks = tuple(settings.comments)
-    skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
-    content, comments, ignored = [], [], []
-    for number, line in enumerate(lines, start=1):
-        bare = line.strip()
-        if marks and bare.startswith(marks):
-            comments.append((number, bare))
-        elif bare and skip is not None and skip.search(line):
-            ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
-        elif bare:
-            content.append((number, line))
-    if not content:
-        raise InputError(f"{source}: only comments and blank lines; export the points again")
+    content, comments, ignored = _sorted_lines(source, lines, settings)
     tried = _by_numbers(content) if settings.delimiter == "auto" else [settings.delimiter]
     # Some write the names of the columns as a comment.
-    mark = re.compile("".join(f"(?:{re.escape(m)})?" for m in sorted(marks, key=len, reverse=True)))
+    marks = sorted(settings.comments, key=len, reverse=True)
+    mark = re.compile("".join(f"(?:{re.escape(m)})?" for m in marks))
     plain = [(number, mark.sub("", line, count=1)) for number, line in comments[:SAMPLE]]
     delimiter, begin, header_line, header = tried[0], 0, 0, list[str]()
     for way, (number, line) in product(tried, [*content[:SAMPLE], *plain]) if named else ():
@@ -163,14 +152,7 @@ def table_rows(
         if not mapping_file.lacking(asked, cells):
             delimiter, header_line, header = way, number, cells
             break
-    table: list[Line] = []
-    for number, line in content:
-        if (found := _cells(delimiter, line)) is None:
-            raise InputError(
-                f"{source}, line {number}: quotation marks do not match in "
-                f"{quoted(line.strip())}; close them on the same line"
-            )
-        table.append((number, found))
+    table = list(_split(source, delimiter, content))
     if not named:
         first = next((k for k, row in enumerate(table[:SAMPLE]) if is_data(row[1])), None)
         if first is None:
@@ -208,6 +190,39 @@ def table_rows(
     return Rows(tuple(header), rows, ignored, f"columns split at {at}, {head}", told)
 
 
+Numbered = list[tuple[int, str]]  # lines with their numbers
+
+
+def _sorted_lines(
+    source: str, lines: list[str], settings: TextSourceKeys
+) -> tuple[Numbered, Numbered, Numbered]:
+    """Those of the table, those that are comments, and those that are to be ignored, with why."""
+    marks = tuple(settings.comments)
+    skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
+    content, comments, ignored = Numbered(), Numbered(), Numbered()
+    for number, line in enumerate(lines, start=1):
+        bare = line.strip()
+        if marks and bare.startswith(marks):
+            comments.append((number, bare))
+        elif bare and skip is not None and skip.search(line):
+            ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
+        elif bare:
+            content.append((number, line))
+    if not content:
+        raise InputError(f"{source}: only comments and blank lines; export the points again")
+    return content, comments, ignored
+
+
+def _split(source: str, delimiter: str, lines: Numbered) -> Iterator[Line]:
+    for number, line in lines:
+        if (cells := _cells(delimiter, line)) is None:
+            raise InputError(
+                f"{source}, line {number}: quotation marks do not match in "
+                f"{quoted(line.strip())}; close them on the same line"
+            )
+        yield number, cells
+
+
 def _cells(delimiter: str, line: str) -> list[str] | None:
     """None where a quotation mark runs on beyond the line."""
     text = " ".join(line.split()) if delimiter == "space" else line
@@ -216,7 +231,7 @@ def _cells(delimiter: str, line: str) -> list[str] | None:
     return [cell.strip() for cell in cells] if reader.line_num == 1 else None
 
 
-def _by_numbers(content: list[tuple[int, str]]) -> list[str]:
+def _by_numbers(content: Numbered) -> list[str]:
     """Delimiters by how many cells that are numbers they leave in a line of the median; commas may
     be decimal marks."""
 
