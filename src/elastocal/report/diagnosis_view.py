@@ -100,9 +100,9 @@ def _residuals(d: Diagnosis) -> Iterator[say.Block]:
 
     base = d.calibrated
     assert base is not None
-    residuals = Residuals(base.model, base.observed, base.x, base.residual)
+    residuals = Residuals(base.model, base.observed, base.residual)
     yield say.Sentence("What the model leaves before the effects found are added.")
-    yield residual_arm(*residuals.of_what)
+    yield residual_arm(base.model, base.observed, base.x, base.residual)
     yield from residuals.figures()
     yield from residuals.over_time()
     yield residuals.table()

@@ -473,12 +473,11 @@ MOST_CONFIGURATIONS = 200
 
 
 class Residuals:
-    """Residuals (observations, components) of a model at x (parameters,) in µm (µrad for rotations)
-    as figures and a table; `shown` are the observations to draw, all or a random choice."""
+    """Residuals (observations, components) of a model in µm (µrad for rotations) as figures and a
+    table; `shown` are the observations to draw, all or a random choice."""
 
-    def __init__(self, model: Model, observed: Observations, x: Array, residual: Array) -> None:
+    def __init__(self, model: Model, observed: Observations, residual: Array) -> None:
         self.kinds, self.observed = model.chain.kinds, observed
-        self.of_what = model, observed, x, residual
         self.components = COMPONENTS[observed.kind]
         self.units = ["µrad" if name.startswith("r") else "µm" for name in self.components]
         self.value = residual.reshape(-1, observed.size) * 1e6

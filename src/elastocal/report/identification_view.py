@@ -82,7 +82,7 @@ def calibration_blocks(
         *([("Truth", held)] if truth else []),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    residuals = Residuals(result.model, result.observations, result.x, result.residual)
+    residuals = Residuals(result.model, result.observations, result.residual)
     yield say.Fold("", residuals.figures, figures=("residuals", "against_joints"))
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
     yield say.Fold("Method, noise and intervals", lambda: _method(result), printed=True)
@@ -101,7 +101,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: _on_the_arm(residuals),
+        lambda: _on_the_arm(result, residuals),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -139,10 +139,12 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield found
 
 
-def _on_the_arm(residuals: Residuals) -> list[say.Block]:
+def _on_the_arm(result: Calibration, residuals: Residuals) -> Iterator[say.Block]:
     from elastocal.report.arm_view import residual_arm
 
-    return [residual_arm(*residuals.of_what), *residuals.over_time(), residuals.table()]
+    yield residual_arm(result.model, result.observations, result.x, result.residual)
+    yield from residuals.over_time()
+    yield residuals.table()
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:
