@@ -67,8 +67,8 @@ class ModelSet:
             scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
         assert noise is not None
         self.items, self.noise, self.data, self.scales = items, noise, data, scales
-        at = Projection(weighted, data.precision)
-        z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
+        at, _ = weighted.factored(data.precision)
+        z = at.b / np.linalg.norm(at.inverse, axis=0)  # in deviations
         for item, span in zip(items, self.spans, strict=True):
             score += item.log_prior
             if isinstance(item.what, Hypothesis):
