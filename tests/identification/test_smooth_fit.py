@@ -113,8 +113,10 @@ def test_nothing_is_claimed_where_there_are_no_curves():
     assert fit.test.rms < 1.15 * plain.test.rms + 1e-6
     assert sum(part.effective for part in fit.smooth) < 8
     gone = [part for part in fit.smooth if part.scale == 0]
+    assert gone
     for part in gone:
         assert (part.value == 0).all() and (part.covariance == 0).all()
+        assert part.sizes == {"rad": (0.0, (0.0, 0.0), 0.0)}
         assert any(part.group.name in told for told in fit.warnings)
         note = fit[model.names[part.group.columns[0, 0]]].note
         assert "do not show" in note

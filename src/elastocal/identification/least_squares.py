@@ -312,8 +312,9 @@ def root_of(covariance: Array) -> Array:
 def drawing_root(covariance: Array) -> Array:
     """L (p, p) with L Lᵀ = covariance, for draws: triangular, since alike eigenvalues turn their
     axes, and the draws with them, by their last digits; by way of correlations, since the rounding
-    of large variances would drown small ones."""
-    unit = np.maximum(np.sqrt(np.diag(covariance)), 1e-300)
+    of large variances would drown small ones.  What does not vary is not drawn."""
+    unit = np.sqrt(np.diag(covariance))
+    unit = np.where(unit > 0, unit, 1.0)
     lower = np.asarray(np.linalg.qr(root_of(covariance / np.outer(unit, unit)).T, mode="r")).T
     return np.asarray(unit[:, None] * lower * np.where(np.diag(lower) < 0, -1, 1))
 
