@@ -1,5 +1,6 @@
 """Relaxation and exchange on small pools: beside a cone solver, and beside all plans there are."""
 
+from dataclasses import replace
 from itertools import combinations, product
 
 import cvxpy as cp
@@ -106,7 +107,8 @@ def test_an_exchange_ends_where_no_single_pose_has_a_better_one():
 
 def test_the_same_plan_in_parameters_of_any_scale():
     problem = problem_of("test_pose", 5, N=40, n=6)
-    other = problem.in_terms(np.diag(np.logspace(-6, 6, 5)))
+    S = np.diag(np.logspace(-6, 6, 5))
+    other = replace(problem, blocks=problem.blocks @ S, criterion=problem.criterion.turned(S))
     plans = []
     for one in (problem, other):
         turned = one.balanced()

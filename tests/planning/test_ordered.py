@@ -37,6 +37,13 @@ class Walled(Feasibility):
         return (np.atleast_2d(q_from)[:, 0] < self.wall) & (np.atleast_2d(q_to)[:, 0] < self.wall)
 
 
+class Stepping(Walled):
+    """No move turns joint1 by half a radian or more."""
+
+    def free(self, q_from: Any, q_to: Any, loaded: Any) -> Any:
+        return np.abs(q_from[:, 0] - q_to[:, 0]) < 0.5
+
+
 def selection() -> tuple[Any, FeasiblePool, Any]:
     q = random_poses(CHAIN, 60, seed=2)
     setup = setup_of(CELL, q)
@@ -88,3 +95,12 @@ def test_where_no_other_candidates_are_left_the_poses_are_named() -> None:
     wall = np.sort(pool.q[:, 0])[4]
     with pytest.raises(Unreachable, match=r"pose \d+ \(joints .* cannot be reached"):
         ordered(search(setup, pool, np.arange(6), walled(wall), "quick"))
+
+
+def test_few_poses_that_were_brought_are_joined_through_drawn_ones() -> None:
+    setup, pool, chosen = selection()
+    after = search(setup, pool.take(chosen), np.arange(6), Stepping(CELL, CHAIN), "batch")
+    execution, _, told = ordered(after)
+    assert told == [] and {stop.pose for stop in execution.stops} == set(range(6))
+    assert any(len(stop.via) for stop in execution.stops)
+    assert np.array_equal(after.whole(after.chosen)[0].q, pool.q[chosen])

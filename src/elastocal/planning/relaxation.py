@@ -122,22 +122,17 @@ class DesignProblem:
         L: Array = np.asarray(np.linalg.cholesky(M * scale[:, None] * scale))
         return np.asarray(scale[:, None] * inverse(L).T)
 
-    def in_terms(self, T: Array, ridge: float = 0.0) -> DesignProblem:
-        """That of the parameters z, y = T z, T (p, k), `ridge` · 1 known before.
-
-        Where k < p, what T leaves out is taken for known: no plan has a larger Φ than before.
-        """
+    def balanced(self, T: Array | None = None) -> DesignProblem:
+        """That of the parameters z, y = T z, in which the search works, with a ridge that keeps
+        every plan regular."""
+        T = self.balancing() if T is None else T
         prior = T.T @ self.prior @ T
         return replace(
             self,
             blocks=self.blocks @ T,
-            prior=(prior + prior.T) / 2 + ridge * np.eye(T.shape[-1]),
+            prior=(prior + prior.T) / 2 + RIDGE * np.eye(len(T)),
             criterion=self.criterion.turned(T),
         )
-
-    def balanced(self, T: Array | None = None) -> DesignProblem:
-        """In parameters in which the search works, with a ridge that keeps every plan regular."""
-        return self.in_terms(self.balancing() if T is None else T, RIDGE)
 
     def check_enough(self) -> None:
         _, r, p = self.blocks.shape

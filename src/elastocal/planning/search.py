@@ -11,7 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from elastocal.errors import InsufficientDataError
 from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.planning.candidates import draw
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.criteria import inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
@@ -74,8 +76,7 @@ class Search:
     @property
     def problem(self) -> DesignProblem:
         if self._of is None or self._of[0] is not self.pool:
-            whole = self.setup.problem(self.pool, self.shares)
-            self._of = self.pool, whole.balanced(self.T)
+            self._of = self.pool, self.setup.problem(self.pool, self.shares).balanced(self.T)
         return self._of[1]
 
     def value_of(self, chosen: IntArray) -> float:
@@ -200,7 +201,7 @@ class Search:
 ROUNDING = 1e-9  # of the largest number of the blocks: rounding
 TRIED = 6  # poses of the hub one of which a pose put into a plan must be able to reach
 LIKELY = 400  # candidates that gain most, of which that is found out
-VIA = 200  # candidates through which a blocked move may go
+VIA = 200  # poses through which a blocked move may go
 REPLACED = 10  # times at most
 
 
@@ -282,6 +283,10 @@ class _Ordering:
         same = off.max(axis=(1, 2)) <= ROUNDING * np.abs(pool.blocks).max()
         self.search.pool = pool = replace(pool, q=np.where(same[:, None], q, pool.q))
         self.hub = pool.q[:: max(len(pool) // VIA, 1)]
+        if len(pool) < VIA:  # as where the candidates are poses that were brought
+            with suppress(InsufficientDataError):
+                forces = self.search.setup.information.forces
+                self.hub = np.vstack([self.hub, draw(rules, forces, VIA, self.search.seed).q])
 
     def _replace(self, error: Unreachable) -> None:
         """In the place of the poses that cannot be reached, and by exchange in that of others, come

@@ -229,13 +229,13 @@ def share_within(
     pool = pool.take(evenly(pool.group, each))
     problem = replace(setup, share=0.0).problem(pool, shares)
     own, T = problem.criterion, problem.balancing()
-    alone = relax(problem.in_terms(T), LOOSE)
+    alone = relax(problem.balanced(T), LOOSE)
     weights, price = alone.weights, ((1 + cap) ** 2 - 1) * alone.value
 
     def over(u: float) -> float:
         nonlocal weights
         other = replace(problem, criterion=replace(setup, share=u / (1 + u)).criterion)
-        weights = relax(other.in_terms(T), LOOSE, weights).weights
+        weights = relax(other.balanced(T), LOOSE, weights).weights
         paid = (float(own.of_information(problem.at(weights))) - alone.value) / price
         return 0.0 if 1 - CLOSE <= paid <= 1 else paid - 1 + CLOSE / 2
 
