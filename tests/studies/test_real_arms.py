@@ -68,7 +68,8 @@ def test_the_faulty_block_of_the_cable_data_is_found(folder):
     clean = ran("identify", folder, "irb120.toml", "irb120.csv")
     left_out = {o["line"] for o in clean["excluded"]}
     assert len(left_out & set(range(142, 508))) > 350 and len(left_out) < 400
-    assert clean["heldout_rms_um"] < 620 < as_is["heldout_rms_um"]
+    # Better than the nominal arm by a wider set alone, far from where the narrow fit ends.
+    assert clean["heldout_rms_um"] < clean["nominal_rms_um"] < as_is["heldout_rms_um"]
 
 
 def of_written_cell(folder, cell, train, test=None):
@@ -95,6 +96,7 @@ def of_written_cell(folder, cell, train, test=None):
         ("ur5.toml", "ur5_grid.csv", "ur5_random.csv", 80),
         ("wam.toml", "wam_grid.csv", "wam_random.csv", 3280),
         ("iiwa7_rigid.toml", "iiwa7_train.csv", "iiwa7_test.csv", 320),
+        ("irb120.toml", "irb120.csv", None, 330),
     ],
 )
 def test_what_is_diagnosed_corrects_poses_never_fitted(folder, cell, train, test, bar):

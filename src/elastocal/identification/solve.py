@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.least_squares import Fit, PriorRows, fit, root_of
+from elastocal.identification.least_squares import EPS, Fit, PriorRows, fit, moved, root_of
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -203,10 +203,16 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides.
+    decides, first on the linearised model, then on the fit that starts at its minimum: from where
+    the narrow one ended it may take hundreds of steps.
     """
     problem, held = found.problem, None
     observed = problem.observations
+
+    def predicts(before: Array, after: Array) -> bool:
+        own = observed.configuration, observed.size
+        return predicts_better(before, after, problem.weights, *own)
+
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, found.of_free, sigma, threshold)
@@ -214,16 +220,22 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
         held = looked_at(found)[0] if held is None else held
+        # Of least length in typical sizes where several are least squares.
+        size = problem.sizes[wider.kept]
+        step = size * least_norm(own.R * size, own.projected, cond=own.rows * EPS)
+        start = moved(found.x, wider.kept, step)
+        linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
+        if not predicts(held, linear):
+            continue
         try:
-            wide = fit_kept(problem, found.x, wider, max_steps=30)
+            wide = fit_kept(problem, start, wider, max_steps=30)
             after = looked_at(wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        own_rows = problem.weights, observed.configuration, observed.size
         better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-        if better and predicts_better(held, after, *own_rows):
+        if better and predicts(held, after):
             found, reduction, held = wide, wider, after
     return found, reduction
 
