@@ -39,6 +39,7 @@ LAYOUTS = (
     'model = { nominal = { settings = { "marker:M1" = { slip_time_s = 1.0 } } } }\n'
     '[robot]\nurdf = "arm.urdf"\n[workspace.load]\nshape = "mesh"\nfile = "load.stl"\n'
     '[[workspace.body]]\nname = "b"\nshape = "mesh"\nfile = "fixture.stl"\n',
+    '[robot]\nurdf = "arm.urdf"\n[design]\ncandidates = [100, "path.csv"]\n',
 )
 
 

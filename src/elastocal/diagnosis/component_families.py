@@ -12,11 +12,13 @@ import numpy as np
 
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, wrenches
-from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, wrenches
+from elastocal.diagnosis.evidence import Grams, direct
 from elastocal.diagnosis.hypotheses import (
     CHANGE_TIMES,
+    SCALES,
     UNSIZED_SCALES,
+    EntryKey,
     Hypothesis,
     RegressorDirection,
     cell_with,
@@ -24,12 +26,11 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.identification.start import as_placed
-from elastocal.measurements import Measurements, with_moves
+from elastocal.measurements import Measurements, first_of_visit, with_moves
 from elastocal.model.effects.base import (
     DrivenEffect,
     Effect,
     JointMotion,
-    SmoothFunction,
     Stage,
     index,
     turning_joints,
@@ -161,31 +162,6 @@ def beside(
 FIELD = ResidualField()
 
 
-def _field(
-    dataset: DiagnosisData, where: str, name: str, length: float
-) -> tuple[SmoothFunction, dict[str, float]]:
-    """A field's function of what it follows, and its settings."""
-    x = _followed(dataset.table, name)
-    values = {"size": 1.0, "length": length * np.ptp(x), "low": x.min(), "high": x.max()}
-    settings = {f"field_{name}_{key}": float(value) for key, value in values.items()}
-    cell = cell_with(dataset.base.model.cell, where, settings)
-    (function,) = FIELD.functions(where, dataset.base.model.chain, cell)
-    return function, settings
-
-
-def field_block(dataset: DiagnosisData, where: str, name: str, length: float) -> Generic:
-    """A field as a block, for a search: its direction at every visit, the same waves in each
-    component of the motion."""
-    function, _ = _field(dataset, where, name, length)
-    waves = Waves.of(function)
-    sd = np.sqrt(waves.variances(function.size, function.length))
-    F = waves.at(_followed(dataset.visit_table, name)) * sd * MOTION
-    F = F.reshape(*dataset.present.shape, -1) * dataset.present[:, :, None]
-    entry = FIELD.entry_at(where)
-    D = np.asarray(np.kron(np.eye(entry.size), F[:, :, None, :]), dtype=np.float64)
-    return Generic("angle", name, where, "geometry", (entry.name, (where,)), D)
-
-
 def _followed(table: Measurements, name: str) -> Array:
     """What a field follows in each row (n_rows,): the angle of a joint, or the time."""
     x = table.time if name == "time" else table.q[:, index(name)]
@@ -196,14 +172,25 @@ def _followed(table: Measurements, name: str) -> Array:
 def field_component(
     dataset: DiagnosisData, where: str, name: str, shortest: float = FIELD_LENGTHS[0]
 ) -> Component:
-    function, settings = _field(dataset, where, name, shortest)
-    columns = driven_columns(dataset, FIELD, where, settings) * MOTION
-    span = function.high - function.low
-    low, high = (math.log(share * span) for share in (shortest, FIELD_LENGTHS[1]))
+    """A smooth motion of a place with what it follows, of lengths from the `shortest` share of its
+    range: the same waves in each component of the motion."""
+    x, chain = _followed(dataset.table, name), dataset.base.model.chain
+    values = {"size": 1.0, "length": shortest * np.ptp(x), "low": x.min(), "high": x.max()}
+    settings = {f"field_{name}_{key}": float(value) for key, value in values.items()}
+    (function,) = FIELD.functions(where, chain, cell_with(dataset.base.model.cell, where, settings))
+    low, high = (math.log(share * np.ptp(x)) for share in (shortest, FIELD_LENGTHS[1]))
+    waves, entry = Waves.of(function), FIELD.entry_at(where)
+    D = np.kron(np.eye(entry.size), waves.at(x)[:, None, :])
+    columns = _moved(dataset, (entry.name, (where,)), D)
     return Component(
-        "time" if name == "time" else "pose", FIELD, where, columns, MOTION, name,
-        Waves.of(function), (low, high), FIELD.entry_at(where).size, tuple(settings.items())[2:],
+        "time" if name == "time" else "pose", FIELD, where, columns, MOTION, name, waves,
+        (low, high), entry.size, tuple(settings.items())[2:],
     )  # fmt: skip
+
+
+def _moved(dataset: DiagnosisData, key: EntryKey, D: Array) -> Array:
+    """Columns (C, m, k) of motions D (n_rows, d, k) of an entry, in typical ones."""
+    return dataset.pack(dataset.columns.entry(key) @ D) * MOTION
 
 
 # What corrects the arm beside a sum and names no cause: fields, steps, and responses to loads.
@@ -218,54 +205,62 @@ def without_a_name(
     fields, steps in time, what a joint makes of its torque or last motion, base and links of the
     load; none of the effects `without` which to do."""
     sums, model = beside(dataset, found, found.noise), dataset.base.model
-    chain, cell = model.chain, model.cell
     respond = partial(_response, dataset.columns.torques())
-    wrench_at = {where: wrench for where, *wrench in wrenches(dataset)}
     tried: tuple[tuple[Effect, Search], ...] = (
         (ResidualStep(), _step), (TorqueResponse(), respond), (ApproachResponse(), respond),
-        (LoadResponse(), partial(_yielding, wrench_at)),
+        (LoadResponse(), partial(_yielding, dict(wrenches(dataset)))),
     )  # fmt: skip
     taken = {(p.effect, p.where) for p in model.parameters}
     taken |= {(c.effect.name, c.where) for c in found.components}
-    every: list[Conspicuous] = []
-    for where in FIELD.places(chain, cell):
-        # Of one place at a time: what a large table's entries sum up to would fill the memory.
+    shown: list[Conspicuous] = []
+
+    def scored(c: Component, scales: Array, component: Callable[[], Component]) -> None:
+        columns = sums.data.masked(c.columns * c.scalings[0])
+        nats = float(direct(columns, sums.at).evidence(scales)[0]) - c.search
+        if nats > CONSPICUOUS:
+            of = "time" if c.family == "time" else c.follows or c.effect.name
+            shown.append((nats, (c.where, of), component))
+
+    for where in FIELD.places(model.chain, model.cell):
+        for name in () if FIELD.name in without else _followed_by(dataset, found, where):
+            coarse = field_component(dataset, where, name, FIELD_LENGTHS[0] * 2)
+            # A large table's fields would fill the memory.
+            scored(coarse, SCALES, partial(field_component, dataset, where, name))
+        # Of one place at a time: so would what its entries sum up to.
         grams = Grams(dataset, sums.data, sums.at)
-        if FIELD.name not in without:
-            every += _fields(found, grams, where)
         for effect, search in tried:
             free = effect.name not in without and (effect.name, where) not in taken
-            if not free or where not in effect.places(chain, cell):
+            if not free or where not in effect.places(model.chain, model.cell):
                 continue
             if (it := search(effect, grams, where)) is not None:
-                block, settings, cost = it
-                evidence = float(grams.of(block).evidence(UNSIZED_SCALES)[0]) - cost
-                maker = partial(_as_component, dataset, effect, block, settings, cost)
-                every.append((evidence, where, block.covariate, maker))
-    shown = sorted((c for c in every if c[0] > CONSPICUOUS), key=lambda c: -c[0])
-    chosen = list(dict.fromkeys((where, of) for _, where, of, _ in shown))[:most]
-    return [component() for _, where, of, component in shown if (where, of) in chosen]
+                columns, settings, cost = it
+                c = Component(
+                    family_of(effect, model.cell), effect, where, columns, search=cost,
+                    settings=tuple(settings.items()),
+                    fellows=len(effect.places(model.chain, model.cell)),
+                )  # fmt: skip
+                scored(c, UNSIZED_SCALES, lambda c=c: c)
+    shown.sort(key=lambda c: -c[0])
+    chosen = list(dict.fromkeys(of for _, of, _ in shown))[:most]
+    return [component() for _, of, component in shown if of in chosen]
 
 
 CONSPICUOUS = 3.0  # nats of evidence, its size integrated out
-Conspicuous = tuple[float, str, str, Callable[[], Component]]  # nats, place, what it follows
-# A block, the constants of its effect, and what finding them cost in nats.
-Tried = tuple[Generic, dict[str, float], float]
+# Nats, place and what it follows, and the component.
+Conspicuous = tuple[float, tuple[str, str], Callable[[], Component]]
+# Columns, the constants of their effect, and what finding these cost in nats.
+Tried = tuple[Array, dict[str, float], float]
 Search = Callable[[Any, Grams, str], Tried | None]
 
 
-def _fields(found: FittedSum, grams: Grams, where: str) -> Iterator[Conspicuous]:
-    dataset = grams.dataset
+def _followed_by(dataset: DiagnosisData, found: FittedSum, where: str) -> Iterator[str]:
+    """What a place may follow and does not in the sum: the time, and joints that move."""
     follow = ["time"] if recorded(dataset.table, "time") else []
     if not where.startswith("marker"):
         turning = turning_joints(dataset.base.model.chain)
         follow += [w for w in turning if np.ptp(dataset.table.q[:, index(w)]) > MOVED]
     known = {(c.where, c.follows) for c in found.components}
-    for name in follow:
-        if where != name and (where, name) not in known:
-            coarse = field_block(dataset, where, name, FIELD_LENGTHS[0] * 2)
-            maker = partial(field_component, dataset, where, name)
-            yield float(grams.of(coarse).evidence()[0]), where, name, maker
+    return (name for name in follow if where != name and (where, name) not in known)
 
 
 def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
@@ -275,12 +270,12 @@ def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
     if time is None or not len(moments):
         return None
     entry = effect.entry_at(where)
-    moved, key = np.eye(entry.size) * MOTION, (entry.name, (where,))
-    sums, visits = grams.entry(key), time.reshape(dataset.present.shape)
+    key, visits = (entry.name, (where,)), time.reshape(dataset.present.shape)
+    sums = grams.entry(key)
 
     def directions(tried: Array) -> Array:
         later = (visits[:, :, None] >= tried) & dataset.present[:, :, None]
-        return later[:, :, None, :, None] * moved[:, None, :]
+        return later[:, :, None, :, None] * (MOTION * np.eye(entry.size))[:, None, :]
 
     def best(tried: Array) -> float:
         each = sums.each(len(tried), entry.size, lambda some: directions(tried[some]))
@@ -289,9 +284,9 @@ def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
     apart = math.ceil(len(moments) / CHANGE_TIMES)
     k = int(np.searchsorted(moments, best(moments[apart // 2 :: apart])))
     moment = best(moments[max(k - apart, 0) : k + apart + 1])
-    D = directions(np.array([moment]))[:, :, :, 0]
-    block = Generic("", "time", where, effect.stage, key, D)
-    return block, {effect.constants[0].key: moment}, math.log(len(moments))
+    begun = np.asarray(dataset.table.time)[first_of_visit(dataset.table)]
+    D = (begun >= moment)[:, None, None] * np.eye(entry.size)
+    return _moved(dataset, key, D), {effect.constants[0].key: moment}, math.log(len(moments))
 
 
 def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) -> Tried | None:
@@ -307,36 +302,25 @@ def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) ->
     F = effect.at_rows(tau / largest, np.ones_like(tau) if came is None else came[:, i])
     if np.ptp(F, axis=0).max() == 0:
         return None
-    D = dataset.blocks.of_visits(F[dataset.lead])[:, :, None, :] * MOTION
-    block = Generic("", effect.name, where, effect.stage, (JointMotion.name, (where,)), D)
-    return block, {f"{effect.name}_Nm": largest}, 0.0
+    columns = _moved(dataset, (JointMotion.name, (where,)), F[:, None, :])
+    return columns, {f"{effect.name}_Nm": largest}, 0.0
 
 
 def _yielding(
-    wrench_at: Mapping[str, Sequence[Any]], effect: LoadResponse, grams: Grams, where: str
+    wrench_at: Mapping[str, tuple[EntryKey, Array]], effect: LoadResponse, grams: Grams, where: str
 ) -> Tried | None:
     """Base or link by force and moment of the load, about the axes of the springs there."""
-    base = grams.dataset.base
+    dataset = grams.dataset
+    base = dataset.base
     if where not in wrench_at:
         return None
-    entry, *wrench = wrench_at[where]
+    entry, wrench = wrench_at[where]
     turned = as_placed(base.model, base.x).model.nominal.base_rotation
     R = np.eye(3) if where != "base" or turned is None else turned
-    largest = [float(np.abs(part).max()) or 1.0 for part in wrench]
-    D = np.zeros((*wrench[0].shape[:2], 6, 6))
-    for own, part, most in zip((slice(3), slice(3, 6)), wrench, largest, strict=True):
-        D[:, :, own, own] = R * (part @ R)[:, :, None, :] / most * MOTION
+    parts = np.split(wrench, 2, axis=1)
+    largest = [float(np.abs(part).max()) or 1.0 for part in parts]
+    D = np.zeros((len(wrench), 6, 6))
+    for own, part, most in zip((slice(3), slice(3, 6)), parts, largest, strict=True):
+        D[:, own, own] = R * (part @ R)[:, None, :] / most
     settings = zip((s.key for s in effect.constants[1:]), largest, strict=True)
-    return Generic("", effect.name, where, effect.stage, entry, D), dict(settings), 0.0
-
-
-def _as_component(
-    dataset: DiagnosisData, effect: Effect, block: Generic, settings: dict[str, float],
-    search: float,
-) -> Component:  # fmt: skip
-    model = dataset.base.model
-    return Component(
-        family_of(effect, model.cell), effect, block.where,
-        dataset.packed(block), settings=tuple(settings.items()),
-        search=search, fellows=len(effect.places(model.chain, model.cell)),
-    )  # fmt: skip
+    return _moved(dataset, entry, D), dict(settings), 0.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -58,15 +58,8 @@ from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, listed
 from elastocal.units import BoolArray, Progress
 
-# Tables of the cell file, and the keys in them whose values are paths.  A list of tables counts
-# as each of its members.
-PATHS = (
-    (("robot",), ("urdf", "mjcf", "dh", "masses")),
-    (("workspace", "obstacle"), ("file",)),
-    (("workspace", "body"), ("file",)),
-    (("workspace", "load"), ("file",)),
-    (("design", "test_path"), ("file",)),
-)
+# Keys of the cell file, in whatever table, whose texts are paths.
+PATHS = ("urdf", "mjcf", "dh", "masses", "file", "candidates")
 
 
 def write_extended_cell(
@@ -91,7 +84,8 @@ def write_extended_cell(
     source, target = Path(source), Path(target)
     cell = read_cell(source)
     data = {"name": cell.name} | read_toml(source, "cell file")
-    _redirect(data, source.parent, target.parent)
+    # The real folders: ".." of a link to a folder is not where the link stands.
+    data = _redirected(data, source.parent, os.path.realpath(target.parent))
     if found:
         _switch_on(data.setdefault("model", {}), found)
         data["model"] |= dict(model_keys or {})
@@ -131,31 +125,16 @@ def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
                 _join(model, {"nominal": {key: {f.where: found_there}}})
 
 
-def _redirect(data: dict[str, Any], old: Path, new: Path) -> None:
-    # The real folders: ".." of a link to a folder is not where the link stands.
-    folder = os.path.realpath(new)
-
-    def redirected(path: str) -> str:
-        if os.path.isabs(path):
-            return path
-        return Path(os.path.relpath(os.path.realpath(old / path), folder)).as_posix()
-
-    for names, keys in PATHS:
-        for table in _tables(data, names):
-            table |= {key: redirected(table[key]) for key in keys if key in table}
-    if modules := data.get("plugins", {}).get("modules"):
-        data["plugins"]["modules"] = [redirected(m) if is_plugin_file(m) else m for m in modules]
-
-
-def _tables(data: Any, names: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """The tables reached by `names`, where there are some; every member of a list of them."""
-    if isinstance(data, list):
-        for member in data:
-            yield from _tables(member, names)
-    elif not names:
-        yield data
-    elif names[0] in data:
-        yield from _tables(data[names[0]], names[1:])
+def _redirected(value: Any, old: Path, new: str, key: str = "") -> Any:
+    """A value whose paths lead from the folder `new` to the files that they lead to from `old`."""
+    if isinstance(value, dict):
+        return {name: _redirected(part, old, new, name) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_redirected(part, old, new, key) for part in value]
+    of_file = key in PATHS or (key == "modules" and is_plugin_file(value))
+    if not of_file or not isinstance(value, str) or os.path.isabs(value):
+        return value
+    return Path(os.path.relpath(os.path.realpath(old / value), new)).as_posix()
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from elastocal.diagnosis.noise_floor import NoisyData
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import TIME, stated_deviations
 from elastocal.identification.start import as_placed
-from elastocal.measurements import Measurements, numbered
+from elastocal.measurements import Measurements, first_of_visit, numbered
 from elastocal.model.arm import Setting, usual_sizes
 from elastocal.model.effects.base import Stage
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -377,9 +377,9 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
         yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
 
 
-def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Array]]:
+def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, tuple[EntryKey, Array]]]:
     """Places that the load bends, the base and each link's end, with the entry that moves them and
-    the load's force and moment (C, v, 3) there along the entry's axes.
+    the load's force and moment (n_rows, 6) there along the entry's axes, of a visit's first row.
 
     A frame moved by e moves every marker by R e, so the columns of its frame are R; and turned
     about e they move a marker by R e × lever, whose product with the force is the moment about e,
@@ -387,15 +387,14 @@ def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, EntryKey, Array, Arr
     """
     if not recorded(dataset.table, "load"):
         return
-    n = dataset.table.q.shape[1]
+    n, begun = dataset.table.q.shape[1], first_of_visit(dataset.table)
     links = [(f"link{k + 1}", ("link_frame", (f"link{k + 1}",))) for k in range(n)]
     for place, key in [("base", ("base_motion", ("base",))), *links]:
         E = dataset.columns.entry(key)
         if E.shape[1] < 3:
             return
         wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
-        wrench = dataset.blocks.of_visits(wrench[dataset.lead])
-        yield place, key, wrench[:, :, :3], wrench[:, :, 3:]
+        yield place, (key, wrench[begun])
 
 
 def waves(x: Array, present: BoolArray, count: int) -> Array:
@@ -508,10 +507,11 @@ def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
 
 def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
     last = f"link{dataset.table.q.shape[1]}"
-    for place, key, *wrench in wrenches(dataset):
+    for place, (key, wrench) in wrenches(dataset):
         # Beyond the last link there is only the tool and its markers.
         where = "tool" if place == last else place
-        force, moment = (part / max(np.abs(part).max(), 1e-12) * MOTION for part in wrench)
+        parts = np.split(dataset.blocks.of_visits(wrench[dataset.lead]), 2, axis=2)
+        force, moment = (part / max(np.abs(part).max(), 1e-12) * MOTION for part in parts)
         direction = np.zeros((*force.shape[:2], 6, 18))
         for a in range(3):
             direction[:, :, a, 3 * a : 3 * a + 3] = force
