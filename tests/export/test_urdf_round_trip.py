@@ -16,8 +16,7 @@ from support.urdf_text import arm
 from elastocal.errors import InputError
 from elastocal.export.rigid_files import urdf_flanges
 from elastocal.model.calibrated import CalibratedArm
-from elastocal.model.urdf import check_urdf
-from elastocal.model.xml_file import XmlFile
+from elastocal.model.urdf import XmlFile, check_urdf
 
 NANOMETRE = 1e-9
 

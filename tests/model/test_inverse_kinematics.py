@@ -10,7 +10,7 @@ from support.cells import kr270_chain, nominal_flanges, random_poses
 from support.robots import packaged_urdf
 
 from elastocal.model.chain import Chain, finite_ranges
-from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
+from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.model.urdf import read_urdf
 
 POINT = np.array([0.1, -0.05, 0.2])

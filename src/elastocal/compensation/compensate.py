@@ -32,17 +32,18 @@ from elastocal.model.calibrated import (
     tool_point,
 )
 from elastocal.model.chain import Chain, joint_limits
-from elastocal.model.inverse_kinematics import (
+from elastocal.model.manipulator import smooth_groups
+from elastocal.model.rigid import (
     ARM_LENGTH,
     BoundedSearch,
     Postures,
     Reaching,
     inverse_kinematics,
+    nominal_flanges,
+    reach_of,
     unwound,
 )
-from elastocal.model.inverse_kinematics import TOLERANCE as NOMINAL_TOLERANCE
-from elastocal.model.manipulator import smooth_groups
-from elastocal.model.rigid import nominal_flanges, reach_of
+from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain, some
 from elastocal.units import Array, BoolArray, IntArray

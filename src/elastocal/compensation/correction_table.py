@@ -15,8 +15,7 @@ from elastocal.errors import InputError, option
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint, lasting, numbers
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.model.inverse_kinematics import Reaching
-from elastocal.model.rigid import nominal_flanges
+from elastocal.model.rigid import Reaching, nominal_flanges
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray
 

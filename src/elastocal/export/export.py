@@ -27,7 +27,7 @@ from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.xml_file import XmlFile
+from elastocal.model.urdf import XmlFile
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
 from elastocal.units import Array, microns, rpy_from_rotation

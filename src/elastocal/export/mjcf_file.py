@@ -22,7 +22,7 @@ from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, transform
-from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile, comment, element
+from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element
 from elastocal.text import listed
 from elastocal.units import Array, pose_at
 

@@ -16,8 +16,7 @@ from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import parsed
-from elastocal.model.urdf import tree_of, urdf_file
-from elastocal.model.xml_file import Tag, XmlFile, comment, element
+from elastocal.model.urdf import Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.tables import csv_text
 from elastocal.units import Array, pose_at
 

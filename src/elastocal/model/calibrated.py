@@ -26,7 +26,6 @@ from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limit
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.evaluate import BatchFunction
-from elastocal.model.inverse_kinematics import ARM_LENGTH
 from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.model.symbolic import SymbolicArm, Total
 from elastocal.text import did_you_mean, listed, quoted
@@ -561,7 +560,7 @@ class CalibratedTool:
         self._pose = Total(self._symbolic, y, ca.SX.zeros(0, 1))
         self._sensitivity = Total(self._symbolic, position, p)
         tilt = rigid.vector_from_rotation(ca.reshape(turned, 3, 3).T @ rotation)
-        y = ca.vertcat(position, ARM_LENGTH * tilt)
+        y = ca.vertcat(position, rigid.ARM_LENGTH * tilt)
         self._placing = Total(self._symbolic, position, q)
         self._turning = Total(self._symbolic, y, q, (turned,))
         inputs, frames = [*own.inputs.values(), p], [own.T_tracker_base, place, turn]

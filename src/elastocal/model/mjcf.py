@@ -13,9 +13,11 @@ joint stands a link without mass, and the body on the last one.
 from __future__ import annotations
 
 import copy
+import math
+import os
 import re
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -26,12 +28,12 @@ from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, require
+from elastocal.files import check_size
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, JointKind, LinkMass, check_angles
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.urdf import FileJoint, Tree
-from elastocal.model.xml_file import XmlFile, check_bounds
-from elastocal.text import listed, printable
+from elastocal.model.urdf import MAX_BYTES, FileJoint, Tag, Tree, XmlFile
+from elastocal.text import listed, printable, quoted
 from elastocal.units import Array, pose_at
 
 WORLD = 0  # MuJoCo's number of the world body
@@ -430,3 +432,121 @@ def strip(spec: Any, geoms: Iterable[Any]) -> None:
         for one in list(getattr(spec, kind)):
             if kind != "meshes" or one.name not in meshes:
                 spec.delete(one)
+
+
+# What an MJCF file asks of MuJoCo, counted before MuJoCo sees it.  Its reader takes memory and time
+# by numbers in the file, however small that is.
+
+# A humanoid with hands and keyframes has 1500.  MuJoCo's compiler takes 1 s for so many bodies with
+# free joints; its time grows with their square, and that of 20 000 is beyond a minute.
+MOST_ELEMENTS = 5000
+CELLS = 200  # points of a height field that count as one element
+# The largest numbers of attributes that MuJoCo sets memory aside by.
+LARGEST: dict[str, dict[str, float]] = {
+    "size": {"nuserdata": 1e6, "nkey": 1e3, "njmax": 1e6, "nconmax": 1e6, "nstack": 1e8,
+             "memory": 4e9} | {f"nuser_{kind}": 1e3 for kind in
+             ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")},
+    "numeric": {"size": 1e5},
+    "mesh": {"params": 200, "octree_maxdepth": 8},
+    "composite": {"subgrid": 10},
+}  # fmt: skip
+NAMES = ("name", "class", "childclass", "model", "prefix", "file")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
+_UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
+
+
+def check_bounds(file: XmlFile) -> None:
+    """Raise InputError where an MJCF file asks for more than an arm needs.
+
+    Counted are elements as often as they are replicated, included or attached, and sizes; included
+    models are regular files in its folder.  The message names file and element.
+    """
+    weight = _Model(file.path).weight_of(file)
+    require(
+        weight <= MOST_ELEMENTS,
+        f"{file.path}: makes {weight:.3g} elements of all it replicates and includes; more than "
+        f"{MOST_ELEMENTS} are no arm, so keep the arm alone",
+    )
+
+
+class _Model:
+    def __init__(self, path: Path) -> None:
+        self._folder = path.parent
+        # The folder as it is named, and that of the file where the name is a link.
+        self._roots = path.parent.resolve(), path.resolve().parent
+        self._weights: dict[Path, float] = {}
+        self._text = 0
+
+    def weight_of(self, file: XmlFile) -> float:
+        """How many elements MuJoCo makes of a file and all that it includes."""
+        path, real = file.path, file.path.resolve()
+        if real not in self._weights:
+            self._weights[real] = math.nan  # until it is known
+            self._text += len(file.data)
+            check_size(path, "MuJoCo model with all it includes", self._text, MAX_BYTES)
+            self._weights[real] = self._weight(file, file.root)
+        require(
+            not math.isnan(self._weights[real]), f"{path}: includes itself; take out the <include>"
+        )
+        return self._weights[real]
+
+    def _weight(self, file: XmlFile, tag: Tag) -> float:
+        for key, text in tag.stated.items():
+            stated = f"{file.path}: <{printable(tag.name)} {printable(key)}={quoted(text)}>"
+            require(
+                key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
+                f"{stated} is no number; correct it",
+            )
+            largest = LARGEST.get(tag.name, {}).get(key, math.inf)
+            require(
+                max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
+                f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
+            )
+            require(
+                (tag.name, key) != ("flexcomp", "file"),
+                f"{stated} makes a body of every vertex of a file, which no arm needs; take it out",
+            )
+        inside = 1 + sum(self._weight(file, child) for child in tag.inside)
+        return _count(tag) * (inside + sum(self._named(file, tag)))
+
+    def _named(self, file: XmlFile, tag: Tag) -> Iterator[float]:
+        """Weights of the models that it names."""
+        name = tag.get("file")
+        if tag.name == "attach":
+            models = {one.get("name") or Path(one.get("file")).stem: one.get("file")
+                      for one in file.tags if one.name == "model"}  # fmt: skip
+            name = models.get(tag.get("model"), "")
+        if tag.name not in ("include", "model", "attach") or not name:
+            return
+        # Beside the model or beside the file itself, as versions of MuJoCo differ.
+        for found in {self._folder / name, file.path.parent / name}:
+            if os.path.lexists(found):
+                require(
+                    any(found.resolve().is_relative_to(root) for root in self._roots),
+                    f"{file.path}: includes {printable(name)}, which is outside its folder; "
+                    "put a copy there",
+                )
+                yield self.weight_of(XmlFile.read(found, "included model", "an MJCF file"))
+
+
+def _numbers(text: str) -> list[float]:
+    """Sizes of the numbers in a text, of one with a unit ("2G") too."""
+    found = _NUMBER.finditer(text)
+    return [abs(float(m[0])) * _UNITS.get(text[m.end() : m.end() + 1].upper(), 1.0) for m in found]
+
+
+def _count(tag: Tag) -> float:
+    """How often MuJoCo makes what an element states; a dimension that is 0 or not there counts as
+    one, and a vertex or segment is a body with three joints and a geom."""
+
+    def size(*keys: str) -> float:
+        return math.prod(max(n, 1.0) for key in keys for n in _numbers(tag.get(key)))
+
+    if tag.name == "replicate":
+        return size("count")
+    if tag.name == "hfield":
+        return 1 + size("nrow", "ncol") / CELLS
+    if tag.name in ("composite", "flexcomp"):
+        vertices = (len(tag.get(key).split()) / 3 for key in ("point", "vertex"))
+        return 5 * max(size("count"), *vertices)
+    return 1.0

@@ -20,8 +20,8 @@ from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.placements import MarkerPosition
-from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
+from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import sobol, told
 from elastocal.planning.feasibility import Feasibility
