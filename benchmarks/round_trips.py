@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 import elastocal as ec
 from elastocal.errors import ElastocalError
 from elastocal.export.export import Wish, export
-from elastocal.export.mjcf_file import MujocoRest
-from elastocal.export.rigid_files import urdf_flanges
+from elastocal.export.robot_files import MujocoRest, urdf_flanges
 from elastocal.measurements import Measurements
 from elastocal.model.chain import extent, finite_ranges, joint_limits
 from elastocal.model.dh import read_dh

@@ -11,7 +11,7 @@ import pytest
 from support.exports import LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
-from elastocal.export.mjcf_file import MujocoRest
+from elastocal.export.robot_files import MujocoRest
 from elastocal.model.arm import Parameter
 
 mujoco = pytest.importorskip("mujoco")

@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import elastocal as ec
 from elastocal.cli.main import app
 from elastocal.export.exportable import read_joint_correction
-from elastocal.export.mjcf_file import MujocoRest
+from elastocal.export.robot_files import MujocoRest
 
 HELD = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 LACKED = (

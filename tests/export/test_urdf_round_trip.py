@@ -14,7 +14,7 @@ from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
 from elastocal.errors import InputError
-from elastocal.export.rigid_files import urdf_flanges
+from elastocal.export.robot_files import urdf_flanges
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.urdf import XmlFile, check_urdf
 

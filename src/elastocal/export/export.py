@@ -1,13 +1,14 @@
 """A calibrated arm written in one of the formats, read back, and with what that costs.
 
-The formats of geometry have rooms of their own; the parameters as YAML or JSON and the smooth
+URDF and MJCF have a room of their own; DH tables, the parameters as YAML or JSON and the smooth
 functions are written here.
 """
 
 from __future__ import annotations
 
+import math
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,21 +17,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
+from elastocal.cell.arm_description import Convention, Robot
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.export import exportable, mjcf_file, rigid_files
-from elastocal.export.mjcf_file import MujocoRest, NotInPlace
+from elastocal.export import exportable, robot_files
+from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
 from elastocal.measurements import Measurements
+from elastocal.model import dh
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.urdf import XmlFile
+from elastocal.model.urdf import XmlFile, check_urdf, tree_of
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
-from elastocal.units import Array, microns, rpy_from_rotation
+from elastocal.units import Array, microns, pose_at, rpy_from_rotation
 
 ENDINGS = {
     ".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh", ".yaml": "yaml",
@@ -339,16 +344,14 @@ class _Writing:
         return random_table(self.kept.full.model, self.kept.conditions, poses, self.wish.seed)
 
     def urdf(self) -> Exported:
-        from elastocal.model.urdf import check_urdf, tree_of
-
-        robot, chain = self.calibrated.model.cell.robot, self.pieces.calibrated_chain()
+        robot, q = self.calibrated.model.cell.robot, self.random(100).q
         how = self.pieces, self.wish.frames, self.wish.base_frame, self.note
         if robot.urdf is not None:
-            text = rigid_files.calibrated_urdf(robot, *how)
-            text, told = rigid_files.moved(robot.urdf, text, self.wish.path.parent)
-            base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
+            text = robot_files.calibrated_urdf(robot, *how)
+            text, told = robot_files.moved(robot.urdf, text, self.wish.path.parent)
+            ends = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
         else:
-            text, base, flange = rigid_files.new_urdf(*how), rigid_files.BASE, rigid_files.FLANGE
+            text, ends = robot_files.new_urdf(*how), robot_files.NEW_ENDS
             told = [
                 "inertia tensors are zero in this file: of the links masses and their centres "
                 "alone are known. Its kinematics and weights are right; before simulating motion "
@@ -357,22 +360,18 @@ class _Writing:
                 if self.pieces.masses or self.pieces.chain.masses
                 else "the links have no <inertial> in this file, as their masses are not known"
             ]
-        back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF")).chain(base, flange)
-        q = self.random(100).q
-        expected = nominal_flanges(chain, q)
-        apart, names = _apart(nominal_flanges(back, q), expected), [j.name for j in chain.joints]
+        chain, reader = self.pieces.calibrated_chain(), "pinocchio"
         try:
-            found = rigid_files.urdf_flanges(text, names, base, flange, q)
+            found = robot_files.urdf_flanges(text, [j.name for j in chain.joints], *ends, q)
         except (ValueError, RuntimeError) as error:  # pinocchio's own
-            refused = (
+            told.append(
                 "pinocchio's own reader refuses this file, as it does without the corrections "
                 f"({str(error).strip().splitlines()[0]}); only elastocal's has read it back"
             )
-            return self.done.written(
-                text, *told, refused, read=(apart, "elastocal's reader of URDF")
-            )
+            back = tree_of(XmlFile(Path("written.urdf"), text.encode(), "a URDF"))
+            found, reader = nominal_flanges(back.chain(*ends), q), "elastocal's reader of URDF"
         return self.done.written(
-            text, *told, read=(max(apart, _apart(found, expected)), "pinocchio")
+            text, *told, read=(_apart(found, nominal_flanges(chain, q)), reader)
         )
 
     def mjcf(self) -> Exported:
@@ -388,7 +387,7 @@ class _Writing:
         inertias: tuple[Array, ...] = ()
         if pieces.masses and robot.urdf is not None:
             inertias = exportable.link_inertias(robot.urdf, pieces.chain)
-        text = mjcf_file.calibrated_mjcf(
+        text = robot_files.calibrated_mjcf(
             pieces, self.note, inertias, _compensator(self.kept.exported), self.wish.base_frame
         )
         if not pieces.masses:
@@ -397,7 +396,7 @@ class _Writing:
                 "weights would deflect the arm a second time; set [model] link_gravity = true and "
                 "identify anew for an arm with weights"
             )
-        warnings += self.rigid_joints(f" (gain {mjcf_file.RIGID:g})")
+        warnings += self.rigid_joints(f" (gain {robot_files.RIGID:g})")
         try:
             import mujoco  # noqa: F401
         except ImportError:
@@ -415,8 +414,8 @@ class _Writing:
         if pieces.masses and not cell.model.link_gravity:
             how = "without those of the file (link_gravity = false)"
             raise NotInPlace(f"weights were identified {how}")
-        text, warnings = mjcf_file.corrected_mjcf(cell.robot, pieces, self.wish.frames, self.note)
-        flange = mjcf_file.FLANGE if f'name="{mjcf_file.FLANGE}"' in text else cell.robot.flange
+        text, warnings = robot_files.corrected_mjcf(cell.robot, pieces, self.wish.frames, self.note)
+        flange = robot_files.FLANGE if f'name="{robot_files.FLANGE}"' in text else cell.robot.flange
         arm = MjcfArm.read(path, cell.robot.base, flange, text)
         if not pieces.masses:
             arm.model.opt.gravity[:] = 0.0
@@ -433,7 +432,7 @@ class _Writing:
                 "the springs stand in series with the joints: hold those by stiff actuators, whose "
                 "own error would come on top"
             )
-        text, told = rigid_files.moved(path, text, self.wish.path.parent)
+        text, told = robot_files.moved(path, text, self.wish.path.parent)
         return self.done.written(text, *warnings, *told, read=read)
 
     def rigid_joints(self, how: str) -> list[str]:
@@ -456,27 +455,25 @@ class _Writing:
         return _accepted(worst, LARGEST_AT_REST), "MuJoCo, at rest under the load"
 
     def dh(self) -> Exported:
-        from elastocal.model.dh import read_dh
-
-        convention, q = rigid_files.CONVENTIONS[self.wish.kind], self.random(100).q
-        lines = rigid_files.dh_lines(self.calibrated.model.cell.robot, self.pieces, convention)
+        convention, q = CONVENTIONS[self.wish.kind], self.random(100).q
+        lines = dh_lines(self.calibrated.model.cell.robot, self.pieces, convention)
         expected = nominal_flanges(self.pieces.calibrated_chain(), q)
 
         def checked(text: str, largest: float = LARGEST) -> float:
             with tempfile.TemporaryDirectory() as folder:
                 (path := Path(folder) / "written.csv").write_text(text, encoding="utf-8")
-                return _apart(nominal_flanges(read_dh(path, convention), q), expected, largest)
+                return _apart(nominal_flanges(dh.read_dh(path, convention), q), expected, largest)
 
-        apart, beta = checked(rigid_files.dh_csv(lines)), None
+        apart, beta = checked(dh_csv(lines)), None
         comments = [
-            f"{self.note}; {convention} convention: {rigid_files.FORMULA[convention]}",
+            f"{self.note}; {convention} convention: {FORMULA[convention]}",
             f"rounding of this table: {apart * 1e6:.2g} um at the flange",
         ]
         if any(row[4] for _, _, row in lines):
             four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
-            beta = checked(rigid_files.dh_csv(four), largest=np.inf)
+            beta = checked(dh_csv(four), largest=np.inf)
             comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
-        text = rigid_files.dh_csv(lines, comments)
+        text = dh_csv(lines, comments)
         checked(text)
         done = replace(self.done, without_beta=beta)
         return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
@@ -505,3 +502,194 @@ def _compensator(part: Valued) -> dict[str, float] | None:
         return None
     joint = int(next(iter(values)).partition(".")[0].removeprefix("joint")) - 1
     return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
+
+
+# A link between two joint axes as Denavit–Hartenberg parameters.
+#
+# Every rigid transform between two frames whose z are joint axes is
+#
+#     T = Rz(θ) Tz(d) Tx(a) Rx(α) · Rz(γ) Tz(h)                 axes not parallel
+#     T = Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β) · Rz(γ) Tz(h)     nearly parallel, d chosen (Hayati)
+#
+# Rz(γ) Tz(h) commutes with the motion of the next joint and goes into its θ and d.  So n links are
+# n rows and one remainder at the flange, exactly.  (Denavit and Hartenberg, J. Appl. Mech. 1955;
+# Hayati, IEEE Conference on Decision and Control 1983.)
+
+# Below this angle between two axes (rad) the foot of their common normal runs away with the
+# smallest error, a/α away; Hayati's parameter keeps it in place.
+NEARLY_PARALLEL = 0.02
+ARE_ANGLES, TRAILING = np.array([1, 0, 0, 1, 1]), np.array([0, 0, 1, 1, 1])
+NO_ROW = np.zeros(5)  # a row is θ, d, a, α and Hayati's β, in rad and m
+
+
+def transform(row: Array) -> Array:
+    return np.matmul(*dh.link(*row.tolist()))
+
+
+def turned_as(row: Array, other: Array) -> Array:
+    return row + 2 * np.pi * np.round((other - row) / (2 * np.pi)) * ARE_ANGLES
+
+
+def near(row: Array, other: Array, tolerance: float = 1e-12) -> Array:
+    """The row with the other's number wherever the two agree to rounding."""
+    return np.where(np.abs(row - other) < tolerance, other, row)
+
+
+def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Array, Array]:
+    """The row of T (4, 4) and the remainder Rz(γ) Tz(h), so that T = row · remainder.
+
+    (θ, a, α) and (θ ± π, −a, −α) say the same: taken is the one closer to `like`, else the one
+    with the smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of
+    `like`, else `height`.
+    """
+    skew = math.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
+    alike, height = (0.0, height) if like is None else like[:2].tolist()
+    ways = [_skew(T, s) if skew else _parallel(T, s, height, alike) for s in (1.0, -1.0)]
+
+    def away(row: Array) -> float:
+        if like is None:
+            return float(abs(row[0]) - 1e-9 * row[2])
+        turns = 1 - np.cos(row[[0, 3]] - like[[0, 3]])
+        return float(turns.sum() + abs(row[2] - like[2]))
+
+    row = min(ways, key=away)
+    row = row if like is None else turned_as(row, like)
+    return row, np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)
+
+
+def _skew(T: Array, sign: float) -> Array:
+    z, p = T[:3, 2], T[:3, 3]
+    theta = math.atan2(sign * z[0], -sign * z[1])
+    x = np.array([math.cos(theta), math.sin(theta), 0.0])
+    alpha = math.atan2(sign * math.hypot(z[0], z[1]), z[2])
+    # p = d·z₀ + a·x + h·z: the common normal meets both axes.
+    d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
+    return np.array([theta, d, a, alpha, 0.0])
+
+
+def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
+    z, p = T[:3, 2], T[:3, 3]
+    foot = p - (p[2] - d) / z[2] * z  # where the second axis passes through the height d
+    a = sign * math.hypot(foot[0], foot[1])
+    theta = math.atan2(sign * foot[1], sign * foot[0])
+    if abs(a) < 1e-12:  # one axis in the other's line: any direction will do
+        theta, a = alike, 0.0
+    # z = Rz(θ) Rx(α) Ry(β) e_z = Rz(θ) (sin β, −sin α cos β, cos α cos β)
+    c, s = math.cos(theta), math.sin(theta)
+    u = (c * z[0] + s * z[1], -s * z[0] + c * z[1], z[2])
+    alpha = math.atan2(-u[1], u[2])
+    beta = math.atan2(u[0], math.hypot(u[1], u[2]))
+    return np.array([theta, d, a, alpha, beta])
+
+
+# The calibrated arm as a Denavit–Hartenberg table, standard or modified.
+#
+# Calibration leaves neighbouring axes skew, so a table of four parameters per joint holds them;
+# where they are nearly parallel there is a column beta_rad.  Rows of type fixed carry what no joint
+# row can: where the first axis stands in the base frame, and the flange.  Numbers that calibration
+# did not change are those of the nominal arm.
+#
+# The chain is written as  L₀ X₀ · L₁(q₁) X₁ · … · L_n(q_n) X_n · F  with L = Rz(θ) Tz(d) and
+# X = Tx(a) Rx(α) Ry(β).  A standard row is an L with the X after it, a modified row an L with the
+# X before it.
+
+CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
+HEADER = ("joint", "type", "theta0_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
+LIMITS = {"revolute": ("lower_rad", "upper_rad"), "prismatic": ("lower_m", "upper_m")}
+ZERO = 1e-14  # m or rad; rounding of a product of rotations
+
+
+# One row of the table: its name, its joint, None for a fixed one, and its numbers.
+Line = tuple[str, Joint | None, Array]
+
+
+def dh_lines(robot: Robot, pieces: exportable.ExportNumbers, convention: Convention) -> list[Line]:
+    """The rows of the calibrated table; `robot` says which nominal table, if any, to keep to."""
+    nominal = pieces.chain
+    ideal = _nominal_rows(robot, nominal, convention) or _decompose(nominal)[0]
+    rows, F = _decompose(pieces.calibrated_chain(), ideal)
+    end, last = split(F)
+    rest = np.array([math.atan2(last[1, 0], last[0, 0]), last[2, 3], 0.0, 0.0, 0.0])
+    every = np.array([*(near(row, old) for row, old in zip(rows, ideal, strict=True)), end, rest])
+    if convention == "modified":
+        every[:, 2:] = np.vstack([NO_ROW, every[:-1]])[:, 2:]
+    every = near(every, NO_ROW, ZERO)
+    names = ["base", *(joint.name for joint in nominal.joints), "flange1", "flange2"]
+    lines = zip(names, [None, *nominal.joints, None, None], every, strict=True)
+    return [line for line in lines if line[1] is not None or line[2].any()]
+
+
+FORMULA = {
+    "standard": "T = Rz(theta0 + q) Tz(d) Tx(a) Rx(alpha) Ry(beta) per row",
+    "modified": "T = Rx(alpha) Tx(a) Ry(beta) Rz(theta0 + q) Tz(d) per row",
+}
+
+
+def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
+    """CSV text of a table, which `[robot] dh` reads: angles in rad, lengths in m.
+
+    beta_rad stands there only where a row needs it; limits are those of commanded values; comments
+    begin with #.
+    """
+    found = []
+    for name, joint, row in lines:
+        numbers = zip(HEADER[2:], row.tolist(), strict=True)
+        cells = {header: repr(value + 0.0) for header, value in numbers}
+        if joint is not None:
+            ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
+            cells |= {end: repr(value + 0.0) for end, value in ends if math.isfinite(value)}
+        kind = dh.FIXED if joint is None else joint.kind
+        found.append(cells | dict(zip(HEADER[:2], (name, kind), strict=True)))
+    bounded = {name for cells in found for name in cells}
+    limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
+    with_beta = any(row[4] for _, _, row in lines)
+    header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
+    return csv_text(header, ([cells.get(name, "") for name in header] for cells in found), comments)
+
+
+def _decompose(chain: Chain, like: list[Array] | None = None) -> tuple[list[Array], Array]:
+    """Rows 0 … n of a chain and its flange in the last row's frame, near the rows `like`.
+
+    Of the last of these θ and d alone change, the rest is the flange's.  Its z is often in line
+    with the last axis, where a row of its own would turn any way.
+    """
+    turned = [  # rotations whose z column is the axis
+        pose_at(np.zeros(3), np.column_stack([*transverse_axes(joint.axis), joint.axis]))
+        for joint in chain.joints
+    ]
+    ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
+    starts = [np.eye(4), *turned]
+    rows: list[Array] = []
+    carried: Array = np.eye(4)
+    for i, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        last = i == chain.n_joints
+        T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
+        old = None if like is None else like[i]
+        if last and old is not None:
+            # The turn about and the shift along the axis that bring it closest to T.
+            R = T[:3, :3] @ transform(old * TRAILING)[:3, :3].T
+            theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
+            row = turned_as(np.array([theta, T[2, 3], *old[2:]]), old)
+            carried = np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)
+        else:
+            row, carried = split(T, old, height=float(T[2, 3]) if last else 0.0)
+        rows.append(row)
+    return rows, carried
+
+
+def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Array] | None:
+    """What the user's own table says of links 0 … n; None where it is in another convention."""
+    if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in dh.UR_ENDINGS:
+        return None
+    table = dh.read_dh_table(robot.dh)
+    n = len(table.row)
+    # Rows without a joint, joints against z and frames slid along their axes are not rows of ours.
+    if n != chain.n_joints or chain.notes or any(joint.axis[2] < 0 for joint in chain.joints):
+        return None
+    stems = ("theta0", "d", "a", "alpha", "beta")
+    keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]
+    numbers = [[dh.dh_number(table, i, *key) for key in keys] for i in range(n)]
+    own = np.vstack([NO_ROW, np.nan_to_num(numbers)])
+    if convention == "modified":  # θ and d of one, the rest of the next
+        own[:, 2:] = np.vstack([own[1:], NO_ROW])[:, 2:]
+    return list(own)

@@ -1,11 +1,13 @@
-"""The calibrated arm as MJCF, whose rest under load is the model's static equilibrium: a new file,
-or the user's own with the corrections in it."""
+"""The calibrated arm as URDF or MJCF: the user's own file with the corrections in it, or a new one;
+of an MJCF the rest under load is the model's static equilibrium."""
 
 from __future__ import annotations
 
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -13,19 +15,264 @@ import numpy as np
 from scipy.optimize import root
 
 from elastocal.cell.arm_description import Robot
-from elastocal.errors import ElastocalError, InputError
-from elastocal.export.exportable import ExportNumbers, nothing, numbers, placed_body
-from elastocal.export.rigid_files import PREFIX, tool_frames
+from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.export.exportable import (
+    ExportNumbers,
+    nothing,
+    numbers,
+    origin_attributes,
+    placed_body,
+)
 from elastocal.files import read_bytes
 from elastocal.model.arm import Spring
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
-from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, transform
-from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element
+from elastocal.model.mjcf import (
+    SPRING,
+    MjcfArm,
+    before,
+    import_mujoco,
+    joints_of,
+    parsed,
+    transform,
+)
+from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.text import listed
 from elastocal.units import Array, pose_at
 
+# The calibrated arm as URDF: the user's own file with corrected joint origins.
+#
+# With O_i the origin of moving joint i, E_i the error of the link before it (6-D, at the link's
+# distal end) and J_i(a_i) the motion by the joint's offset a_i,
+#
+#     O_i ← O_i E_i J_i(a_i)           and for the flange's own fixed joint      O_f ← O_f E_n.
+#
+# So joint values stay what the controller commands: the encoder's zero has moved in the file, and
+# limits, mimics and calibration marks, which are stated in commanded values, stay as they are.
+
+PREFIX = "elastocal_"
+MOUNT, TRACKER, LOAD_POINT = f"{PREFIX}flange_mount", f"{PREFIX}tracker", f"{PREFIX}load_point"
+
+
+def calibrated_urdf(
+    robot: Robot, pieces: ExportNumbers, tool: bool, base_frame: bool, note: str
+) -> str:
+    """Text of the robot's URDF with the calibrated geometry; `note` becomes a comment in it.
+
+    Only origins that change are touched.  `tool` adds elastocal_marker_NAME and
+    elastocal_load_point as links on the flange, `base_frame` elastocal_tracker as the new root.
+    """
+    assert robot.urdf is not None
+    file = urdf_file(robot.urdf)
+    tree, tags = tree_of(file), {tag.get("name").strip(): tag for tag in file.root.all("joint")}
+    base, flange = tree.ends(robot.base, robot.flange, choose=False)
+    lines = [comment(note)]
+
+    def place(joint: str, T: Array) -> None:
+        file.set_in(tags[joint], "origin", origin_attributes(T))
+
+    def add(new: str, parent: str, child: str, T: Array) -> None:
+        """Link `new` and the fixed joint parent → child, one of which is `new`; a frame of an
+        earlier export is moved instead."""
+        name = f"{new}_joint"
+        old = next((joint for joint in tree.joints if joint.name == name), None)
+        if old is not None and (old.kind, old.parent, old.child) == ("fixed", parent, child):
+            return place(name, T)
+        if old is not None or new in tree.links:
+            what = f"joint '{name}'" if old is not None else f"link '{new}'"
+            raise InputError(
+                f"{tree.path}: {what} stands where export would add its own; rename it, "
+                f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
+            )
+        lines.extend(fixed_link(new, parent, child, T))
+
+    for i, joint in enumerate(tree.serial_chain(base, flange)):
+        if not nothing(correction := pieces.correction(i)):
+            place(joint.name, joint.origin @ correction)
+    last, error = tree.parent_joint[flange], pieces.error(pieces.chain.n_joints - 1)
+    if not nothing(error) and last.kind == "fixed":
+        place(last.name, last.origin @ error)
+    elif not nothing(error):
+        # The flange is the link that the last joint moves: a link in between takes the correction.
+        file.set_in(tags[last.name], "child", {"link": MOUNT})
+        add(MOUNT, MOUNT, flange, error)
+    for name, T in tool_frames(pieces).items() if tool else ():
+        add(name, flange, name, T)
+    if base_frame:
+        require(
+            base != TRACKER,
+            f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier "
+            "export; name the robot's own base link as [robot] base",
+        )
+        T = pieces.T_tracker_base @ np.linalg.inv(tree.placed(base))
+        if tree.root != TRACKER:
+            add(TRACKER, TRACKER, tree.root, T)
+        else:
+            below = next(joint for joint in tree.joints if joint.parent == TRACKER)
+            place(below.name, T @ below.origin)
+    file.insert(file.end, "".join(f"  {line}\n" for line in lines))
+    return file.result()
+
+
+def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
+    """Link name → placement (4, 4) in the flange frame of every marker and of the load point."""
+    frames: dict[str, Array] = {}
+    for marker, T in pieces.markers.items():
+        name = f"{PREFIX}marker_{'_'.join(marker.split())}"
+        while name in frames:  # "A B" beside "A_B"
+            name += "_"
+        frames[name] = T
+    return frames | {LOAD_POINT: pose_at(pieces.load_point)}
+
+
+def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
+    ends = element("parent", {"link": parent}), element("child", {"link": child})
+    joint = {"name": f"{new}_joint", "type": "fixed"}
+    return [
+        element("link", {"name": new}),
+        element("joint", joint, *ends, element("origin", origin_attributes(T))),
+    ]
+
+
+# A URDF for an arm that has none: a robot described by a DH table or a MuJoCo model.
+
+NEW_ENDS = NEW_BASE, NEW_FLANGE = "base_link", "flange"
+NO_LIMIT = 1e6  # m; a URDF's slide must have limits
+
+
+def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> str:
+    """URDF text of links base_link, link_1 … link_n, flange with the calibrated placements.
+
+    Joints bear the table's names and limits (continuous where one has none); masses that are known
+    stand with a zero inertia tensor.
+    """
+    # Masses of the robot's description where no weights act in the model.
+    chain, masses = pieces.calibrated_chain(), pieces.masses or pieces.chain.masses
+    lines = []
+    if base_frame:
+        lines += fixed_link(TRACKER, TRACKER, NEW_BASE, pieces.T_tracker_base)
+    lines += [element("link", {"name": NEW_BASE})]
+    parent = NEW_BASE
+    for i, joint in enumerate(chain.joints, start=1):
+        lines += _link(f"link_{i}", masses[i - 1] if masses else None)
+        lines += _joint(joint, parent, f"link_{i}")
+        parent = f"link_{i}"
+    lines += fixed_link(NEW_FLANGE, parent, NEW_FLANGE, chain.flange_placement)
+    if tool:
+        for name, T in tool_frames(pieces).items():
+            lines += fixed_link(name, NEW_FLANGE, name, T)
+    head = ['<?xml version="1.0" encoding="UTF-8"?>', comment(note)]
+    return "\n".join([*head, *_nested("robot", {"name": chain.name}, lines)]) + "\n"
+
+
+def _link(name: str, body: LinkMass | None) -> list[str]:
+    if body is None:
+        return [element("link", {"name": name})]
+    return _nested("link", {"name": name}, _nested("inertial", {}, [
+        element("origin", {"xyz": numbers(body.com), "rpy": "0 0 0"}),
+        element("mass", {"value": repr(float(body.mass))}),
+        element("inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")),
+    ]))  # fmt: skip
+
+
+def _joint(joint: Joint, parent: str, child: str) -> list[str]:
+    bounded = math.isfinite(joint.lower) and math.isfinite(joint.upper)
+    kind = joint.kind if bounded or joint.kind == "prismatic" else "continuous"
+    lines = [
+        element("parent", {"link": parent}),
+        element("child", {"link": child}),
+        element("origin", origin_attributes(joint.placement)),
+        element("axis", {"xyz": numbers(joint.axis)}),
+    ]
+    if kind != "continuous":
+        ends = {"lower": max(joint.lower, -NO_LIMIT), "upper": min(joint.upper, NO_LIMIT)}
+        limit = {name: repr(float(end)) for name, end in ends.items()}
+        lines.append(element("limit", limit | {"effort": "0", "velocity": "0"}))
+    return _nested("joint", {"name": joint.name, "type": kind}, lines)
+
+
+def _nested(tag: str, stated: dict[str, str], lines: Sequence[str]) -> list[str]:
+    head = element(tag, stated).removesuffix("/>")
+    return [f"{head}>", *(f"  {line}" for line in lines), f"</{tag}>"]
+
+
+# The user's own file, of either kind, written into another folder: its meshes are found from there.
+
+# Files that MuJoCo looks for beside the main file, whatever directories the compiler states.
+BESIDE = ("include", "model")
+
+
+def moved(path: Path, text: str, folder: Path) -> tuple[str, list[str]]:
+    """The `text` of a file that lies at `path`, to be written into `folder`, and what to know.
+
+    A file without names of others, or that stays where it was, is as before to the byte.
+    """
+    xml = XmlFile(path, text.encode("utf-8"), "a file")
+    named = [tag for tag in xml.tags if any(_is_file(tag, key) for key in tag.stated)]
+    if not named:
+        return text, []
+    home, there = path.parent.resolve(), folder.resolve()
+    if there != home:
+        if any(tag.name in BESIDE for tag in named):
+            return text, [f"copy it beside {path.name}: the files that it includes are there"]
+        if xml.root.name == "mujoco":
+            stated = parsed(path).compiler
+            places = {key: _from(there, home / (getattr(stated, key) or ""))
+                      for key in ("meshdir", "texturedir")}  # fmt: skip
+            if compilers := [tag for tag in xml.tags if tag.name == "compiler"]:
+                xml.set(compilers[-1], places)
+            else:
+                xml.insert_in(xml.root, f"\n  {element('compiler', places)}")
+        for tag in (tag for tag in named if "filename" in tag.stated):
+            place = home / tag.stated["filename"]
+            if place.is_file():  # others are found in packages
+                xml.set(tag, {"filename": _from(there, place)})
+    told = "meshes and other files are named relative to the file: to have it elsewhere, export it"
+    return xml.result(), [f"{told} there"]
+
+
+def _is_file(tag: Tag, key: str) -> bool:
+    name = tag.stated[key]
+    if key == "filename":  # of a URDF
+        relative = "://" not in name and not Path(name).is_absolute()
+        return tag.name in ("mesh", "texture") and relative
+    return key.startswith("file") and bool(name)
+
+
+def _from(folder: Path, place: Path) -> str:
+    try:
+        return Path(os.path.relpath(place, folder)).as_posix()
+    except ValueError:  # on another drive
+        return place.as_posix()
+
+
+# The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.
+
+
+def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) at q (n, joints) of a URDF in pinocchio; other joints are neutral.
+
+    Raises ValueError or RuntimeError where pinocchio refuses it.
+    """
+    import pinocchio as pin
+
+    model = pin.buildModelFromXML(text.encode("utf-8").decode("utf-8-sig"))
+    data, found = model.createData(), []
+    ends = [model.getFrameId(name, pin.FrameType.BODY) for name in (base, flange)]
+    numbers = [model.getJointId(name) for name in joints]
+    for row in q:
+        motion = np.zeros(model.nv)  # a position is (cos q, sin q) where there are no limits
+        motion[[model.joints[number].idx_v for number in numbers]] = row
+        position = pin.integrate(model, pin.neutral(model), motion)
+        pin.framesForwardKinematics(model, data, position)
+        start, end = (data.oMf[frame].homogeneous for frame in ends)
+        found.append(np.linalg.solve(start, end))
+    return np.array(found)
+
+
+# A new MJCF.
+#
 # Each joint is a hinge or slide that a position actuator drives: its control is the commanded
 # joint value, its gain kp = 1/k the identified stiffness, so that at rest q − q_commanded = k τ.
 # Springs that no motor holds (bearings across the axis, links, pedestal) are passive joints of
