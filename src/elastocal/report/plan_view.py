@@ -362,11 +362,12 @@ def _execution_lines(plan: Plan) -> Told:
     text = f"{len(e.stops)} stops{visits}, {e.travel:.0f} s of travel"
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
-        text += f"; {parts} poses are measured unloaded at start and end (half the readings each)"
+        are = f"{say.counted(parts, 'pose')} {'is' if parts == 1 else 'are'}"
+        text += f"; {are} measured unloaded at start and end (half the readings each)"
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
-    text += f", {via} via points around obstacles" if via else ""
+    text += f", {say.counted(via, 'via point')} around obstacles" if via else ""
     if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
         checked = "every move checked"
     elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
