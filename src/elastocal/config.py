@@ -170,12 +170,9 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
 
 
 @cache
-def _hints_of(cls: Any) -> dict[str, Any]:
-    return get_type_hints(cls, include_extras=True)
-
-
-def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
-    hints = _hints_of(cls)
+def fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
+    """Field of a table or record → the keys that state it."""
+    hints = get_type_hints(cls, include_extras=True)
     if issubclass(cls, BaseModel):
         return {
             name: (Key(name, of.description or _choice(hints[name]), None, None,
@@ -195,10 +192,6 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
         )
         for name, one in cls.__dataclass_fields__.items()
     }
-
-
-# Field of a table or record → the keys that state it.
-fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
 
 
 def keys_of(*classes: Any, without: Sequence[str] = ()) -> list[Key]:
@@ -304,7 +297,7 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     for name in others if more == "forbid" else ():
         raise InputError(f"{spot.path}: {_unknown(cls, name, data[name], spot)}")
     for name in others if more == "allow" else ():
-        kind = get_args(_hints_of(cls)["__pydantic_extra__"])[1]
+        kind = get_args(get_type_hints(cls, include_extras=True)["__pydantic_extra__"])[1]
         found[name] = _value(kind, data[name], spot / name, takes, did_you_mean(name, known))
     for name, one in known.items():
         if name in data:

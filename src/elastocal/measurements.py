@@ -38,11 +38,6 @@ PLANS = ("plan", "targets")
 PLAN_ONLY = ("level", "order")
 # What `compensate` writes beside its commands, which are a plan too.
 BESIDE_COMMANDS = ("correction_", "error_", "std_", "within95_", "status")
-# In the order in which they are written.
-NUMBERS = (
-    "repeat", "q", "force", "position", "rotation", "distance", "torque", "sigma", "time",
-    "approach", "before", "temperature",
-)  # fmt: skip
 SINGLE = ("distance", "time", "temperature")  # one number in a row
 WHOLE = ("position", "torque", "approach", "before")  # as they stand in the file
 DEFAULT_MARKER = "M1"
@@ -153,18 +148,17 @@ class Measurements(Result):
 
     def columns(self) -> dict[str, np.ndarray]:
         """The same as header → (n,) numbers or labels."""
-        known = families(self.kinds)
         columns: dict[str, np.ndarray] = {
             "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
             "marker": np.array(self.marker_names, dtype=object)[self.marker],
         }
-        for name in NUMBERS:
-            values = getattr(self, name)
-            if values is None:
+        for family in families(self.kinds).values():
+            name, _, frame = family.name.partition("_")  # sigma_polar
+            values, stems = getattr(self, name, None), family.units
+            if family.is_label or values is None or frame not in ("", self.sigma_frame):
                 continue
             if name == "approach":
                 values = values.astype(np.int64)
-            stems = known[f"sigma_{self.sigma_frame}" if name == "sigma" else name].units
             for stem, numbers in zip(stems, values.reshape(len(self), len(stems)).T, strict=True):
                 unit = next(unit for unit in SI_UNITS if unit in stems[stem])
                 columns[column(stem, unit)] = numbers

@@ -71,19 +71,29 @@ _LOCK = threading.Lock()
 _here: tuple[str, Path, ModuleType] | None = None  # digest, folder and study.py of what is loaded
 
 
+class StudyFile(Table):
+    title: str = Field("", description="text")
+    seed: Annotated[int, Field(ge=0)] = Field(description="a whole number from 0")
+    files: list[str] = Field([], description='a list of names, as in files = ["cell.toml"]')
+    options: dict[str, Any] = Field({}, description="a table: write [options]")
+    columns: Annotated[dict[str, str], Field(min_length=1)] = Field(
+        description='the unit of what run() returns, as in rms_um = "µm" ("" for none, or text, '
+        "yes/no, count)",
+    )
+
+
 @dataclass(frozen=True)
 class Sources:
-    """The .py files of a study's folder and the files that study.toml names, by their names.
+    """The .py files of a study's folder and the files that study.toml names, by their names, and
+    what it states, with options and seed settled.
 
     Sent to each worker: one that has the same folder with the same contents uses it there, any
-    other unpacks this one, so a cluster needs no shared file system.  `columns` maps each column
-    of the results to its unit, or to `text`, `yes/no` or `count`, which are types.
+    other unpacks this one, so a cluster needs no shared file system.
     """
 
     folder: Path
     contents: Mapping[str, bytes]
-    columns: Mapping[str, str]
-    seed: int
+    stated: StudyFile
     version: str = __version__
 
     @cached_property
@@ -98,26 +108,13 @@ class Sources:
 
 @dataclass(frozen=True)
 class Study:
-    """A study ready to run, with options settled and its tasks in their order: what their lines of
-    results begin with (`task`, `task_hash`, `values`)."""
+    """A study ready to run, with its tasks in their order: what their lines of results begin with
+    (`task`, `task_hash`, `values`)."""
 
     folder: Path
-    title: str
-    options: Mapping[str, Any]
     sources: Sources
     module: ModuleType
     tasks: tuple[Row, ...]
-
-
-class StudyFile(Table):
-    title: str = Field("", description="text")
-    seed: Annotated[int, Field(ge=0)] = Field(description="a whole number from 0")
-    files: list[str] = Field([], description='a list of names, as in files = ["cell.toml"]')
-    options: dict[str, Any] = Field({}, description="a table: write [options]")
-    columns: Annotated[dict[str, str], Field(min_length=1)] = Field(
-        description='the unit of what run() returns, as in rms_um = "µm" ("" for none, or text, '
-        "yes/no, count)",
-    )
 
 
 def read_study(folder: str | Path, seed: int | None = None, options: Iterable[str] = ()) -> Study:
@@ -134,11 +131,12 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
-    contents, seed = _contents(whole, stated, path), stated.seed if seed is None else seed
-    sources = Sources(whole, contents, stated.columns, seed)
+    settled = {"title": stated.title or whole.name, "options": chosen}
+    settled |= {} if seed is None else {"seed": seed}
+    contents = _contents(whole, stated, path)
+    sources = Sources(whole, contents, stated.model_copy(update=settled))
     module = load(sources)
-    tasks = tuple(_tasks(folder, module, chosen, sources))
-    return Study(folder, stated.title or whole.name, chosen, sources, module, tasks)
+    return Study(folder, sources, module, tuple(_tasks(folder, module, sources)))
 
 
 def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
@@ -174,16 +172,13 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
     return options
 
 
-def _tasks(
-    folder: Path, module: ModuleType, options: Mapping[str, Any], sources: Sources
-) -> Iterator[Row]:
-    script = folder / "study.py"
+def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
+    script, stated = folder / "study.py", sources.stated
     for name in ("tasks", "run"):
         told = f"defines no function {name}(); a study has tasks(options) and run(task, rng)"
         require(callable(getattr(module, name, None)), f"{script}: {told}")
-    found = calling(
-        folder, "tasks()", lambda: list(islice(module.tasks(dict(options)), MAX_TASKS + 1))
-    )
+    given = dict(stated.options)
+    found = calling(folder, "tasks()", lambda: list(islice(module.tasks(given), MAX_TASKS + 1)))
     require(bool(found), f"{script}: tasks() gives no task with these options; nothing to do")
     told = f"tasks() gives more than {MAX_TASKS} tasks with these options; let each do more"
     require(len(found) <= MAX_TASKS, f"{script}: {told}")
@@ -198,9 +193,9 @@ def _tasks(
                 f"{where}: {quoted(key)} cannot be a key; keys are text, and {TAKEN}",
             )
             told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
-            require(key not in sources.columns, told)
+            require(key not in stated.columns, told)
         values = json.loads(_json(where, dict(task)))
-        same = sources.digest, sources.seed, index, json.dumps(values, sort_keys=True)
+        same = sources.digest, stated.seed, index, json.dumps(values, sort_keys=True)
         digest = hashlib.sha256("\n".join(map(str, same)).encode()).hexdigest()
         yield {"task": index, "task_hash": digest, "values": values}
 
@@ -285,7 +280,7 @@ def execute(sources: Sources, task: Row) -> Row:
     there are.
     """
     begun, rows, error, trace = time.perf_counter(), list[Row](), None, None
-    draws = np.random.SeedSequence(sources.seed, spawn_key=(task["task"],))
+    draws = np.random.SeedSequence(sources.stated.seed, spawn_key=(task["task"],))
     try:
         if sources.version != __version__:
             raise RuntimeError(
@@ -293,7 +288,7 @@ def execute(sources: Sources, task: Row) -> Row:
                 f"{sources.version}; install the same there"
             )
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
-        rows = _checked_rows(found, sources.columns, task["values"])
+        rows = _checked_rows(found, sources.stated.columns, task["values"])
     except (Exception, SystemExit) as caught:
         error, trace = f"{type(caught).__name__}: {caught}", traceback.format_exc()
     return line_of(task, rows, time.perf_counter() - begun, error, trace)
@@ -642,11 +637,11 @@ def run_study(
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
             atomic_write(folder / RESULTS, "".join(map(as_text, kept)))
+        stated = study.sources.stated
         statement = {
-            "schema": SCHEMA, "title": study.title, "seed": study.sources.seed,
-            "options": dict(study.options), "tasks": len(study.tasks),
-            "columns": dict(study.sources.columns), "sources": study.sources.digests,
-            "elastocal": __version__,
+            "schema": SCHEMA, "title": stated.title, "seed": stated.seed,
+            "options": stated.options, "tasks": len(study.tasks), "columns": stated.columns,
+            "sources": study.sources.digests, "elastocal": __version__,
         }  # fmt: skip
         atomic_write(folder / STATEMENT, json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
@@ -668,7 +663,7 @@ def run_study(
 
 def _known(study: Study, folder: Path) -> list[Row]:
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
-    before, columns = statement_of(folder), dict(study.sources.columns)
+    before, columns = statement_of(folder), study.sources.stated.columns
     require(
         before.get("columns", columns) == columns,
         f"{folder}: has other columns, types or units than the study now. {here}",
@@ -684,15 +679,15 @@ def _known(study: Study, folder: Path) -> list[Row]:
 
 
 def _changes(now: Study, before: dict[str, Any]) -> list[str]:
-    told = []
+    told, stated = [], now.sources.stated
     sources, digests = before.get("sources", {}), now.sources.digests
     changed = [n for n in sorted({*sources, *digests}) if sources.get(n) != digests.get(n)]
     if sources and changed:
         told.append(f"{', '.join(changed)} changed since")
-    if before.get("seed", now.sources.seed) != now.sources.seed:
-        told.append(f"the seed was {before['seed']}, now it is {now.sources.seed}")
+    if before.get("seed", stated.seed) != stated.seed:
+        told.append(f"the seed was {before['seed']}, now it is {stated.seed}")
     options = before.get("options", {})
-    for name, value in now.options.items():
+    for name, value in stated.options.items():
         if options.get(name, value) != value:
             told.append(f"option {name} was {quoted(options[name])}, now it is {quoted(value)}")
     return told
