@@ -262,19 +262,6 @@ def table(
 STILL = 1e-4  # rad or m; a joint that moved by less has stayed where it was
 
 
-def ranked(values: NDArray[Any]) -> IntArray:
-    """Number (n,) of each of the `values` (n,) among the different ones, in their order; whole
-    numbers that lie close, as codes do, without sorting."""
-    n = len(values)
-    if n and values.dtype.kind == "i":
-        low, high = int(values.min()), int(values.max())
-        if high - low < 4 * n:
-            there = np.zeros(high - low + 1, dtype=bool)
-            there[values - low] = True
-            return (np.cumsum(there) - 1)[values - low]
-    return np.unique(values, return_inverse=True)[1].ravel()
-
-
 def firsts(number: IntArray, count: int) -> IntArray:
     """The first row (count,) of each number below `count`; the number of rows where it has none."""
     rows = np.arange(len(number))
@@ -284,16 +271,13 @@ def firsts(number: IntArray, count: int) -> IntArray:
 
 
 def numbered(*columns: NDArray[Any]) -> IntArray:
-    """Number (n,) of each row's combination of values in the `columns` (n,), in their order; column
-    by column, since sorting whole rows takes far longer."""
-    number = np.zeros(len(columns[0]), dtype=np.int64)
+    """Number (n,) of each row's combination of values in the `columns` (n,), in their order."""
+    order = np.lexsort(columns[::-1])
+    new = np.zeros(len(order), dtype=bool)
     for values in columns:
-        if (values == values[:1]).all():
-            continue
-        codes = ranked(values)
-        number = ranked(number * (int(codes.max(initial=0)) + 1) + codes)
-        if int(number.max()) + 1 == len(number):  # no two are left to tell apart
-            break
+        new[1:] |= values[order[1:]] != values[order[:-1]]
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.cumsum(new)
     return number
 
 

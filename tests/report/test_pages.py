@@ -127,11 +127,8 @@ def test_a_found_effect_stands_over_its_driver_with_what_was_read():
     shown = replace(EXPLAINED, calibrated=base, model=model)
     (figure,) = figures.effects_over_joints(shown)
     (axes,) = figures.figure_of(figure).axes
-    (q, explained), (_, seen) = (
-        axes.lines[-1].get_data(),
-        axes.patches[0].get_path().vertices[::2].T,
-    )
-    q, seen, explained = np.radians(q), 1e-6 * seen, 1e-6 * np.asarray(explained)
+    (_, seen), (q, explained) = (line.get_data() for line in axes.lines[-2:])
+    q, seen, explained = np.radians(q), 1e-6 * seen[::3], 1e-6 * np.asarray(explained)
     sin, cos = (found[f"joint2.eccentricity_{k}"] for k in ("sin", "cos"))
     expected = sin * np.sin(q) + cos * np.cos(q)
     np.testing.assert_allclose(explained, expected, atol=1e-6)

@@ -13,7 +13,7 @@ from elastocal.identification.least_squares import TOLERANCE
 from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit, with_placed
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import stated_by_observation, weights_for
-from elastocal.measurements import Measurements, load_states, numbered, ranked, visits
+from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
@@ -235,7 +235,7 @@ def _first_of_each(table: Measurements) -> NDArray[np.bool_]:
     """Rows that are among the first of their configuration, load and marker, as many of each as
     leave MOST_IN_ONE in the configuration."""
     kind = numbered(table.configuration, load_states(table.force), table.marker)
-    order, at = np.argsort(kind, kind="stable"), ranked(table.configuration)
+    order, at = np.argsort(kind, kind="stable"), numbered(table.configuration)
     rank = np.empty(len(table), dtype=np.int64)
     rank[order] = np.arange(len(table)) - np.searchsorted(kind[order], kind[order])
     n_kinds = np.bincount(at[np.unique(kind, return_index=True)[1]])

@@ -11,7 +11,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.identification.outliers import deleted
 from elastocal.identification.weighted_problem import same_size
-from elastocal.measurements import ranked
+from elastocal.measurements import numbered
 from elastocal.units import Array, BoolArray, IntArray
 
 # A reading i left out has an error d whose square dᵀP_ii d follows χ², if the model is right.
@@ -178,7 +178,7 @@ def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     table, lead, moment = dataset.table, dataset.lead, dataset.moment
     loaded = np.any(table.force != 0, axis=1)[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
-        group = ranked(label)
+        group = numbered(label)
         found, size = np.bincount(group, faulty), np.bincount(group)
         # Each group's count given the total is hypergeometric; the most conspicuous one decides.
         p = hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(size)

@@ -80,7 +80,7 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
-from elastocal.measurements import NEVER_YET, Measurements, order_contradicted, ranked
+from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
 from elastocal.model.effects.catalogue import effect_of
@@ -315,7 +315,7 @@ def uncertainty_of(
     """
     B = (B.T / np.sqrt(left)).T.reshape(-1, observed.size, B.shape[1])
     each = variance_of(B[:, :3], covariance)
-    code = ranked(observed.configuration)
+    code = numbered(observed.configuration)
     return np.asarray(np.sqrt(np.bincount(code, each) / np.bincount(code)))
 
 

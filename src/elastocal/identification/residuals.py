@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
-from elastocal.measurements import firsts, numbered, ranked
+from elastocal.measurements import firsts, numbered
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -192,7 +192,7 @@ def predicts_better(
     if not after < before < np.inf:
         return bool(after < before)
     n, w = weights.apply(narrow), weights.apply(wide)
-    own = np.repeat(ranked(configuration), size)
+    own = np.repeat(numbered(configuration), size)
     f = np.bincount(own, 2 * n * (n - w))
     if len(f) < 2:
         return False

@@ -11,7 +11,7 @@ from scipy import sparse
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError, require
-from elastocal.measurements import Measurements, load_states, numbered, ranked
+from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.units import Array, IntArray
 
 SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}
@@ -48,7 +48,7 @@ class Observations:
 
     @cached_property
     def n_configurations(self) -> int:
-        return int(ranked(self.configuration).max(initial=-1)) + 1
+        return int(numbered(self.configuration).max(initial=-1)) + 1
 
     @property
     def load(self) -> IntArray:
@@ -96,7 +96,7 @@ def observe(table: Measurements, kind: str) -> Observations:
 def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     """Sum of squares of `values` (n, d) about the mean of their `group` (n,), and its degrees of
     freedom."""
-    group = ranked(group)
+    group = numbered(group)
     count = np.bincount(group)
     if len(count) == len(group):
         return 0.0, 0
