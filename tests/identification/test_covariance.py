@@ -136,3 +136,10 @@ def test_a_mixture_of_models_holds_what_it_says(sizes):
         half = found.interval(np.zeros(2), level)[0, 1]
         beyond = sum(w * 2 * stats.norm.sf(half / np.sqrt(C[0, 0])) for w, C in among)
         assert beyond == pytest.approx(1 - level, abs=slack)
+
+
+def test_what_does_not_vary_correlates_with_nothing():
+    pinned = Covariance(
+        "t", np.array([[4.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0] * 3]), np.ones(3), ""
+    )
+    assert np.array_equal(pinned.correlation, [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0] * 3])

@@ -262,7 +262,7 @@ def summarise(
         model=model, method=found.method, noise=noise, weights=weights,
         noise_parts=parts, estimates=estimates, combinations=combinations, x=final.x,
         determined=determined, spread=found.spread,
-        correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
+        correlations=_correlations(found.spread.correlation, determined, ~model.shrunk[kept]),
         observations=observed, residual=final.residual, held_out=heldout, sigma=sigma,
         dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
         heldout_rms=rms_3d(heldout, observed.size), nominal_rms=solution.nominal_rms,
@@ -382,13 +382,9 @@ def _not_stated(p: Parameter, held: float, limits: tuple[float, float]) -> str:
 
 
 def _correlations(
-    covariance: Array, names: tuple[str, ...], told: BoolArray
+    rho: Array, names: tuple[str, ...], told: BoolArray
 ) -> tuple[tuple[str, str, float], ...]:
     """Pairs with |ρ| over 0.9 of those that are `told`, strongest first."""
-    std = np.sqrt(np.diag(covariance))
-    known = np.outer(std, std)
-    # A value that equalities fix varies with nothing.
-    rho = np.divide(covariance, known, out=np.zeros_like(known), where=known > 0)
     i, j = np.nonzero(np.triu(np.abs(rho) > CORRELATED, k=1) & np.outer(told, told))
     strongest = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return tuple((names[a], names[b], float(rho[a, b]))

@@ -271,6 +271,13 @@ class Covariance:
         """Standard deviations (p,); infinite where `dof` is 0."""
         return np.where(self.dof > 0, np.sqrt(np.diag(self.matrix)), np.inf)
 
+    @property
+    def correlation(self) -> Array:
+        """ρ (p, p); a value that equalities fix varies with nothing."""
+        unit = np.sqrt(np.diag(self.matrix))
+        unit = np.where(unit > 0, unit, 1.0)
+        return self.matrix / np.outer(unit, unit)
+
     def tails(self, rows: Array) -> tuple[Array, Array]:
         """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p), which a typical
         parameter has, and the share (n,) of that variance which is the squared scale of t.

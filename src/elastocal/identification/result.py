@@ -332,8 +332,7 @@ class Calibration(scrutiny.FoundFit, Result):
     @property
     def correlation(self) -> Array:
         """(determined, determined), ρ of the same parameters: `covariance` over their `std`."""
-        std = np.sqrt(np.diag(self.covariance))
-        return self.covariance / np.outer(std, std)
+        return self.spread.correlation
 
     @property
     def unsteadiness(self) -> Unsteadiness:
