@@ -158,7 +158,7 @@ class Result(Saved):
             >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
             >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
         """
-        write_page(self, path, inputs, command, seed)
+        import_module(VIEWS).write_page(self, Path(path), inputs, command, seed)
 
     def plot(self, kind: str | None = None, interactive: bool = False, ax: Any = None) -> Any:
         """A figure of the result.
@@ -197,13 +197,6 @@ class Result(Saved):
             ['parameter', 'unit', 'value', 'std']
         """
         return import_module(VIEWS).frame(self)
-
-
-def write_page(
-    result: object, path: str | Path, inputs: Any, command: str | None, seed: int | None,
-    **told: Any,
-) -> None:  # fmt: skip
-    import_module(VIEWS).write_page(result, Path(path), inputs, command, seed, **told)
 
 
 def headline(result: object) -> str:

@@ -262,14 +262,6 @@ def table(
 STILL = 1e-4  # rad or m; a joint that moved by less has stayed where it was
 
 
-def firsts(number: IntArray, count: int) -> IntArray:
-    """The first row (count,) of each number below `count`; the number of rows where it has none."""
-    rows = np.arange(len(number))
-    first = np.full(count, len(number))
-    first[number[::-1]] = rows[::-1]  # what is written last stays
-    return first
-
-
 def numbered(*columns: NDArray[Any]) -> IntArray:
     """Number (n,) of each row's combination of values in the `columns` (n,), in their order."""
     order = np.lexsort(columns[::-1])
@@ -295,7 +287,7 @@ def visits(table: Measurements) -> IntArray:
 def first_of_visit(table: Measurements) -> IntArray:
     """Where in the table (n,) each row's visit begins."""
     visit = visits(table)
-    return firsts(visit, int(visit.max(initial=-1)) + 1)[visit]
+    return np.unique(visit, return_index=True)[1][visit]
 
 
 def with_moves(table: Measurements) -> Measurements:
@@ -313,11 +305,11 @@ def with_moves(table: Measurements) -> Measurements:
         return replace(table, move=None, direction=None)
     order = np.arange(n) if table.time is None else np.argsort(table.time, kind="stable")
     number = visits(table)
-    known, begun = np.unique(number[order], return_index=True)
-    sequence = np.argsort(begun)
-    q = table.q[order[begun[sequence]]]
+    begun = np.unique(number[order], return_index=True)[1]
+    first = order[np.sort(begun)]  # the row of each visit in their sequence
+    q = table.q[first]
     if table.before is not None:
-        step = q - table.before[order[begun[sequence]]]
+        step = q - table.before[first]
     else:
         step = np.diff(q, axis=0, prepend=q[:1])
     step[np.abs(step) <= STILL] = 0.0
@@ -326,10 +318,9 @@ def with_moves(table: Measurements) -> Measurements:
     if table.before is None:
         last = np.maximum.accumulate(np.where(step.any(axis=1), visit, 0))
         own = np.maximum.accumulate(np.where(step != 0, visit[:, None], 0), axis=0)
-    place = np.empty(len(known), dtype=np.int64)
-    place[sequence] = visit
+    place = np.argsort(np.argsort(begun))[number]
     direction = np.sign(np.take_along_axis(step, own, axis=0))
-    return replace(table, move=step[last][place[number]], direction=direction[place[number]])
+    return replace(table, move=step[last][place], direction=direction[place])
 
 
 NEVER_YET = 1e15  # as the line of a table: after all that were measured
@@ -615,7 +606,7 @@ def _check_duplicates(raw: RawTable, table: Measurements) -> None:
         key = [*raw.numbers.values(), *(labels.codes for labels in raw.labels.values())]
         what = "the same values in all columns"
     number = numbered(*key)
-    earliest = firsts(number, int(number.max()) + 1)[number]
+    earliest = np.unique(number, return_index=True)[1][number]
     repeated = earliest < np.arange(len(number))
     if repeated.any():
         i = int(np.argmax(repeated))

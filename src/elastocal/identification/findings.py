@@ -21,7 +21,7 @@ from elastocal.identification.result import Calibration, Estimate, Finding
 from elastocal.identification.sentences import AT_BOUND, STATE_NOISE, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
-from elastocal.measurements import Measurements, firsts, numbered
+from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import effect_of
@@ -586,7 +586,7 @@ def spare_equations(result: Calibration) -> int:
     table, lead = observed.table, observed.lead
     code = numbered(observed.configuration, *np.round(table.force[lead], 3).T)
     marked = numbered(code, table.marker[lead])
-    seen = code[firsts(marked, int(marked.max()) + 1)]
+    seen = code[np.unique(marked, return_index=True)[1]]
     size = 1 if observed.kind == "distance" else observed.size
     told = np.minimum(size * np.bincount(seen), 6)
     return int(told.sum()) - int(np.sum(~result.model.shrunk[result.columns]))

@@ -40,7 +40,7 @@ from elastocal.identification.weighted_problem import (
     stated_by_observation,
     whitener,
 )
-from elastocal.measurements import firsts, numbered
+from elastocal.measurements import numbered
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, polar_axes
 from elastocal.units import Array, IntArray
@@ -61,7 +61,7 @@ class Sets:
     def __init__(self, readings: Readings, B: Array, apart: Sequence[IntArray]) -> None:
         self.of = numbered(readings.configuration, readings.load, readings.marker, *apart)
         self.n = int(self.of.max(initial=-1)) + 1
-        self.first = firsts(self.of, self.n)
+        self.first = np.unique(self.of, return_index=True)[1]
         repeats = np.bincount(self.of, minlength=self.n)
         self.root, self.order = np.sqrt(repeats), np.argsort(self.of, kind="stable")
         self.starts = np.cumsum(repeats) - repeats

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
-from elastocal.measurements import firsts, numbered
+from elastocal.measurements import numbered
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -278,7 +278,7 @@ def groupings(
     table, size = observed.table, observed.size
     force = np.round(table.force[observed.lead], 3)
     load = numbered(*force.T)
-    loads = tuple(map(_named, force[firsts(load, int(load.max(initial=-1)) + 1)]))
+    loads = tuple(map(_named, force[np.unique(load, return_index=True)[1]]))
     coded: list[tuple[str, IntArray, tuple[str, ...]]] = [
         ("component", np.arange(size)[None], COMPONENTS[observed.kind]),
         ("marker", table.marker[observed.lead][:, None], table.marker_names),
@@ -287,9 +287,8 @@ def groupings(
     ]
     for by, own, names in coded:
         code = np.broadcast_to(own, (len(observed.lead), size)).ravel()[chosen]
-        first = firsts(code, len(names))
-        order = np.argsort(first, kind="stable")
-        order = order[first[order] < len(code)]
+        used, first = np.unique(code, return_index=True)
+        order = used[np.argsort(first)]
         if len(order) > 1:
             place = np.empty(len(names), dtype=np.int64)
             place[order] = np.arange(len(order))

@@ -6,13 +6,14 @@ import math
 from collections.abc import ItemsView, Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import DataFrame, Result, checked_arguments, headline, write_page
+from elastocal.above import VIEWS, DataFrame, Result, checked_arguments, headline
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny
@@ -416,7 +417,8 @@ class Calibration(scrutiny.FoundFit, Result):
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
         """
-        write_page(self, path, inputs, command, seed, certificate=True)
+        view = import_module(VIEWS)
+        view.write_page(self, Path(path), inputs, command, seed, certificate=True)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:

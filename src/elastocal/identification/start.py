@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option
-from elastocal.measurements import Measurements, firsts, numbered, visits
+from elastocal.measurements import Measurements, numbered, visits
 from elastocal.model.chain import joint_limits
 from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
 from elastocal.model.manipulator import Model
@@ -466,13 +466,13 @@ def copied(observed: Observations) -> BoolArray:
     said += [] if table.torque is None else [table.torque]
     key = np.column_stack(said)[own].T
     whole = numbered(*value.T, *key)
-    found = firsts(whole, int(whole.max()) + 1)[whole] != np.arange(n)
+    found = np.unique(whole, return_index=True)[1][whole] != np.arange(n)
     steps = value[:, :3] / NO_FINER
     if not found.any() or np.abs(steps - np.round(steps)).max() > 1e-3:
         return found
     group = numbered(*key)
     size = np.bincount(group)
-    first = firsts(group, len(size))[group]
+    first = np.unique(group, return_index=True)[1][group]
     others = np.flatnonzero(first != np.arange(n))
     same = value[others] == value[first[others]]
     differing = same[~same.all(axis=1)]
