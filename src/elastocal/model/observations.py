@@ -98,8 +98,6 @@ def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     freedom."""
     group = numbered(group)
     count = np.bincount(group)
-    if len(count) == len(group):
-        return 0.0, 0
     mean = np.zeros((len(count), values.shape[1]))
     np.add.at(mean, group, values)
     left = values - (mean / count[:, None])[group]

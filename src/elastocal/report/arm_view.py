@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell.work_cell import Cell, HalfSpace, Solid
 from elastocal.errors import ElastocalError, require
 from elastocal.files import atomic_write
+from elastocal.measurements import numbered
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -270,9 +271,8 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
     mean residual of a marker; `residual` (rows,) at parameter values x (parameters,)."""
     table, marker = observed.table, observed.table.marker[observed.lead]
     force = np.round(table.force[observed.lead], 3)
-    key = np.column_stack([observed.configuration, force])
-    _, first, entry = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    entry = entry.ravel()
+    entry = numbered(observed.configuration, *force.T)
+    first = np.unique(entry, return_index=True)[1]
     # Where markers were seen, or the model puts them if only a distance was; of a residual of a
     # pose the position's, of a distance's along the line from its anchor.
     vectors = residual.reshape(-1, observed.size)

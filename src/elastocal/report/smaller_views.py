@@ -17,7 +17,7 @@ from elastocal.errors import InputError
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
-from elastocal.measurements import in_file_units, joint_columns
+from elastocal.measurements import in_file_units, joint_columns, numbered
 from elastocal.report import blocks as say
 from elastocal.report import identification_view as fitted
 from elastocal.report.figures import NO_ENDS, rows_of_dots
@@ -363,8 +363,7 @@ def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
 
 def _counts(found: Imported) -> Iterator[tuple[str, str]]:
     table, joined = found.table, found.joined
-    alike = np.column_stack([table.configuration, table.marker, table.force])
-    repeats = np.unique(alike, axis=0, return_counts=True)[1]
+    repeats = np.bincount(numbered(table.configuration, table.marker, *table.force.T))
     span = " to ".join(dict.fromkeys((str(repeats.min()), str(repeats.max()))))
     poses = say.counted(len(table.configuration_labels), "configuration")
     yield (
