@@ -19,16 +19,12 @@ from elastocal.diagnosis.hypotheses import (
     SCALES,
     UNSIZED_SCALES,
     EntryKey,
-    Hypothesis,
-    RegressorDirection,
-    cell_with,
     recorded,
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit, with_moves
 from elastocal.model.effects.base import (
-    DrivenEffect,
     Effect,
     JointMotion,
     Stage,
@@ -69,13 +65,9 @@ def family_of(effect: Effect, cell: Cell) -> Family:
     return next(needed, "torque" if loaded else OF_STAGE[effect.stage])
 
 
-def driven_columns(
-    dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
-) -> Array:
-    chain, cell = dataset.base.model.chain, cell_with(dataset.base.model.cell, where, settings)
-    h = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
-    D = RegressorDirection(h, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
-    return dataset.pack(dataset.columns.entry(h.entry_key(dataset.base.model)) @ D)
+def moved(dataset: DiagnosisData, key: EntryKey, D: Array) -> Array:
+    """Columns (C, m, k) of an entry's motions D (n_rows, d, k)."""
+    return dataset.pack(dataset.columns.entry(key) @ D)
 
 
 # What is tried from the start: a curve of every joint, and every effect that needs no search.
@@ -94,14 +86,13 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
         if span < MOVED or shortest > span / 2:
             continue
         longest = max(min(LONGEST, 2 * span), 2 * shortest)
-        measured = {"curve_low_rad": float(q.min()), "curve_high_rad": float(q.max())}
-        tried = {"curve_size_rad": 1.0, "curve_length_rad": shortest, **measured}
-        cell = cell_with(model.cell, where, tried)
+        low, high = float(q.min()), float(q.max())
+        waves = Waves.over(low, high, shortest, turns=True)
+        D = waves.at(q)[:, None, :] * CURVE
         yield Component(
-            "angle", effect, where, driven_columns(dataset, effect, where, tried) * CURVE, CURVE,
-            waves=Waves.of(effect.functions(where, model.chain, cell)[0]),
-            lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
-            fellows=len(joints),
+            "angle", effect, where, moved(dataset, (JointMotion.name, (where,)), D), CURVE,
+            waves=waves, lengths=(math.log(shortest), math.log(longest)),
+            settings=(("curve_low_rad", low), ("curve_high_rad", high)), fellows=len(joints),
         )  # fmt: skip
 
 
@@ -174,23 +165,16 @@ def field_component(
 ) -> Component:
     """A smooth motion of a place with what it follows, of lengths from the `shortest` share of its
     range: the same waves in each component of the motion."""
-    x, chain = _followed(dataset.table, name), dataset.base.model.chain
-    values = {"size": 1.0, "length": shortest * np.ptp(x), "low": x.min(), "high": x.max()}
-    settings = {f"field_{name}_{key}": float(value) for key, value in values.items()}
-    (function,) = FIELD.functions(where, chain, cell_with(dataset.base.model.cell, where, settings))
-    low, high = (math.log(share * np.ptp(x)) for share in (shortest, FIELD_LENGTHS[1]))
-    waves, entry = Waves.of(function), FIELD.entry_at(where)
-    D = np.kron(np.eye(entry.size), waves.at(x)[:, None, :])
-    columns = _moved(dataset, (entry.name, (where,)), D)
+    x, entry = _followed(dataset.table, name), FIELD.entry_at(where)
+    low, high, span = float(x.min()), float(x.max()), float(np.ptp(x))
+    waves = Waves.over(low, high, shortest * span, turns=name != "time")
+    D = np.kron(np.eye(entry.size), waves.at(x)[:, None, :]) * MOTION
     return Component(
-        "time" if name == "time" else "pose", FIELD, where, columns, MOTION, name, waves,
-        (low, high), entry.size, tuple(settings.items())[2:],
+        "time" if name == "time" else "pose", FIELD, where,
+        moved(dataset, (entry.name, (where,)), D), MOTION, name, waves,
+        (math.log(shortest * span), math.log(FIELD_LENGTHS[1] * span)), entry.size,
+        ((f"field_{name}_low", low), (f"field_{name}_high", high)),
     )  # fmt: skip
-
-
-def _moved(dataset: DiagnosisData, key: EntryKey, D: Array) -> Array:
-    """Columns (C, m, k) of motions D (n_rows, d, k) of an entry, in typical ones."""
-    return dataset.pack(dataset.columns.entry(key) @ D) * MOTION
 
 
 # What corrects the arm beside a sum and names no cause: fields, steps, and responses to loads.
@@ -285,8 +269,8 @@ def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
     k = int(np.searchsorted(moments, best(moments[apart // 2 :: apart])))
     moment = best(moments[max(k - apart, 0) : k + apart + 1])
     begun = np.asarray(dataset.table.time)[first_of_visit(dataset.table)]
-    D = (begun >= moment)[:, None, None] * np.eye(entry.size)
-    return _moved(dataset, key, D), {effect.constants[0].key: moment}, math.log(len(moments))
+    D = (begun >= moment)[:, None, None] * MOTION * np.eye(entry.size)
+    return moved(dataset, key, D), {effect.constants[0].key: moment}, math.log(len(moments))
 
 
 def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) -> Tried | None:
@@ -302,7 +286,7 @@ def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) ->
     F = effect.at_rows(tau / largest, np.ones_like(tau) if came is None else came[:, i])
     if np.ptp(F, axis=0).max() == 0:
         return None
-    columns = _moved(dataset, (JointMotion.name, (where,)), F[:, None, :])
+    columns = moved(dataset, (JointMotion.name, (where,)), F[:, None, :] * MOTION)
     return columns, {f"{effect.name}_Nm": largest}, 0.0
 
 
@@ -323,4 +307,4 @@ def _yielding(
     for own, part, most in zip((slice(3), slice(3, 6)), parts, largest, strict=True):
         D[:, own, own] = R * (part @ R)[:, None, :] / most
     settings = zip((s.key for s in effect.constants[1:]), largest, strict=True)
-    return _moved(dataset, entry, D), dict(settings), 0.0
+    return moved(dataset, entry, D * MOTION), dict(settings), 0.0

@@ -11,13 +11,13 @@ from itertools import chain
 import numpy as np
 from scipy.special import logit, logsumexp, ndtri
 
-from elastocal.diagnosis.component_families import MOVED, beside, driven_columns
+from elastocal.diagnosis.component_families import MOVED, beside, moved
 from elastocal.diagnosis.components import ALONE, Component, FittedSum, presence_cost
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, cell_with
+from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior, project
-from elastocal.model.effects.base import index, turning_joints
+from elastocal.model.effects.base import JointMotion, index, turning_joints
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
@@ -228,14 +228,15 @@ def family_component(
     settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
     for k in range(1, m + 1):
         settings |= {f"order_{k}": k * order, f"order_sd_{k}": k * sd}
-    cell = cell_with(dataset.base.model.cell, where, settings)
-    parameters = effect.parameters(where, dataset.base.model.chain, cell)
-    typical = [p.typical or 0.0 for p in parameters]
-    columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
+    chain, cell = dataset.base.model.chain, cell_with(dataset.base.model.cell, where, settings)
+    lines = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
+    D = RegressorDirection(lines, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
+    D = D * [LINE * (p.typical or 0.0) for p in lines.parameters]
+    columns = moved(dataset, (JointMotion.name, (where,)), D)
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
     return Component(
         "angle", effect, where, columns, LINE, settings=kept, search=search,
-        fellows=len(turning_joints(dataset.base.model.chain)),
+        fellows=len(turning_joints(chain)),
     )  # fmt: skip
 
 
