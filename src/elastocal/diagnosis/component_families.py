@@ -198,12 +198,14 @@ def without_a_name(
     taken |= {(c.effect.name, c.where) for c in found.components}
     shown: list[Conspicuous] = []
 
-    def scored(c: Component, scales: Array, component: Callable[[], Component]) -> None:
+    def scored(
+        c: Component, scales: Array, component: Callable[[], Component] | None = None
+    ) -> None:
         columns = sums.data.masked(c.columns * c.scalings[0])
         nats = float(direct(columns, sums.at).evidence(scales)[0]) - c.search
         if nats > CONSPICUOUS:
             of = "time" if c.family == "time" else c.follows or c.effect.name
-            shown.append((nats, (c.where, of), component))
+            shown.append((nats, (c.where, of), component or (lambda: c)))
 
     for where in FIELD.places(model.chain, model.cell):
         for name in () if FIELD.name in without else _followed_by(dataset, found, where):
@@ -223,7 +225,7 @@ def without_a_name(
                     settings=tuple(settings.items()),
                     fellows=len(effect.places(model.chain, model.cell)),
                 )  # fmt: skip
-                scored(c, UNSIZED_SCALES, lambda c=c: c)
+                scored(c, UNSIZED_SCALES)
     shown.sort(key=lambda c: -c[0])
     chosen = list(dict.fromkeys(of for _, of, _ in shown))[:most]
     return [component() for _, of, component in shown if of in chosen]
