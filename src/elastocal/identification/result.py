@@ -35,7 +35,7 @@ from elastocal.identification.prediction import (
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.measurements import Measurements
-from elastocal.model.arm import check_loads
+from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -573,7 +573,7 @@ class Calibration(scrutiny.FoundFit, Result):
             ((1, 3), (1, 3, 3), True)
         """
         model = self.model
-        check_loads(load, len(model.table(q)))
+        given_force(load, len(model.table(q)))
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         return position_at(tool, model.table(q, load), self.noise, self.spread)
 

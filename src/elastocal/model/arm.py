@@ -281,33 +281,24 @@ def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
     return value[:, None] if value.ndim == 1 else value
 
 
-def _as_force(load: ArrayLike) -> Array:
-    try:
-        return np.asarray(load, dtype=float)
-    except (TypeError, ValueError):
-        return np.zeros(())
-
-
-def check_loads(load: ArrayLike | None, n: int) -> None:
-    if load is None:
-        return
-    force = _as_force(load)
-    known = force.shape in ((3,), (n, 3))
-    if not (known and (np.abs(force) <= LARGEST_FORCE).all()):
-        found = "numbers beyond all measure" if known else f"an array of shape {force.shape}"
-        raise InputError(
-            f"{option('load')} takes a force (3,) in N, or one for each pose ({n}, 3); found "
-            f"{found}"
-        )
-
-
-def given_force(load: ArrayLike | None) -> Array | None:
-    """The option `load` as a force (3,) in N, None where it is not given."""
+def given_force(load: ArrayLike | None, poses: int | None = None) -> Array | None:
+    """The option `load` as a force (3,) in N, or one for each of so many `poses` (poses, 3); None
+    where it is not given."""
     if load is None:
         return None
-    force = _as_force(load)
-    if force.shape != (3,) or not (np.abs(force) <= LARGEST_FORCE).all():
+    try:
+        force = np.asarray(load, dtype=float)
+    except (TypeError, ValueError):
+        force = np.zeros(())
+    known = force.shape == (3,) or force.shape == (poses, 3)
+    if known and (np.abs(force) <= LARGEST_FORCE).all():
+        return force
+    if poses is None:
         found = " ".join(f"{v:g}" for v in force) if force.ndim == 1 and len(force) else load
         most = "" if not np.isfinite(force).all() else f" of at most {LARGEST_FORCE:g}"
         raise InputError(f"{option('load')} takes three finite numbers in N{most}; found {found}")
-    return force
+    found = "numbers beyond all measure" if known else f"an array of shape {force.shape}"
+    raise InputError(
+        f"{option('load')} takes a force (3,) in N, or one for each pose ({poses}, 3); found "
+        f"{found}"
+    )

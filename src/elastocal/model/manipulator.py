@@ -17,7 +17,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
-from elastocal.model.arm import Parameter, check_loads, row_inputs
+from elastocal.model.arm import Parameter, given_force, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
 from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
@@ -240,7 +240,7 @@ class Model(ByValue):
             >>> ec.Model("cell.toml").pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0]).shape
             (4, 4)
         """
-        check_loads(load, len(np.atleast_2d(q)))
+        given_force(load, len(np.atleast_2d(q)))
         poses = self.flange_poses(self.table(q, load), self._at(x))
         return poses[0] if np.ndim(q) == 1 else poses
 

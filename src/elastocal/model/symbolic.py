@@ -154,30 +154,16 @@ class SymbolicArm:
         return np.zeros((n, size), dtype=p.dtype), np.zeros((n, size, size))
 
     def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
-        theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
-        with np.errstate(invalid="ignore"):
-            theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
-        # F_θ = 1 − C·H with the potential's Hessian H: a minimum while its eigenvalues are
-        # positive, which they are wherever C·H is small; only soft poses need the eigenvalues.
-        one = np.eye(F_theta.shape[1])
-        soft = np.abs(F_theta.real - one).sum(axis=2).max(axis=1) >= 1
-        rows = np.flatnonzero(soft & np.isfinite(F_theta.real).all(axis=(1, 2)))
-        theta[rows[np.linalg.eigvals(F_theta.real[rows]).real.min(axis=1) <= 0]] = np.nan
-        F_theta[~np.isfinite(theta).all(axis=1)] = one
-        return theta, F_theta
-
-    def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> tuple[NDArray, NDArray]:
-        """θ (n, size), NaN where it does not settle, and F_θ where the last step was taken: that
-        step is rounding, so F_θ is that of θ."""
-        size = len(self.arm.springs)
+        n, size = len(inputs[0]), len(self.arm.springs)
         theta = np.zeros((n, size), dtype=np.result_type(np.float64, p, *inputs))
+        # Where the last step was taken: that step is rounding, so F_θ is that of θ.
         slope = np.full((n, size, size), np.nan, dtype=theta.dtype)
         active = np.arange(n)
         for _ in range(MAX_STEPS):
             if not len(active):
                 break
-            *rows, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
-            F, F_theta = self._equations(*rows, at, theta[active])
+            *given, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
+            F, F_theta = self._equations(*given, at, theta[active])
             finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
             theta[active[~finite]] = np.nan
             active, F, F_theta = active[finite], F[finite], F_theta[finite]
@@ -190,6 +176,14 @@ class SymbolicArm:
             settled = np.abs(step).max(axis=1) <= TOLERANCE + 1e-12 * np.abs(theta[active]).max(1)
             active = active[~settled]
         theta[active] = np.nan
+        with np.errstate(invalid="ignore"):
+            theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
+        # F_θ = 1 − C·H with the potential's Hessian H: a minimum while its eigenvalues are
+        # positive, which they are wherever C·H is small; only soft poses need the eigenvalues.
+        soft = np.abs(slope.real - np.eye(size)).sum(axis=2).max(axis=1) >= 1
+        rows = np.flatnonzero(soft & np.isfinite(slope.real).all(axis=(1, 2)))
+        theta[rows[np.linalg.eigvals(slope.real[rows]).real.min(axis=1) <= 0]] = np.nan
+        slope[~np.isfinite(theta).all(axis=1)] = np.eye(size)
         return theta, slope
 
     def _of_rows(self, *outputs: ca.SX) -> BatchFunction:
