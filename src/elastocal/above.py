@@ -199,11 +199,6 @@ class Result(Saved):
         return import_module(VIEWS).frame(self)
 
 
-def headline(result: object) -> str:
-    """The verdict on a calibration, in the words of terminal, page and notebook."""
-    return str(import_module(WORDS).judgement(result).sentence)
-
-
 # Arguments
 
 # numpy is loaded where a value is looked at: the command line reads the kinds alone, for --help.

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import VIEWS, DataFrame, Result, checked_arguments, headline
+from elastocal.above import VIEWS, WORDS, DataFrame, Result, checked_arguments
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny
@@ -637,6 +637,7 @@ class Calibration(scrutiny.FoundFit, Result):
         chain, observed, test, off = (
             self.model.chain, self.observations, self.test, self.unsteadiness
         )  # fmt: skip
+        said = import_module(WORDS).judgement(self).sentence if self.findings else None
         return plain({
             "schema": SCHEMA,
             "robot": chain.name,
@@ -660,8 +661,7 @@ class Calibration(scrutiny.FoundFit, Result):
             "test_rms_um": None if test is None else microns(test.rms),
             "test_mean_um": None if test is None else microns(test.mean),
             "test_max_um": None if test is None else microns(test.maximum),
-            "verdict": self.verdict.to_json()
-            | {"sentence": headline(self) if self.findings else None},
+            "verdict": self.verdict.to_json() | {"sentence": said},
             "predicted_new_poses_um": _json(self.predicted),
             "load_point_um": microns(self.load_point_error),
             "measured_visits": measured_visits(observed).to_json(),
