@@ -169,9 +169,7 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
     return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
 
 
-@cache
-def fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
-    """Field of a table or record → the keys that state it."""
+def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     hints = get_type_hints(cls, include_extras=True)
     if issubclass(cls, BaseModel):
         return {
@@ -192,6 +190,10 @@ def fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
         )
         for name, one in cls.__dataclass_fields__.items()
     }
+
+
+# Field of a table or record → the keys that state it.
+fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
 
 
 def keys_of(*classes: Any, without: Sequence[str] = ()) -> list[Key]:

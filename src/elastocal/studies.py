@@ -131,7 +131,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
-    settled = {"title": stated.title or whole.name, "options": chosen}
+    settled: dict[str, Any] = {"title": stated.title or whole.name, "options": chosen}
     settled |= {} if seed is None else {"seed": seed}
     contents = _contents(whole, stated, path)
     sources = Sources(whole, contents, stated.model_copy(update=settled))

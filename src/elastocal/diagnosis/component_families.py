@@ -168,7 +168,7 @@ def field_component(
     x, entry = _followed(dataset.table, name), FIELD.entry_at(where)
     low, high, span = float(x.min()), float(x.max()), float(np.ptp(x))
     waves = Waves.over(low, high, shortest * span, turns=name != "time")
-    D = np.kron(np.eye(entry.size), waves.at(x)[:, None, :]) * MOTION
+    D = np.asarray(np.kron(np.eye(entry.size), waves.at(x)[:, None, :] * MOTION), dtype=float)
     return Component(
         "time" if name == "time" else "pose", FIELD, where,
         moved(dataset, (entry.name, (where,)), D), MOTION, name, waves,
