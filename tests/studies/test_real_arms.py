@@ -10,14 +10,11 @@ from support.design_commands import elastocal
 
 FOLDER = Path(__file__).parents[2] / "experiment_design" / "real_arms"
 
-pytestmark = [
-    pytest.mark.long,  # of every day is the golden real_ur5
-    pytest.mark.skipif(
-        not os.environ.get("ELASTOCAL_DATASETS"),
-        reason="ELASTOCAL_DATASETS is unset; "
-        "experiment_design/real_arms/README.md says what it names",
-    ),
-]
+pytestmark = pytest.mark.skipif(
+    not os.environ.get("ELASTOCAL_DATASETS"),
+    reason="ELASTOCAL_DATASETS is unset; experiment_design/real_arms/README.md says what it names",
+)
+LONG = pytest.mark.long  # of every day are the golden real_ur5 and the cable arm
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +38,7 @@ def ran(verb, folder, cell, data, *options):
     return json.loads(done.stdout)
 
 
+@LONG
 def test_wam_is_no_matter_of_geometry_alone(folder):
     """A cable drive: fitted like the others, and what is left is far above any tracker."""
     found = ran("identify", folder, "wam.toml", "wam_grid.csv", "--test", "wam_random.csv")
@@ -48,6 +46,7 @@ def test_wam_is_no_matter_of_geometry_alone(folder):
     assert found["heldout_rms_um"] > 1000
 
 
+@LONG
 def test_iiwa_bends_at_its_joints(folder):
     """Three payloads, one tool point each, springs driven by the measured torques; of more
     parameters than the readings show, those stay without which the fit settles."""
@@ -91,11 +90,11 @@ def of_written_cell(folder, cell, train, test=None):
 @pytest.mark.parametrize(
     "cell, train, test, bar",
     [
-        ("ur10.toml", "ur10_100.csv", "ur10_test.csv", 190),
-        ("ur10.toml", "ur10_600.csv", "ur10_test.csv", 125),
-        ("ur5.toml", "ur5_grid.csv", "ur5_random.csv", 80),
-        ("wam.toml", "wam_grid.csv", "wam_random.csv", 3280),
-        ("iiwa7_rigid.toml", "iiwa7_train.csv", "iiwa7_test.csv", 320),
+        pytest.param("ur10.toml", "ur10_100.csv", "ur10_test.csv", 190, marks=LONG),
+        pytest.param("ur10.toml", "ur10_600.csv", "ur10_test.csv", 125, marks=LONG),
+        pytest.param("ur5.toml", "ur5_grid.csv", "ur5_random.csv", 80, marks=LONG),
+        pytest.param("wam.toml", "wam_grid.csv", "wam_random.csv", 3280, marks=LONG),
+        pytest.param("iiwa7_rigid.toml", "iiwa7_train.csv", "iiwa7_test.csv", 320, marks=LONG),
         ("irb120.toml", "irb120.csv", None, 330),
     ],
 )
@@ -104,6 +103,7 @@ def test_what_is_diagnosed_corrects_poses_never_fitted(folder, cell, train, test
     assert corrected <= bar and corrected < 0.8 * geometry
 
 
+@LONG
 @pytest.mark.parametrize(
     "cell, calibrated", [("iiwa7_rigid.toml", 1650), ("iiwa7_rigid_scale.toml", 990)]
 )
