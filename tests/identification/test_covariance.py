@@ -13,7 +13,12 @@ import statsmodels.api as sm
 from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.least_squares import Covariance, clustered, orthogonal
+from elastocal.identification.least_squares import (
+    Covariance,
+    clustered,
+    drawing_root,
+    orthogonal,
+)
 
 
 def cluster_robust(B, e, cluster, kind="CR2"):
@@ -143,3 +148,15 @@ def test_what_does_not_vary_correlates_with_nothing():
         "t", np.array([[4.0, 2.0, 0.0], [2.0, 4.0, 0.0], [0.0] * 3]), np.ones(3), ""
     )
     assert np.array_equal(pinned.correlation, [[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [0.0] * 3])
+
+
+def test_draws_do_not_turn_by_rounding():
+    """Alike eigenvalues turn their axes by last digits; what does not vary is not drawn."""
+    rng, unit = np.random.default_rng(0), np.array([1.0, 1.0, 1e6, 1e6, 0.0])
+    rounded = 1 + 1e-14 * rng.normal(size=(5, 5))
+    covariance = np.eye(5) * unit**2
+    covariance[0, 1] = covariance[1, 0] = 1e-13
+    root = drawing_root(covariance)
+    np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-12, atol=1e-12)
+    again = drawing_root(covariance * (rounded + rounded.T) / 2)
+    np.testing.assert_allclose(again, root, rtol=0, atol=1e-12 * unit.max())

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.least_squares import EPS, Fit, PriorRows, fit, moved, root_of
+from elastocal.identification.least_squares import EPS, Fit, PriorRows, drawing_root, fit, moved
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -386,7 +386,7 @@ def bent(solution: Solution, covariance: Array) -> Array:
         return none
     size = problem.sizes[kept]
     typical = np.where(is_placed(problem.model), 0.0, problem.sizes)[dropped]
-    root = size[:, None] * root_of(covariance / np.outer(size, size))
+    root = drawing_root(covariance)
     # Of many readings some tell it as well: it is no smaller where there are more of them.
     looked = problem.sample(BENT_SAMPLE)
     residual, B = found.residual[looked.rows], found.B[looked.rows] * size
