@@ -273,10 +273,8 @@ class Covariance:
 
     @property
     def correlation(self) -> Array:
-        """ρ (p, p); a value that equalities fix varies with nothing."""
-        unit = np.sqrt(np.diag(self.matrix))
-        unit = np.where(unit > 0, unit, 1.0)
-        return self.matrix / np.outer(unit, unit)
+        """ρ (p, p), zeros for a value that equalities fix."""
+        return correlations(self.matrix)[0]
 
     def tails(self, rows: Array) -> tuple[Array, Array]:
         """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p), which a typical
@@ -316,13 +314,19 @@ def root_of(covariance: Array) -> Array:
     return np.asarray(axes * np.sqrt(np.maximum(value, 0.0))[..., None, :])
 
 
+def correlations(covariance: Array) -> tuple[Array, Array]:
+    """ρ (p, p) and the deviations (p,), 1 of what does not vary, which correlates with nothing."""
+    unit = np.sqrt(np.diag(covariance))
+    unit = np.where(unit > 0, unit, 1.0)
+    return covariance / np.outer(unit, unit), unit
+
+
 def drawing_root(covariance: Array) -> Array:
     """L (p, p) with L Lᵀ = covariance, for draws: triangular, since alike eigenvalues turn their
     axes, and the draws with them, by their last digits; by way of correlations, since the rounding
     of large variances would drown small ones.  What does not vary is not drawn."""
-    unit = np.sqrt(np.diag(covariance))
-    unit = np.where(unit > 0, unit, 1.0)
-    lower = np.asarray(np.linalg.qr(root_of(covariance / np.outer(unit, unit)).T, mode="r")).T
+    rho, unit = correlations(covariance)
+    lower = np.asarray(np.linalg.qr(root_of(rho).T, mode="r")).T
     return np.asarray(unit[:, None] * lower * np.where(np.diag(lower) < 0, -1, 1))
 
 
