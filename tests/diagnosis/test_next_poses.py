@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -42,3 +43,25 @@ def test_another_limit_is_refused(tmp_path, limit) -> None:
     words = ("next", INPUTS / "wished.toml", INPUTS / "data.csv", "-o", tmp_path / "n.csv")
     done = elastocal(*words, "--require", limit)
     assert done.exit_code == 2 and "NAME one of new_poses" in " ".join(done.output.split())
+
+
+def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:
+    """A cell without [tracker] noise is planned for with that of its readings, and says so; pairs
+    of loaded and unloaded readings do not show it, which is said before any work."""
+    for name in ("arm.csv", "links.csv"):
+        (tmp_path / name).write_bytes((INPUTS / name).read_bytes())
+    text = (INPUTS / "wished.toml").read_text()
+    pairs, cell, data = (tmp_path / name for name in ("pairs.toml", "cell.toml", "data.csv"))
+    pairs.write_text(text.replace("sigma_um = 10", ""))
+    position = text.replace('"deflection"', '"position"').replace("sigma_um = 10", "sigma_um = 40")
+    cell.write_text(position)
+    assert elastocal("simulate", cell, INPUTS / "data.csv", "-o", data).exit_code == 0
+    cell.write_text(position.replace("sigma_um = 40", ""))
+    plan = tmp_path / "plan.csv"
+    for words in (("next", cell, data), ("design", cell, "--augment", data, "--poses", 3)):
+        done = elastocal(*words, "-o", plan, "--json", *FEW)
+        answer = json.loads(done.output)
+        (told,) = (w for w in answer.get("plan", answer)["warnings"] if "no noise" in w)
+        assert 30 < float(told.split("takes the ")[1].split()[0]) < 50, told
+    done = elastocal("next", pairs, INPUTS / "data.csv", "-o", plan, *FEW)
+    assert done.exit_code == 2 and "needs the noise" in " ".join(done.output.split())

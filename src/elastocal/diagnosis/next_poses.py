@@ -31,6 +31,7 @@ from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import check_levels
 from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import test_poses
 from elastocal.units import Progress
@@ -154,6 +155,7 @@ def next_poses(
         levels=spec.levels or model.cell.model.compliance_levels,
     )  # fmt: skip
     check_levels(replace(model.cell, design=spec), "batch", batch)
+    unstated = lacks_noise(replace(model.cell, design=spec))
     why = None
     if len(np.unique(table.configuration)) >= FEWEST:
         tell("diagnosing")
@@ -164,7 +166,9 @@ def next_poses(
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table)
         error = _error_now(fit, 1.0 if why is None else why.probability_unknown)
-    cell, options = replace(model.cell, design=spec), DesignOptions("batch", seed, jobs, done=table)
+    cell = replace(model.cell, design=spec)
+    cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
+    options = DesignOptions("batch", seed, jobs, done=table, notes=notes)
     plan = design(cell, options, progress=tell)
     assert plan.gain is not None  # the criterion has test poses
     reached = math.inf if error is None else max(plan.gain.sure, error.sure)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from bisect import bisect_left
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import count
 from typing import Literal, get_args
@@ -15,7 +16,9 @@ from threadpoolctl import threadpool_limits
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, check_known, option, require
+from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -36,9 +39,11 @@ from elastocal.planning.information import (
     IDENTIFIED,
     Done,
     Known,
+    lacks_noise,
     measured,
     next_number,
     plan_forces,
+    with_noise_of,
 )
 from elastocal.planning.plan import (
     CandidateCounts,
@@ -107,6 +112,13 @@ def design(
     on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
+    if options.done is not None and lacks_noise(cell):
+        progress("noise of the measurements done")
+        with suppress(InsufficientDataError):  # then it has to be stated
+            model = Model(cell, options.done.marker_names)
+            found = identify(model, options.done, Options(fixed=options.fixed))
+            cell, told = with_noise_of(cell, found)
+            options = replace(options, notes=(*options.notes, *told))
     whole, spec = _Design(cell, options, checkpoint, progress), cell.design
     if spec.choose is None and spec.minutes is None:
         return whole.run()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse
 
+from elastocal.cell.arm_description import CartesianNoise
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, check_known, option, require
 from elastocal.identification.identify import identify
@@ -22,6 +24,7 @@ from elastocal.identification.noise_structure import (
 )
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import kept_of
+from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
 from elastocal.identification.weighted_problem import (
     Weights,
@@ -77,6 +80,13 @@ def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
     return replace(table, sigma=np.repeat(sigma[:, None], 3, axis=1), sigma_frame="cartesian")
 
 
+def _no_noise(cell: Cell) -> str:
+    return (
+        f"{cell.source}: a plan needs the noise of a reading; state [tracker] sigma_um, range_um "
+        "and transverse_um, or distance_um, as the instrument's data sheet says"
+    )
+
+
 def reading_covariance(model: Model, observed: Observations) -> Array:
     """Covariance (n_rows, size, size) by which a single reading of each table row counts.
 
@@ -86,8 +96,7 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
     kind = available_noise(observed.table, cell.tracker)
     require(
         kind != "none" or (observed.kind == "distance" and cell.tracker.distance_sigma is not None),
-        f"{cell.source}: a plan needs the noise of a reading; state [tracker] sigma_um, "
-        "range_um and transverse_um, or distance_um, as the instrument's data sheet says",
+        _no_noise(cell),
     )
     single, spec = stated_covariance(observed, cell.tracker, kind)[0], cell.design
     if (dof := cell.noise.tails) is None:
@@ -432,6 +441,37 @@ def evenly(group: IntArray, each: int) -> IntArray:
 # Measurements already done: what they tell, so that a plan adds what they lack.
 
 IDENTIFIED = "the arm as identified from the measurements done"
+COMPUTED = 1e-9  # m: readings that scatter by less were not read
+
+
+def lacks_noise(cell: Cell) -> bool:
+    """Whether the noise of a reading is to be taken from the measurements done, as none is stated.
+
+    Raises InputError where these do not show it: deflections share readings, poses have two units.
+    """
+    observed, tracker = cell.model.observe, cell.tracker
+    own = tracker.distance_sigma is not None and observed == "distance"
+    lacks = not own and tracker.noise is None and not cell.design.marker_sigma
+    require(not lacks or observed in ("position", "distance"), _no_noise(cell))
+    return lacks
+
+
+def with_noise_of(cell: Cell, done: Calibration) -> tuple[Cell, tuple[str, ...]]:
+    """The cell with the noise of single readings that the measurements done show, the same on each
+    axis, and a sentence that says so."""
+    observed = done.observations
+    sigma = math.sqrt(done.noise_parts["readings"] / min(observed.size, 3))
+    if sigma < COMPUTED:
+        return cell, ()
+    tracker, key, along = replace(cell.tracker, distance_sigma=sigma), "distance_um", ""
+    if observed.kind != "distance":
+        tracker = replace(cell.tracker, noise=CartesianNoise(np.full(3, sigma)))
+        key, along = "sigma_um", " on each axis"
+    told = (
+        f"no noise of a reading is stated: the plan takes the {1e6 * sigma:.3g} µm{along} that "
+        f"the measurements done show; state [tracker] {key} where you know it"
+    )
+    return replace(cell, tracker=tracker), (told,)
 
 
 def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
