@@ -372,7 +372,7 @@ class Estimable:
             raise InsufficientDataError(
                 f"{cell.source}: the position at test pose {lost[0] + 1} depends on "
                 f"{self.model.names[lost[1]]}; {self.why(lost[1])}; or ask for parameters instead "
-                'of test poses (criterion = "D")'
+                'of test poses: design with criterion = "D"'
             )
         return np.asarray(A[..., self.columns] * self.sizes[self.columns])
 
