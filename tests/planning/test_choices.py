@@ -137,6 +137,14 @@ def test_the_plan_keeps_the_time() -> None:
         ec.design(cell, minutes=20, poses=5)
 
 
+def test_time_is_planned_for_a_cell_as_a_diagnosis_writes_it() -> None:
+    """With smooth functions, which a plan holds at zero, and the markers that its data name."""
+    curved = ("base_frame", "joint_compliance", "joint_curve:joint2")
+    cell = plan_cell(curved, "position", motion=MOTION, **FEW)
+    plan = ec.design(replace(cell, tool=replace(cell.tool, markers={})), minutes=20, effort="quick")
+    assert plan.execution.total <= 20 * 60 and "holds the smooth functions" in plan.warnings[0]
+
+
 def test_loads_are_chosen_with_poses_and_readings() -> None:
     effects = ("base_frame", "joint_compliance", "marker_position")
     loads = np.array([[0.0, 0, 0], DOWN / 2, DOWN])

@@ -226,9 +226,10 @@ class Choice:
         try:
             rules = Feasibility(cell, chain)
             drawn = self.draw(cell, drawn) if isinstance(drawn, int) else drawn
+            model = Model.assembled(chain, replace(cell, model=self.work.cell.model))
             setup = set_up(
-                Model.assembled(chain, cell), drawn.q, int(shares.sum()), self.targets, self.known,
-                self.region, rules.seen, self.work,
+                model, drawn.q, int(shares.sum()), self.targets, self.known, self.region,
+                rules.seen, self.work,
             )  # fmt: skip
             if read is not None:
                 setup = replace(setup, ways=cell.design.repeats * read)
@@ -237,7 +238,7 @@ class Choice:
                 setup = replace(setup, ways=ways)
             pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
             relaxed = prospects(setup.problem(pool, shares).balanced(), GAIN / 10)
-        except ElastocalError:
+        except InsufficientDataError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, tried.feasible / tried.tried)
 

@@ -385,7 +385,7 @@ def _execution_lines(plan: Plan) -> Told:
         return
     text = f"a steady drift of {DRIFT * 1e6:g} µm changes "
     if d.at_test_poses:
-        text += f"the result by at most {d.bias * 1e6:.2g} µm at the test poses"
+        text += f"the result by at most {round(d.bias * 1e6, 6):.2g} µm at the test poses"
         other = f"{d.shortest * 1e6:.2g} µm"
     else:
         text += f"parameters by at most {d.bias:.2g} standard deviations"
