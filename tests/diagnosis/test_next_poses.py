@@ -1,8 +1,7 @@
 """The next poses from what was measured so far, and when no more are needed."""
 
-from __future__ import annotations
-
 import json
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -17,51 +16,33 @@ FEW = ["--candidates", "60", "-q"]
 
 
 def test_measuring_ends_where_enough_is_kept_or_nothing_is_won() -> None:
-    inf = float("inf")
     won, lost, first = Gain(3, 2, 1, 1, 6), Gain(3, 2.99, 1, 1, 6), Gain(inf, inf, inf, 1, inf)
     assert verdict_of(won, 6, None, 0.01) == verdict_of(won, 6, 5, 0.01) == "measure"
     assert verdict_of(won, 5, 5, 0.01) == verdict_of(lost, 5, 5, 0.01) == "enough"
-    assert (
-        verdict_of(lost, 6, 5, 0.01) == "no_gain" and verdict_of(first, inf, 5, 0.01) == "measure"
-    )
+    assert verdict_of(lost, 6, 5, 0.01) == "no_gain"
+    assert verdict_of(first, inf, 5, 0.01) == "measure"
 
 
 @pytest.mark.long
 def test_enough_is_said_and_no_plan_is_written(tmp_path) -> None:
     run_demo(tmp_path)
-    path = tmp_path / "none.csv"
-    words = ("next", tmp_path / "cell.toml", tmp_path / "data.csv", "-o", path)
-    done = elastocal(*words, "--require", "new_poses=1000", *FEW)
+    cell, data, path = (tmp_path / name for name in ("cell.toml", "data.csv", "none.csv"))
+    done = elastocal("next", cell, data, "-o", path, "--require", "new_poses=1000", *FEW)
     told = " ".join(done.output.split())
     assert done.exit_code == 0 and not path.exists() and "not written" in told
     assert "no further pose is needed: the required error is kept with 95 %" in told
-    assert "(required: 1e+03 µm)" in told
-
-
-@pytest.mark.parametrize("limit", ["heldout=50", "new_poses=0", "50"])
-def test_another_limit_is_refused(tmp_path, limit) -> None:
-    words = ("next", INPUTS / "wished.toml", INPUTS / "data.csv", "-o", tmp_path / "n.csv")
-    done = elastocal(*words, "--require", limit)
-    assert done.exit_code == 2 and "NAME one of new_poses" in " ".join(done.output.split())
 
 
 def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:
-    """A cell without [tracker] noise is planned for with that of its readings, and says so; pairs
-    of loaded and unloaded readings do not show it, which is said before any work."""
+    """A plan for a cell without [tracker] noise takes that of its readings, and says so."""
     for name in ("arm.csv", "links.csv"):
         (tmp_path / name).write_bytes((INPUTS / name).read_bytes())
-    text = (INPUTS / "wished.toml").read_text()
-    pairs, cell, data = (tmp_path / name for name in ("pairs.toml", "cell.toml", "data.csv"))
-    pairs.write_text(text.replace("sigma_um = 10", ""))
-    position = text.replace('"deflection"', '"position"').replace("sigma_um = 10", "sigma_um = 40")
-    cell.write_text(position)
+    text = (INPUTS / "wished.toml").read_text().replace('"deflection"', '"position"')
+    cell, data, plan = (tmp_path / name for name in ("cell.toml", "data.csv", "plan.csv"))
+    cell.write_text(text.replace("sigma_um = 10", "sigma_um = 40"))
     assert elastocal("simulate", cell, INPUTS / "data.csv", "-o", data).exit_code == 0
-    cell.write_text(position.replace("sigma_um = 40", ""))
-    plan = tmp_path / "plan.csv"
+    cell.write_text(text.replace("sigma_um = 10", ""))
     for words in (("next", cell, data), ("design", cell, "--augment", data, "--poses", 3)):
-        done = elastocal(*words, "-o", plan, "--json", *FEW)
-        answer = json.loads(done.output)
+        answer = json.loads(elastocal(*words, "-o", plan, "--json", *FEW).output)
         (told,) = (w for w in answer.get("plan", answer)["warnings"] if "no noise" in w)
         assert 30 < float(told.split("takes the ")[1].split()[0]) < 50, told
-    done = elastocal("next", pairs, INPUTS / "data.csv", "-o", plan, *FEW)
-    assert done.exit_code == 2 and "needs the noise" in " ".join(done.output.split())

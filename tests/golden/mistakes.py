@@ -16,6 +16,7 @@ DEFLECT = "identify deflecting.toml data.csv -q -o out.json"
 COMPENSATE = "compensate deflecting.toml result.json -q"
 EXPORT = "export placed.toml placed.json -q"
 POINTS = "--preset spatialanalyzer"
+NEXT = "next wished.toml data.csv -o next.csv -q"
 DESIGN = "design wished.toml -o plan.csv --candidates 20 --effort quick -q"
 
 
@@ -179,8 +180,9 @@ OPTIONS = (
     Mistake("an unknown criterion", f"{DESIGN} --criterion Z"),
     Mistake("an unknown effort", "design wished.toml -o plan.csv --effort little -q"),
     Mistake("a kept pose that is not there", f"{DESIGN} --poses 9 --keep poses.csv:1,99"),
-    Mistake("a level of gain that is none", "next wished.toml data.csv -o next.csv --least-gain "
-            "100 -q"),
+    Mistake("pairs that show no noise", NEXT, "wished.toml", "sigma_um = 10\n", ""),
+    *(Mistake(f"a batch with {options}", f"{NEXT} {options}") for options in (
+        "--least-gain 100", "--require heldout=50", "--require new_poses=0", "--require 50")),
     Mistake("a target of two numbers", "compensate placed.toml placed.json --target 1,2 -q"),
     Mistake("an unknown frame", "compensate placed.toml placed.json --target 1500,200,1200 "
             "--frame tool -q"),

@@ -128,9 +128,9 @@ def test_what_the_arm_does_not_repeat_calls_for_poses() -> None:
 def test_the_plan_keeps_the_time() -> None:
     cell = plan_cell(motion=MOTION, repeatability=20e-6, **FEW)
     plan = ec.design(cell, minutes=20, effort="quick")
-    spec = plan.model.cell.design
     assert plan.execution.total <= 20 * 60
-    (own,) = (s for s in plan.timed if (s.poses, s.repeats) == (len(plan), spec.repeats))
+    size = len(plan), plan.model.cell.design.repeats
+    (own,) = (s for s in plan.timed if (s.poses, s.repeats) == size)
     assert own.minutes == pytest.approx(plan.execution.total / 60, rel=0.2)
     assert plan.to_json()["minutes"] == plan.execution.total / 60
     with pytest.raises(InputError, match="asks for the number of poses"):
