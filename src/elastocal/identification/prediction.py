@@ -283,6 +283,7 @@ def position_at(
 MOST_LOADS, MOST_VISITS = 100, 400  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
+WHOLE = 1e-6
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
 
 
@@ -465,7 +466,8 @@ def predicted_error(
     missing = excess or Excess(np.zeros(DRAWS), np.ones(DRAWS))
     inflated, lacking = missing.inflated, float(missing.squared.mean())
     (dof,), (share,) = spread.tails((known * each).reshape(1, -1, n))
-    wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
+    # A whole number stays one where rounding leaves it short of that.
+    wide = _chi2(max(int(dof + WHOLE), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
     z[:, :n] *= np.sqrt(share * wide * inflated)[:, None]
     squares = (z @ G * z).sum(axis=1) + missing.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())

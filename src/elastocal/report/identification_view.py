@@ -356,7 +356,8 @@ def names_of(result: Calibration, standing: str) -> list[str]:
 def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     """The first member and the largest other terms by factor, "+ n more" for the rest."""
     (first, _), *rest = combination.terms.items()
-    kept = sorted(rest, key=lambda term: -abs(term[1]))[: most - 1]
+    # Of factors that are alike but for rounding the first ones are told, on any machine.
+    kept = sorted(rest, key=lambda term: -float(f"{abs(term[1]):.6g}"))[: most - 1]
     text = printable(first)
     for name, factor in [term for term in rest if term in kept]:
         size = say.significant(abs(factor))
