@@ -31,6 +31,7 @@ def test_enough_is_said_and_no_plan_is_written(tmp_path) -> None:
     told = " ".join(done.output.split())
     assert done.exit_code == 0 and not path.exists() and "not written" in told
     assert "no further pose is needed: the required error is kept with 95 %" in told
+    assert "(required: 1e+03 µm)" in told
 
 
 def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:
