@@ -112,18 +112,18 @@ def design(
     on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
-    # What is assembled of a chain knows no markers but the cell's, nor the file's names of joints.
-    model = Model(cell, options.done.marker_names if options.done else ())
-    cell = model.cell
+    read = options.done.marker_names if options.done else ()
     if options.done is not None and lacks_noise(cell):
         progress("noise of the measurements done")
         with suppress(InsufficientDataError):  # then it has to be stated
-            found = identify(model, options.done, Options(fixed=options.fixed))
+            found = identify(Model(cell, read), options.done, Options(fixed=options.fixed))
             cell, told = with_noise_of(cell, found)
             options = replace(options, notes=(*options.notes, *told))
     whole, spec = _Design(cell, options, checkpoint, progress), cell.design
     if spec.choose is None and spec.minutes is None:
         return whole.run()
+    # What is assembled of a chain knows no markers but the cell's, nor the file's names of joints.
+    cell = Model(cell, read).cell
     choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
     chosen = None if spec.choose is None else choice.best()
     placed = cell if chosen is None else applied(chosen, cell)
@@ -152,7 +152,7 @@ class _Design:
         if cell.design.candidates is None and cell.design.taught is None:
             cell = replace(cell, design=replace(cell.design, candidates=POOL))
         self.checkpoint, self.progress, self.options = checkpoint, progress, options
-        self.model = Model(cell)
+        self.model = Model(cell, options.done.marker_names if options.done else ())
         self._leave_out()
         # What the cell as it stands says of test poses and of measurements holds for others too.
         self.work: Model = self.model if first is None else first.work
