@@ -308,18 +308,18 @@ def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
     if setting.kind == "range":
         values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
     elif setting.kind == "change_time":
-        every = moments_between(_time(visits))
+        every = moments_between(times_of(visits))
         evenly = np.linspace(0, len(every) - 1, min(len(every), CHANGE_TIMES))
         values = every[evenly.round().astype(int)]
     else:
-        span = float(np.ptp(_time(visits)))
+        span = float(np.ptp(times_of(visits)))
         low, high = max(span / 20, setting.lower), min(3 * span, setting.upper)
         values = np.geomspace(min(low, high), high, TIME_CONSTANTS)
     step = np.gradient(values) if len(values) > 1 else np.ones(1)
     return SettingsGrid(values[:, None], np.full(len(values), -np.log(len(values))), step[:, None])
 
 
-def _time(visits: Measurements) -> Array:
+def times_of(visits: Measurements) -> Array:
     return by_rows(visits) if visits.time is None else visits.time
 
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.diagnosis.component_answer import SumAnswer
+from elastocal.diagnosis.component_answer import DRAWS, SumAnswer
 from elastocal.diagnosis.component_search import sum_of
 from elastocal.diagnosis.diagnosis import (
     Candidate,
@@ -32,10 +32,15 @@ from elastocal.diagnosis.effect_search import (
     fit_extended,
     settings_of,
 )
-from elastocal.diagnosis.evidence import Item, Scan, exceedance
-from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
+from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, times_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
-from elastocal.diagnosis.stated_floor import each_left_out, with_intervals
+from elastocal.diagnosis.stated_floor import (
+    NEW_POSES,
+    each_left_out,
+    mean_square,
+    with_intervals,
+)
 from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
@@ -170,9 +175,13 @@ class FewAnswer(SumAnswer):
     @cached_property
     def _refitted(self) -> dict[str, float]:
         """Values by name of the exact model with all items that have a name, fitted to the
-        readings: where a geometry is sought, its columns are no line to it."""
-        chosen = self.selected.chosen
-        fitted = fit_extended(self.dataset, chosen, [chosen.items[k] for k in self._named])
+        readings, where a geometry is sought: its columns are no line to it."""
+        chosen, model = self.selected.chosen, self.dataset.base.model
+        named = [chosen.items[k] for k in self._named]
+        hypotheses = (i.what for i in named if isinstance(i.what, Hypothesis))
+        if not any(h.effect.starts(h.where, model.chain, model.cell) for h in hypotheses):
+            return {}
+        fitted = fit_extended(self.dataset, chosen, named)
         return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
@@ -180,13 +189,43 @@ class FewAnswer(SumAnswer):
 
         A configuration c that is left out of a fit is a new pose for it.  Before, the error there
         is X_c β̂₋c − W_c θ*, after it W_c (θ̂ − θ*), with the columns W of all that is held to be
-        true.  What is unexplained is no noise, and stays.
+        true.  What is unexplained is no noise, and stays; so does a change for new readings
+        that fall between its moment and the one that was found.
         """
         before, after = (
             self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
             for predicted in self._predicted(members)
         )
+        for k in members:
+            after = after + self._mistimed(k)
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
+
+    def _mistimed(self, k: int) -> Array:
+        """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
+        moment at which item k changes and the one at which it was found to.
+
+        By the evidence a change lies between two visits, and at any moment between them.
+        """
+        chosen, dataset = self.selected.chosen, self.dataset
+        item = chosen.items[k]
+        kinds = [setting.kind for setting in item.what.settings]
+        time = np.unique(times_of(dataset.visit_table.take(dataset.present.ravel())))
+        if "change_time" not in kinds or len(time) < 4:
+            return np.zeros(DRAWS)
+        s, data = kinds.index("change_time"), chosen.beside(k)
+        middle = (time[1:-2] + time[2:-1]) / 2
+        near = np.sort(np.argsort(np.abs(middle - item.settings[s]))[:CHANGE_TIMES])
+        tried = np.repeat(item.settings[None], len(near), axis=0)
+        tried[:, s] = middle[near]
+        grams = Grams(dataset, data, project(data, chosen.noise))
+        evidence = grams.of(item.what, tried).evidence(item.what.scales)
+        after = self.rng.choice(near, DRAWS, p=special.softmax(evidence)) + 1
+        moment = self.rng.uniform(time[after], time[after + 1])
+        apart = np.abs(moment - item.settings[s]) / np.ptp(time)
+        n_new = NEW_POSES * round(len(time) / len(dataset.blocks.member))
+        changed = (times_of(dataset.table)[dataset.lead] > item.settings[s]).mean()
+        step = mean_square(data, chosen.signal(k)) / changed
+        return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
 
     @cached_property
     def _true(self) -> Array:
@@ -214,15 +253,17 @@ class FewAnswer(SumAnswer):
         return before[self._rows][kept], after[self._rows][kept]
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
-        """Of the exact fit by the instrument's noise, and one step from there by all the noise."""
+        """Of the columns by the instrument's noise or, where a geometry is sought, of the exact
+        fit, and one step from there by all the noise."""
         c, span = self.found.components[k], self.found.spans[k]
         assert c.hypothesis is not None
         size = self.dataset.sizes[c.hypothesis.key]
-        step = (self.at.beta - self._fitted.beta)[span] * size
+        each = size * [self._fitted.beta[span], self.at.beta[span]]
         std = np.linalg.norm(self.at.beta_deviation[:, span], axis=0) * size
-        for p, more, s in zip(c.hypothesis.parameters, step, std, strict=True):
+        for p, first, last, s in zip(c.hypothesis.parameters, *each, std, strict=True):
             name = f"{c.where}.{p.key}"
-            yield FittedParameter(name, self._refitted[name] + float(more), p.unit, float(s))
+            value = self._refitted.get(name, p.nominal + float(first))
+            yield FittedParameter(name, value + float(last - first), p.unit, float(s))
 
     components = groups = slight = fields = ()
 
