@@ -77,7 +77,8 @@ def true_reduction(base: Baseline, answer: dict[str, Any], extended: Path, fresh
     """
     model = Model.assembled(base.model.chain, read_cell(extended))
     start = dict(zip(base.model.names, base.x, strict=True))
-    start |= {p["name"]: p["value"] for e in answer["effects"] for p in e["parameters"]}
+    known = (p for e in answer["effects"] for p in e["parameters"] if p["value"] is not None)
+    start |= {p["name"]: p["value"] for p in known}  # others stand in the cell
     x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
     after = fit_baseline(model, base.observed.table, x0=x0)
     table = base.model.read(fresh)

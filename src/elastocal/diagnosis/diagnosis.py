@@ -77,7 +77,8 @@ class EffectAt:
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """A parameter of an added effect after the nonlinear refit, in `unit` (SI)."""
+    """A parameter of an added effect, in `unit` (SI); `std` is infinite where the data determine
+    only what it does together with others, and the value is one of many that do the same."""
 
     name: str
     value: float
@@ -592,10 +593,13 @@ def _without(content: dict[str, Any], key: str) -> dict[str, Any]:
 
 
 def _found(f: FoundEffect) -> dict[str, Any]:
-    def ends(p: FittedParameter) -> list[float]:
-        return [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
+    def told(p: FittedParameter) -> dict[str, Any]:
+        if math.isinf(p.std):
+            return vars(p) | {"value": None, "ci95": None}
+        ends = [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
+        return vars(p) | {"ci95": ends}
 
-    return vars(f) | {"parameters": [vars(p) | {"ci95": ends(p)} for p in f.parameters]}
+    return vars(f) | {"parameters": [told(p) for p in f.parameters]}
 
 
 def _location(location: Location) -> dict[str, Any]:

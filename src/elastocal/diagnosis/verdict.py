@@ -24,7 +24,7 @@ from elastocal.diagnosis.diagnosis import (
     Untested,
     Verdict,
 )
-from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.effect_search import (
     LARGEST_SET,
     SelectedEffects,
@@ -125,6 +125,9 @@ TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
 TURNS = ((" rx", "rad"), (" ry", "rad"), (" rz", "rad"))
 COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # name and unit
 
+# A parameter whose deviation grows by more under a prior so much weaker is undetermined.
+WEAKER, HELD_BY_PRIOR = 1e-3, 2.0
+
 
 @dataclass(frozen=True)
 class FewAnswer(SumAnswer):
@@ -176,13 +179,19 @@ class FewAnswer(SumAnswer):
     def _refitted(self) -> dict[str, float]:
         """Values by name of the exact model with all items that have a name, fitted to the
         readings, where a geometry is sought: its columns are no line to it."""
-        chosen, model = self.selected.chosen, self.dataset.base.model
+        chosen = self.selected.chosen
         named = [chosen.items[k] for k in self._named]
-        hypotheses = (i.what for i in named if isinstance(i.what, Hypothesis))
-        if not any(h.effect.starts(h.where, model.chain, model.cell) for h in hypotheses):
+        if not any(self._is_sought(item.what) for item in named):
             return {}
         fitted = fit_extended(self.dataset, chosen, named)
         return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
+
+    def _is_sought(self, what: Hypothesis | Generic) -> bool:
+        """Whether its geometry was looked for from many starts."""
+        model = self.dataset.base.model
+        if not isinstance(what, Hypothesis):
+            return False
+        return bool(what.effect.starts(what.where, model.chain, model.cell))
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls by these components.
@@ -259,8 +268,13 @@ class FewAnswer(SumAnswer):
         assert c.hypothesis is not None
         size = self.dataset.sizes[c.hypothesis.key]
         each = size * [self._fitted.beta[span], self.at.beta[span]]
-        std = np.linalg.norm(self.at.beta_deviation[:, span], axis=0) * size
-        for p, first, last, s in zip(c.hypothesis.parameters, *each, std, strict=True):
+        D = self.at.beta_deviation[:, span]
+        std = np.linalg.norm(D, axis=0)
+        if self._is_sought(c.hypothesis):
+            # The prior is about one of many geometries: what is known by it alone is not known.
+            without = np.linalg.inv(D.T @ D) - (1 - WEAKER) * np.diag(self._wide.precision[span])
+            std[np.diag(np.linalg.inv(without)) > (HELD_BY_PRIOR * std) ** 2] = np.inf
+        for p, first, last, s in zip(c.hypothesis.parameters, *each, size * std, strict=True):
             name = f"{c.where}.{p.key}"
             value = self._refitted.get(name, p.nominal + float(first))
             yield FittedParameter(name, value + float(last - first), p.unit, float(s))

@@ -369,11 +369,15 @@ def added_parameter_table(d: Diagnosis) -> say.ShownTable:
     rows: list[tuple[str, ...]] = []
     for f in d.effects:
         for p in f.parameters:
-            rows.append((printable(p.name), *say.estimate(p.value, NORMAL_95 * p.std, p.unit)))
+            told = p.value if math.isfinite(p.std) else math.nan
+            rows.append((printable(p.name), *say.estimate(told, NORMAL_95 * p.std, p.unit)))
         if f.settings:
             rows.append((f"{say.effect_at(f)}: {settings_of(d, f.settings)}", "", "", ""))
     title = "Parameters of the effects found"
-    return say.ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
+    unknown = any(math.isinf(p.std) for f in d.effects for p in f.parameters)
+    note = "–: undetermined; the data show only what these parameters do together." * unknown
+    heads = ("parameter", "value", "± 95 %", "unit")
+    return say.ShownTable(heads, rows, (0, 3), title=title, note=note)
 
 
 def structure_table(d: Diagnosis) -> say.ShownTable:
