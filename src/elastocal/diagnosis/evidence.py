@@ -246,10 +246,14 @@ class EntrySums:
         return Spectrum(lam, beta)
 
     def driven(self, D: Array) -> Spectrum:
-        """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
-        are the same in all visits of a configuration."""
+        """Spectrum of the groups with directions D, as `products` takes them."""
+        return Spectrum.of(*self.products(D))
+
+    def products(self, D: Array) -> tuple[Array, Array]:
+        """A (V, k, k) and b (V, k, T) of the groups with directions D (C, v, d, V, k), or
+        (C, 1, d, V, k) where they are the same in all visits of a configuration."""
         if D.shape[1] < self.local.shape[1]:
-            return self._of_configurations.driven(D)
+            return self._of_configurations.products(D)
         C, v, d, V, k = D.shape
         n = v * d
         flat = D.reshape(C, n, V * k)
@@ -259,7 +263,7 @@ class EntrySums:
         A = _each_with_each(flat.reshape(-1, V, k), moved.reshape(-1, V, k))
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
         b = np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
-        return Spectrum.of(A, b.reshape(V, k, -1))
+        return A, b.reshape(V, k, -1)
 
 
 def _each_with_each(a: Array, b: Array) -> Array:
@@ -315,6 +319,13 @@ class Grams:
             len(tried), what.width, lambda some: dataset.direction(what, tried[some]),
             self.data.threads,
         )  # fmt: skip
+
+    def estimates(self, what: Hypothesis, settings: Array, scale: float) -> Array:
+        """Posterior means (G, k) of a driven hypothesis at each of the `settings` (G, …), its
+        coefficients of this `scale` beforehand."""
+        D = self.dataset.direction(what, settings)
+        A, b = self.entry(what.entry_key(self.dataset.base.model)).products(D)
+        return np.asarray(np.linalg.solve(A + np.eye(what.width) / scale**2, b[..., :1]))[..., 0]
 
 
 # Everything that may be missing, scored under one noise.

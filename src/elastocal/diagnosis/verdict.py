@@ -33,7 +33,7 @@ from elastocal.diagnosis.effect_search import (
     settings_of,
 )
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
-from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, times_of
+from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.stated_floor import (
     NEW_POSES,
@@ -127,6 +127,7 @@ COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # na
 
 # A parameter whose deviation grows by more under a prior so much weaker is undetermined.
 WEAKER, HELD_BY_PRIOR = 1e-3, 2.0
+FARTHEST = 10.0  # times what was found that a time constant may be, or part of it
 
 
 @dataclass(frozen=True)
@@ -211,30 +212,61 @@ class FewAnswer(SumAnswer):
 
     def _mistimed(self, k: int) -> Array:
         """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
-        moment at which item k changes and the one at which it was found to.
-
-        By the evidence a change lies between two visits, and at any moment between them.
-        """
+        moment at which item k changes and the one at which it was found to."""
         chosen, dataset = self.selected.chosen, self.dataset
-        item = chosen.items[k]
-        kinds = [setting.kind for setting in item.what.settings]
-        time = np.unique(times_of(dataset.visit_table.take(dataset.present.ravel())))
+        item, every = chosen.items[k], times_of(dataset.table)[dataset.lead]
+        kinds, time = [setting.kind for setting in item.what.settings], np.unique(every)
         if "change_time" not in kinds or len(time) < 4:
             return np.zeros(DRAWS)
-        s, data = kinds.index("change_time"), chosen.beside(k)
-        middle = (time[1:-2] + time[2:-1]) / 2
-        near = np.sort(np.argsort(np.abs(middle - item.settings[s]))[:CHANGE_TIMES])
-        tried = np.repeat(item.settings[None], len(near), axis=0)
-        tried[:, s] = middle[near]
-        grams = Grams(dataset, data, project(data, chosen.noise))
-        evidence = grams.of(item.what, tried).evidence(item.what.scales)
-        after = self.rng.choice(near, DRAWS, p=special.softmax(evidence)) + 1
-        moment = self.rng.uniform(time[after], time[after + 1])
+        s = kinds.index("change_time")
+        tried, p, _ = self._constants(k, s)
+        # Between the two visits at any moment.
+        after = np.searchsorted(time, self.rng.choice(tried[:, s], DRAWS, p=p))
+        moment = self.rng.uniform(time[after - 1], time[after])
         apart = np.abs(moment - item.settings[s]) / np.ptp(time)
         n_new = NEW_POSES * round(len(time) / len(dataset.blocks.member))
-        changed = (times_of(dataset.table)[dataset.lead] > item.settings[s]).mean()
-        step = mean_square(data, chosen.signal(k)) / changed
+        changed = (every > item.settings[s]).mean()
+        step = mean_square(chosen.data, chosen.signal(k)) / changed
         return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
+
+    def _constants(self, k: int, s: int) -> tuple[Array, Array, Grams]:
+        """Settings (G, …) of item k with constant s at all values that it may have, the others as
+        found, their probabilities (G,), and the sums by which these were judged."""
+        chosen, dataset = self.selected.chosen, self.dataset
+        item, data = chosen.items[k], chosen.beside(k)
+        assert isinstance(item.what, Hypothesis)
+        found, kind, grid = (
+            item.settings[s],
+            item.what.settings[s].kind,
+            dataset.grids[item.what.key],
+        )
+        if kind == "change_time":
+            values = moments_between(np.unique(times_of(dataset.table)[dataset.lead]))
+            values = values[np.argsort(np.abs(values - found))[:CHANGE_TIMES]]
+        elif kind == "time_constant":  # as probable from here to twice it as to half of it
+            values = found * np.geomspace(1 / FARTHEST, FARTHEST, 33)
+            ends = grid.values[:, s]
+            values = values[(values >= ends.min()) & (values <= ends.max())]
+        else:
+            setting = item.what.settings[s]
+            values = found + grid.step[grid.nearest(item.settings), s] * np.linspace(-1, 1, 33)
+            values = values[(values >= setting.lower) & (values <= setting.upper)]
+        tried = np.repeat(item.settings[None], len(values), axis=0)
+        tried[:, s] = values
+        grams = Grams(dataset, data, project(data, chosen.noise))
+        evidence = grams.of(item.what, tried).evidence(item.what.scales)
+        return tried, special.softmax(evidence), grams
+
+    def _by_constants(self, k: int) -> Array:
+        """Variance (width,) of item k's coefficients because its constants are estimated, too."""
+        chosen = self.selected.chosen
+        what, scale, out = chosen.items[k].what, chosen.scales[k], np.zeros(1)
+        for s in range(len(what.settings)):
+            assert isinstance(what, Hypothesis)
+            tried, p, grams = self._constants(k, s)
+            off = grams.estimates(what, tried, scale) - chosen.at.beta[chosen.spans[k]]
+            out = out + p @ off**2
+        return out
 
     @cached_property
     def _true(self) -> Array:
@@ -269,7 +301,7 @@ class FewAnswer(SumAnswer):
         size = self.dataset.sizes[c.hypothesis.key]
         each = size * [self._fitted.beta[span], self.at.beta[span]]
         D = self.at.beta_deviation[:, span]
-        std = np.linalg.norm(D, axis=0)
+        std = np.sqrt((D**2).sum(axis=0) + self._by_constants(k))
         if self._is_sought(c.hypothesis):
             # The prior is about one of many geometries: what is known by it alone is not known.
             without = np.linalg.inv(D.T @ D) - (1 - WEAKER) * np.diag(self._wide.precision[span])
