@@ -135,11 +135,9 @@ def targets_at(
     force: Array | None = None, q: Array | None = None,
 ) -> Targets:  # fmt: skip
     """Targets that no table states, all under one `force` (3,) N; errors name `source`."""
-    known = position if position is not None else q
-    if known is None:
-        raise InputError(f"{source}: neither positions nor joints")
+    n = next(len(given) for given in (position, q) if given is not None)
     pull = np.zeros(3) if force is None else force
-    table = Measurements.of_poses(source, np.zeros((len(known), 0)), pull)
+    table = Measurements.of_poses(source, np.zeros((n, 0)), pull)
     return Targets(table, frame, position, rotation, q)
 
 
@@ -482,13 +480,15 @@ def _status(search: Commanding, missed: Array, nominal: Array) -> tuple[str, ...
 def _uncertainty(
     tool: CalibratedTool, rows: list[NDArray], q: Array, reached: BoolArray
 ) -> Uncertainty:
-    n = len(q)
-    covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
-    total = covariance.copy()
-    good = np.flatnonzero(reached)
-    found = uncertainty_at(tool, [values[good] for values in rows], q[good])
-    covariance[good], total[good], unknown[good] = found.covariance, found.total, found.unknown
-    return Uncertainty(covariance, total, unknown, found.blamed)
+    def of_all(values: Array) -> Array:
+        found = np.full((len(q), *values.shape[1:]), np.nan)
+        found[reached] = values
+        return found
+
+    some = uncertainty_at(tool, [values[reached] for values in rows], q[reached])
+    return Uncertainty(
+        of_all(some.covariance), of_all(some.total), of_all(some.unknown), some.blamed
+    )
 
 
 # Sentences about commands that are right but that somebody should look at.

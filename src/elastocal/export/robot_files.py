@@ -597,7 +597,7 @@ class _MjcfText(XmlFile):
         path = arm.tree.path
         super().__init__(path, read_bytes(path, "MuJoCo model", MAX_BYTES), "an MJCF file")
         self.arm, self.model, self.pieces = arm, arm.model, pieces
-        below = [tag for tag in self.tags if tag.name == "body" and tag.within("worldbody")]
+        below = self.anywhere("body")
         self.bodies = [*self.anywhere("worldbody")[:1], *below]
         names = [arm.model.body(i).name for i in range(1, arm.model.nbody)]
         if [body.get("name") for body in below] != names:

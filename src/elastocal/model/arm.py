@@ -286,10 +286,7 @@ def given_force(load: ArrayLike | None, poses: int | None = None) -> Array | Non
     where it is not given."""
     if load is None:
         return None
-    try:
-        force = np.asarray(load, dtype=float)
-    except (TypeError, ValueError):
-        force = np.zeros(())
+    force = np.asarray(load, dtype=float)
     known = force.shape == (3,) or force.shape == (poses, 3)
     if known and (np.abs(force) <= LARGEST_FORCE).all():
         return force

@@ -74,9 +74,6 @@ class Tag:
         inside = self.first(name)
         return None if inside is None else inside.stated.get(key)
 
-    def within(self, name: str) -> bool:
-        return self.above is not None and (self.above.name == name or self.above.within(name))
-
 
 class XmlFile:
     """The tags of an XML file, and the edits to make in its text.

@@ -159,8 +159,10 @@ def check_settings(chain: Chain, cell: Cell) -> None:
     nominal = cell.model.nominal
     for table, what, given, keys_of in (
         ("settings", "setting", nominal.settings, lambda e, *at: [s.key for s in e.settings(*at)]),
-        ("sizes", "parameter", nominal.sizes, _keys_of_sizes),
-    ):
+        # Shrunk parameters have their size from a setting.
+        ("sizes", "parameter", nominal.sizes,
+         lambda e, *at: [p.key for p in e.parameters(*at) if not p.shrunk]),
+    ):  # fmt: skip
         known: dict[str, list[str]] = {}
         for effect in CATALOGUE.values() if given else ():
             for place in effect.places(chain, cell):
@@ -170,15 +172,6 @@ def check_settings(chain: Chain, cell: Cell) -> None:
             _check_known(f"nominal.{table}", "place", place, known, cell)
             for key in values:
                 _check_known(f"nominal.{table}", f"{what} of {place}", key, known[place], cell)
-
-
-def _keys_of_sizes(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
-    """Shrunk parameters have their size from a setting; an effect that this arm cannot have (masses
-    that nobody stated) has none."""
-    try:
-        return [p.key for p in effect.parameters(place, chain, cell) if not p.shrunk]
-    except InputError:
-        return []
 
 
 def sized_parameters(

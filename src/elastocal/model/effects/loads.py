@@ -101,16 +101,13 @@ class LinkGravity(Effect):
     def may_be_missing(self, cell: Cell) -> bool:
         return False
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+    def load(self, arm: Arm, place: str, p: Symbols) -> None:
         require(
-            bool(chain.masses),
-            f"link_gravity is on, but robot '{chain.name}' has no masses: give <inertial> "
+            bool(arm.chain.masses),
+            f"link_gravity is on, but robot '{arm.chain.name}' has no masses: give <inertial> "
             'elements in the URDF, or [robot] masses = "links.csv" for a DH robot, '
             "or set [model] link_gravity = false",
         )
-        return ()
-
-    def load(self, arm: Arm, place: str, p: Symbols) -> None:
         i = index(place)
         body = arm.chain.masses[i]
         com = rigid.point(arm.T_tracker_link[i], rigid.constant(body.com))
