@@ -12,7 +12,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
-from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice, Tool
 from elastocal.errors import InputError, InsufficientDataError, option, require
@@ -41,29 +40,7 @@ from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
-from elastocal.units import Array, microns, rpy_from_rotation
-
-
-def numbers(values: ArrayLike) -> str:
-    """Numbers separated by blanks, each with the digits that give the same double back."""
-    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=float))
-
-
-def placed_body(name: str | None, T: Array) -> dict[str, str]:
-    """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
-    turned = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
-    called = {} if name is None else {"name": name}
-    return called | {"pos": numbers(T[:3, 3]), "quat": numbers(turned)}
-
-
-def origin_attributes(T: Array) -> dict[str, str]:
-    return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy_from_rotation(T[:3, :3]))}
-
-
-def nothing(T: Array) -> bool:
-    """Whether T (4, 4) differs from the identity by rounding alone."""
-    return bool(np.max(np.abs(T - np.eye(4))) < 4 * np.finfo(float).eps)
-
+from elastocal.units import Array, microns
 
 # What of the calibrated model a file can hold, as a model of its own beside the full one.
 #

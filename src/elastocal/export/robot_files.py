@@ -12,17 +12,13 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import root
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.export.exportable import (
-    ExportNumbers,
-    nothing,
-    numbers,
-    origin_attributes,
-    placed_body,
-)
+from elastocal.export.exportable import ExportNumbers
 from elastocal.files import read_bytes
 from elastocal.model.arm import Spring
 from elastocal.model.chain import Joint, LinkMass
@@ -39,7 +35,29 @@ from elastocal.model.mjcf import (
 )
 from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.text import listed
-from elastocal.units import Array, pose_at
+from elastocal.units import Array, pose_at, rpy_from_rotation
+
+
+def numbers(values: ArrayLike) -> str:
+    """Numbers separated by blanks, each with the digits that give the same double back."""
+    return " ".join(repr(float(value)) for value in np.asarray(values, dtype=float))
+
+
+def placed_body(name: str | None, T: Array) -> dict[str, str]:
+    """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
+    turned = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    called = {} if name is None else {"name": name}
+    return called | {"pos": numbers(T[:3, 3]), "quat": numbers(turned)}
+
+
+def origin_attributes(T: Array) -> dict[str, str]:
+    return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy_from_rotation(T[:3, :3]))}
+
+
+def nothing(T: Array) -> bool:
+    """Whether T (4, 4) differs from the identity by rounding alone."""
+    return bool(np.max(np.abs(T - np.eye(4))) < 4 * np.finfo(float).eps)
+
 
 # The calibrated arm as URDF: the user's own file with corrected joint origins.
 #
@@ -356,6 +374,13 @@ def calibrated_mjcf(
             )  # fmt: skip
     flange = _body(body, "flange", pieces.links[-1])
     _passive(flange, before)
+    _tool(flange, actuators, pieces)
+    root.append(actuators)
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _tool(flange: ET.Element, actuators: ET.Element, pieces: ExportNumbers) -> None:
     placed = {"flange": np.eye(4), "load_point": pose_at(pieces.load_point)}
     placed |= {f"marker_{name}": T for name, T in pieces.markers.items()}
     for name, T in placed.items():
@@ -366,9 +391,6 @@ def calibrated_mjcf(
             actuators, "motor", name=f"load_{axis}", site="load_point", refsite="tracker_axes",
             gear=numbers(pieces.load_scale * unit),
         )  # fmt: skip
-    root.append(actuators)
-    ET.indent(root)
-    return ET.tostring(root, encoding="unicode") + "\n"
 
 
 def _body(
