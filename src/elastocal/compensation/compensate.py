@@ -31,7 +31,7 @@ from elastocal.model.calibrated import (
     numbers,
     tool_point,
 )
-from elastocal.model.chain import Chain, joint_limits
+from elastocal.model.chain import Chain, joint_index, joint_limits
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import (
     ARM_LENGTH,
@@ -550,7 +550,7 @@ def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
             f"the tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
         )
     for name, values in spec.compliance_levels.items():
-        angle = c.q[:, int(name.removeprefix("joint")) - 1]
+        angle = c.q[:, joint_index(name)]
         off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
         if (off & c.reached).any():
             yield (

@@ -27,7 +27,7 @@ from elastocal.measurements import Measurements
 from elastocal.model import dh
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
-from elastocal.model.chain import Chain, Joint
+from elastocal.model.chain import Chain, Joint, joint_index
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm
@@ -500,7 +500,7 @@ def _compensator(part: Valued) -> dict[str, float] | None:
     values = {name: v for name, v in part.values.items() if ".compensator_" in name}
     if not values:
         return None
-    joint = int(next(iter(values)).partition(".")[0].removeprefix("joint")) - 1
+    joint = joint_index(next(iter(values)).partition(".")[0])
     return {name.partition(".")[2]: v for name, v in values.items()} | {"joint": joint}
 
 

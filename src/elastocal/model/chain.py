@@ -114,8 +114,8 @@ def finite_ranges(
 
 
 def joint_index(name: str) -> int:
-    """0-based index of "jointN"."""
-    return int(name.removeprefix("joint")) - 1
+    """0-based index of "joint3", as of "link3"."""
+    return int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
 
 
 # Can a nominal chain be meant as its file states it?  One rule for URDF, MJCF and DH tables.
@@ -298,28 +298,33 @@ def names_told(chain: Chain) -> str:
     return listed(f"{number} = {printable(name)}" for number, name in names.items())
 
 
+def _meanings(chain: Chain, meant: str | None) -> tuple[dict[str, str], list[str]]:
+    """What a joint may be called → jointN, and the names of which one must say what is `meant`."""
+    by_file = {name: number for number, name in file_names(chain).items()}
+    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
+    clash = clashing(chain)
+    if meant == "order":
+        return by_file | by_order, []
+    if clash:  # by the file: a number that is no name there means nothing
+        same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
+        return same | by_file, clash if meant is None else []
+    return by_order | by_file, []
+
+
 def numbered(cell: Cell, chain: Chain) -> Cell:
     """The cell with every joint that it names as jointN, N its place in the chain.
 
     A joint may be named as in the robot's file wherever jointN may stand.  Where the file calls
     another than the Nth joint jointN, `[robot] joint_names` says which is meant.
     """
-    by_file = {name: number for number, name in file_names(chain).items()}
-    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
-    clash = clashing(chain) if cell.robot.joint_names is None else []
-    known = by_order | by_file
-    if cell.robot.joint_names == "order":
-        known = by_file | by_order
-    elif clashing(chain):  # by the file: a number that is no name there means nothing
-        same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
-        known = same | by_file
+    known, clash = _meanings(chain, cell.robot.joint_names)
 
     def one(name: str, where: str, others: bool = False) -> str:
         """jointN of a name that stands at `where`; with `others` what is no joint stays."""
         if name in clash:
             raise InputError(
                 f"{cell.source}: {where} names {name}, which in the robot's file is "
-                f"joint number {by_file[name].removeprefix('joint')} of the arm "
+                f"joint number {known[name].removeprefix('joint')} of the arm "
                 f'({names_told(chain)}); say which is meant: [robot] joint_names = "file" (names '
                 'of the file) or "order" (jointN is the Nth)'
             )

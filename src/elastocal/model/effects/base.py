@@ -14,7 +14,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
-from elastocal.model.chain import Chain
+from elastocal.model.chain import Chain, joint_index
 from elastocal.plugin_loader import check_registered
 from elastocal.text import listed
 from elastocal.units import Array
@@ -266,9 +266,7 @@ def links(chain: Chain) -> tuple[str, ...]:
     return tuple(f"link{i + 1}" for i in range(chain.n_joints))
 
 
-def index(place: str) -> int:
-    """0-based index of "joint3" or "link3"."""
-    return int(place.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
+index = joint_index
 
 
 # Effects that the table drives: small motions, and where along the chain they enter.
