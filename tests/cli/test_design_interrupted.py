@@ -17,7 +17,7 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.planning import checkpoint
+from elastocal.planning import search
 
 GOING_ON = "resuming the interrupted design"
 
@@ -33,7 +33,7 @@ def whole(tmp_path_factory):
 
 def interrupt_after(monkeypatch, saves):
     """Ctrl-C right after so many states were saved."""
-    save, count = checkpoint.atomic_write, [0]
+    save, count = search.atomic_write, [0]
 
     def saving(path, state):
         save(path, state)
@@ -41,7 +41,7 @@ def interrupt_after(monkeypatch, saves):
         if count[0] == saves:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(checkpoint, "atomic_write", saving)
+    monkeypatch.setattr(search, "atomic_write", saving)
 
 
 @pytest.mark.parametrize("edited", [False, True])
@@ -67,7 +67,7 @@ def stages_in(begun):
     if not begun.exists():
         return set()
     with np.load(begun) as kept:
-        return {name.partition("/")[0] for name in kept.files} - {checkpoint.KEY}
+        return {name.partition("/")[0] for name in kept.files} - {search.KEY}
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

@@ -18,11 +18,11 @@ from elastocal.cell.work_cell import Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, _Design
 from elastocal.planning.information import Known
 from elastocal.planning.plan import Plan
 from elastocal.planning.relaxation import exact_plan, relax
+from elastocal.planning.search import Checkpoint
 from elastocal.planning.setup import Setup, set_up, share_within
 from elastocal.planning.test_poses import ELSEWHERE, everywhere
 

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
     from elastocal.cell.work_cell import Cell
     from elastocal.importing.assemble import Imported
-    from elastocal.planning.checkpoint import Checkpoint
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.plan import Plan
+    from elastocal.planning.search import Checkpoint
     from elastocal.units import Progress
 
 
@@ -251,8 +251,8 @@ def _resumed(
     progress: Progress,
 ) -> tuple[Plan, Checkpoint]:  # fmt: skip
     """The plan, where an interrupted run of the same input left off, and what that left."""
-    from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
+    from elastocal.planning.search import Checkpoint, key_of
 
     apart = ("jobs", "augment", "knowledge")  # these are among the files
     told = {name: value for name, value in asked.items() if name not in apart}

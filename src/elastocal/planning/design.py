@@ -31,7 +31,6 @@ from elastocal.planning.candidates import (
     joint_space,
     shares_of,
 )
-from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice, applied, chosen_states, within
 from elastocal.planning.criteria import CRITERIA, criterion_named
 from elastocal.planning.feasibility import Feasibility
@@ -57,7 +56,15 @@ from elastocal.planning.plan import (
 )
 from elastocal.planning.polish import Searches
 from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
-from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, ordered
+from elastocal.planning.search import (
+    EFFORTS,
+    POOL,
+    Checkpoint,
+    Search,
+    SearchEffort,
+    State,
+    ordered,
+)
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import listed, quoted

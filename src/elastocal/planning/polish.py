@@ -14,6 +14,7 @@ import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,7 +22,6 @@ from scipy.optimize import minimize
 
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.planning.candidates import CHUNK, JointSpace, points
-from elastocal.planning.checkpoint import State
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.relaxation import DesignProblem
@@ -204,7 +204,7 @@ EXCESS = 1e-6  # over the pool's largest d, relative, that counts as one
 def estimate(
     problem: DesignProblem, tangent: TangentBound, searches: Searches, T: Array,
     pool: FeasiblePool, seed: int = 0, progress: Progress = lambda message: None,
-) -> State:  # fmt: skip
+) -> dict[str, Any]:  # fmt: skip
     """The largest d on the continuum per group, for the tangent (Φ, G) of the optimum of the `pool`
     with its `problem`; every maximum is evaluated exactly and passed by the cell's rules.
 
