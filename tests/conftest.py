@@ -44,14 +44,14 @@ def short_search(request: pytest.FixtureRequest) -> Iterator[None]:
     if WHOLE & {*request.path.parts} or getattr(request.module, "WHOLE_SEARCH", False):
         yield
         return
-    names = ("execution", "polish", "search")
-    drift, polish, search = (import_module(f"elastocal.planning.{name}") for name in names)
+    names = ("execution", "search")
+    drift, search = (import_module(f"elastocal.planning.{name}") for name in names)
     with pytest.MonkeyPatch.context() as patch:
         quick = replace(search.EFFORTS["quick"], starts=1)
         patch.setitem(search.EFFORTS, "quick", quick)
         patch.setattr(search, "REFINED", 0)
-        patch.setattr(polish, "POINTS", 1)
-        patch.setattr(polish, "STARTS", 1)
+        patch.setattr(search, "POINTS", 1)
+        patch.setattr(search, "STARTS", 1)
         patch.setattr(drift, "STEPS", 1000)
         patch.setattr(drift, "FEW", 1000)
         yield

@@ -14,8 +14,7 @@ from elastocal.planning.candidates import joint_space
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Unreachable
 from elastocal.planning.plan import Certificate
-from elastocal.planning.polish import Searches
-from elastocal.planning.search import EFFORTS, Checkpoint, Search, ordered
+from elastocal.planning.search import EFFORTS, Checkpoint, Search, Searches, ordered
 from elastocal.planning.setup import FeasiblePool
 
 CHAIN = kr270_chain()

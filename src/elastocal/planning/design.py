@@ -54,7 +54,6 @@ from elastocal.planning.plan import (
     predicted,
     reasons,
 )
-from elastocal.planning.polish import Searches
 from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
 from elastocal.planning.search import (
     EFFORTS,
@@ -62,6 +61,7 @@ from elastocal.planning.search import (
     Checkpoint,
     Search,
     SearchEffort,
+    Searches,
     State,
     ordered,
 )

@@ -65,11 +65,11 @@ class Sentence:
     soft: bool = False
 
 
-@dataclass(frozen=True)
 class Lines:
-    """Sentences with labels.  Those labelled WARNING call for attention."""
+    """Sentences with labels, those that there are; labels WARNING call for attention."""
 
-    items: Sequence[tuple[str, str]]
+    def __init__(self, items: Iterable[tuple[str, str | None]]) -> None:
+        self.items = [(label, text) for label, text in items if text]
 
 
 WARNING = "Warning"

@@ -53,9 +53,9 @@ def calibration_blocks(
     budget = cache(lambda: gap_budget(result))
     yield say.Fold("", lambda: [_key(result, budget())])
     yield judgement(result)
-    new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
     yield say.Lines([
-        ("Error (rms)", error_line(result)), *new,
+        ("Error (rms)", error_line(result)),
+        ("Expected", at_new_poses(result.predicted)),
         *(("Next", f.remedy) for f in next_steps(result)),
         *warnings_beside(result),
     ])  # fmt: skip
@@ -69,17 +69,16 @@ def calibration_blocks(
         yield say.Fold("Combinations with all their members", lambda: longer)
     for line in undetermined_lines(result, FEW):
         yield say.Sentence(say.sentence(line), soft=True)
-    constraints, prior = words.constraints_line(result), words.prior_line(result)
     hit, n = coverage(result, truth) if truth else (0, 0)
     held = f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
     yield say.Lines([
         ("Readings", readings(result)),
         ("Identified", what_was_identified(result)),
-        *joint_lines(result),
+        ("Joints", names_told(result.model.chain)),
         ("Noise", words.does_noise_explain_it(result)),
-        *([("Constraints", constraints)] if constraints else []),
-        *([("Prior", prior)] if prior else []),
-        *([("Truth", held)] if truth else []),
+        ("Constraints", words.constraints_line(result)),
+        ("Prior", words.prior_line(result)),
+        ("Truth", held if truth else None),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
     residuals = Residuals(result.model, result.observations, result.residual)
@@ -148,17 +147,21 @@ def _on_the_arm(result: Calibration, residuals: Residuals) -> Iterator[say.Block
 
 
 def _method(result: Calibration) -> Iterator[say.Block]:
+    summary = result.residual_summary
     yield say.Lines([
         ("Method", say.sentence(words.method_and_weights(result))),
         ("Degrees of freedom", f"{result.dof}."),
-        *prediction_lines(result),
-        *words.noise_lines(result),
+        ("Prediction", prediction_line(result)),
+        ("Noise model", words.noise_model_line(result)),
+        ("Repeats", words.repeats_line(result)),
+        ("Residuals", None if summary is None else words.shape_line(summary)),
+        ("In time", words.in_time_line(result)),
         ("Intervals", say.sentence(words.intervals_line(result))),
     ])  # fmt: skip
     if len((tried := words.candidate_table(result.noise)).rows) > 1:
         yield tried
-    if result.residual_summary is not None:
-        yield words.deviating_table(result.residual_summary)
+    if summary is not None:
+        yield words.deviating_table(summary)
 
 
 def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
@@ -218,7 +221,7 @@ def what_was_identified(result: Calibration) -> str:
     return f"{text}."
 
 
-def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
+def prediction_line(result: Calibration) -> str:
     told: list[str] = []
     held = math.isfinite(result.heldout_rms)
     if not held:
@@ -235,10 +238,12 @@ def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
             f"Test error ({say.counted(t.n, 'reading')}, not fitted): {say.length(t.rms)} rms, "
             f"{say.length(t.mean)} mean, {say.length(t.maximum)} maximum."
         )
-    return [("Prediction", " ".join(told))] if told else []
+    return " ".join(told)
 
 
-def at_new_poses(found: PredictedError) -> str:
+def at_new_poses(found: PredictedError | None) -> str:
+    if found is None:
+        return ""
     low, high = found.ci95
     parts = [f"parameters {say.length(found.parameters)}"]
     if found.open > 0:
@@ -268,12 +273,6 @@ def error_line(result: Calibration) -> str:
         )
         text += f"; rotations {next(told)} fitted, {next(told)} held out"
     return text
-
-
-def joint_lines(result: Calibration) -> list[tuple[str, str]]:
-    """The names that the robot's file has for joint1 … jointN, where they say something else."""
-    told = names_told(result.model.chain)
-    return [("Joints", told)] if told else []
 
 
 def readings(result: Calibration) -> str:

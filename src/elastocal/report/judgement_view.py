@@ -320,17 +320,6 @@ SHAPES = {
 }
 
 
-def noise_lines(result: Calibration) -> list[tuple[str, str]]:
-    summary = result.residual_summary
-    found = {
-        "Noise model": noise_model_line(result),
-        "Repeats": _repeats_line(result),
-        "Residuals": None if summary is None else shape_line(summary),
-        "In time": _in_time_line(result),
-    }
-    return [(label, text) for label, text in found.items() if text is not None]
-
-
 def does_noise_explain_it(result: Calibration) -> str:
     # Whether the weights come from a noise model with estimated variances.
     estimated = method_of(result) in ("reml", "constrained") and result.noise.estimated
@@ -426,7 +415,7 @@ def candidate_table(noise: Noise) -> say.ShownTable:
     return say.ShownTable(heads, rows, title="Noise models tried", note=note)
 
 
-def _repeats_line(result: Calibration) -> str | None:
+def repeats_line(result: Calibration) -> str | None:
     """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
     f = result.finding("lack_of_fit", "repeats_agree")
     if f is None:
@@ -490,7 +479,7 @@ def deviating_table(summary: ResidualSummary) -> say.ShownTable:
     return say.ShownTable(heads, rows)
 
 
-def _in_time_line(result: Calibration) -> str | None:
+def in_time_line(result: Calibration) -> str | None:
     """How alike the residuals of visits are that follow each other; None for few visits."""
     found = result.autocorrelation
     if found is None:

@@ -59,7 +59,7 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
             (), title="Poses and readings within the time",
         )  # fmt: skip
         yield say.Fold(timed.title, lambda: [timed], printed=True)
-    yield say.Fold("What the plan is worth", lambda: [say.Lines([*plan_lines(plan)])], printed=True)
+    yield say.Fold("What the plan is worth", lambda: [say.Lines(plan_lines(plan))], printed=True)
 
 
 def next_blocks(found: NextPoses) -> Iterator[say.Block]:
@@ -71,7 +71,7 @@ def next_blocks(found: NextPoses) -> Iterator[say.Block]:
         for name, value in zip(names, values, strict=True) if math.isfinite(value)
     ]  # fmt: skip
     title, axis = "Error before and after the batch", "rms error at the test poses"
-    yield say.Lines([*next_lines(found)])
+    yield say.Lines(next_lines(found))
     yield say.Fold("", lambda: [rows_of_dots("gain", title, rows, axis)], figures=("gain",))
     if found.plan is not None:
         yield from plan_blocks(found.plan)

@@ -18,6 +18,7 @@ from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.measurements import in_file_units, joint_columns, numbered
+from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import identification_view as fitted
 from elastocal.report.figures import NO_ENDS, rows_of_dots
@@ -330,7 +331,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
         )
         rows = [(name, column, unit or "–") for name, column, unit in seen["columns"]]
         yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
-        yield say.Lines([("Not used", listed(seen["unused"], 20))] if seen["unused"] else [])
+        yield say.Lines([("Not used", listed(seen["unused"], 20))])
     columns = found.columns
     first = range(min(FIRST_ROWS, len(found.table)))
     every = {n: [_cell(columns[n], i) for i in first] for n in columns if n != "note_source"}
@@ -436,16 +437,17 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
         )
     facts = [
         ("Robot", printable(result.model.chain.name)),
-        *fitted.joint_lines(result),
+        ("Joints", names_told(result.model.chain)),
         ("Instrument, standard deviations", noise),
         ("Readings", fitted.readings(result)),
         ("Loads", "; ".join(say.newtons(f) for f in measured_loads(result.observations))),
         ("Identified", fitted.what_was_identified(result)),
         ("Method", say.sentence(method_and_weights(result))),
-        *([("Expected error", fitted.at_new_poses(result.predicted))] if result.predicted else []),
-        *fitted.prediction_lines(result),
+        ("Expected error", fitted.at_new_poses(result.predicted)),
+        ("Prediction", fitted.prediction_line(result)),
     ]
-    yield say.ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
+    title = "What was calibrated, and by what"
+    yield say.ShownTable(("what", ""), say.Lines(facts).items, (0, 1), title=title)
 
 
 @dataclass(frozen=True)

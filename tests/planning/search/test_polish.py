@@ -19,8 +19,8 @@ from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_sp
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, ScenarioCriterion
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
-from elastocal.planning.polish import JointSearch, Searches, estimate, polish
 from elastocal.planning.relaxation import DesignProblem, relax
+from elastocal.planning.search import JointSearch, Searches, estimate, polish
 from elastocal.planning.setup import FeasiblePool, Setup
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
