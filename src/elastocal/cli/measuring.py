@@ -172,16 +172,9 @@ def _candidates(text: str) -> int | str | list[int | str]:
     },
 )
 def design(
-    cell: CellFile,
-    output: Output,
-    *,
-    asked: Asked,
-    program: list[Path] | None = None,
-    picture: Path | None = None,
-    cell_out: Path | None = None,
-    report: ReportFile = None,
-    run: Run,
-) -> None:
+    cell: CellFile, output: Output, *, asked: Asked, program: list[Path] | None = None,
+    picture: Path | None = None, cell_out: Path | None = None, report: ReportFile = None, run: Run,
+) -> None:  # fmt: skip
     """Which poses should I measure?
 
     Writes the plan (CSV) and plan.json beside it.  An interrupted run, started again with
@@ -385,18 +378,11 @@ def simulate(
     flags="json",
 )
 def import_(
-    files: Annotated[list[Path] | None, typer.Argument()] = None,
-    output: AnyOutput = None,
-    mapping: Annotated[Path | None, typer.Option("--map")] = None,
-    preset: list[str] | None = None,
-    show_preset: str | None = None,
-    preview: bool = False,
-    cell: Path | None = None,
-    length_unit: str | None = None,
-    angle_unit: str | None = None,
-    *,
-    run: Run,
-) -> None:
+    files: Annotated[list[Path] | None, typer.Argument()] = None, output: AnyOutput = None,
+    mapping: Annotated[Path | None, typer.Option("--map")] = None, preset: list[str] | None = None,
+    show_preset: str | None = None, preview: bool = False, cell: Path | None = None,
+    length_unit: str | None = None, angle_unit: str | None = None, *, run: Run,
+) -> None:  # fmt: skip
     """Convert exports of a laser tracker and joint logs to the measurement table.
 
     Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka

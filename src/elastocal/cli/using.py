@@ -269,21 +269,11 @@ GRID = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
 
 @command(verb=verbs.compensate, offers="frame point load seed", texts={"point": ("POINT", str)})
 def compensate(
-    cell: CellFile,
-    result: ResultFile,
-    targets: Annotated[Path | None, typer.Argument()] = None,
-    output: AnyOutput = None,
-    target: str | None = None,
-    near: str | None = None,
-    partial: bool = False,
-    table: Path | None = None,
-    grid: str = "5",
-    box: str | None = None,
-    rotation: str | None = None,
-    *,
-    asked: Asked,
-    run: Run,
-) -> None:
+    cell: CellFile, result: ResultFile, targets: Annotated[Path | None, typer.Argument()] = None,
+    output: AnyOutput = None, target: str | None = None, near: str | None = None,
+    partial: bool = False, table: Path | None = None, grid: str = "5", box: str | None = None,
+    rotation: str | None = None, *, asked: Asked, run: Run,
+) -> None:  # fmt: skip
     """Compute corrected joint commands for targets.
 
     Solves the calibrated arm under load for every target.  --table writes corrections that a
@@ -504,22 +494,16 @@ EVERY = 10.0  # s between plain lines of progress
 
 @command(short_help="Run many simulations on all cores or a cluster")
 def study(
-    folder: Path,
-    jobs: Annotated[int | None, typer.Option(min=1)] = None,
-    cluster: str | None = None,
-    tls_ca: Path | None = None,
-    tls_cert: Path | None = None,
-    tls_key: Path | None = None,
-    unencrypted: bool = False,
-    seed: Annotated[int | None, typer.Option(min=0)] = None,
-    set_: list[str] | None = None,
+    folder: Path, jobs: Annotated[int | None, typer.Option(min=1)] = None,
+    cluster: str | None = None, tls_ca: Path | None = None, tls_cert: Path | None = None,
+    tls_key: Path | None = None, unencrypted: bool = False,
+    seed: Annotated[int | None, typer.Option(min=0)] = None, set_: list[str] | None = None,
     output: AnyOutput = None,
     progress: Annotated[bool, typer.Option("--progress", show_default=False)] = True,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", "--no-progress")] = False,
-    only: Annotated[int | None, typer.Option(min=1)] = None,
-    restart: bool = False,
+    only: Annotated[int | None, typer.Option(min=1)] = None, restart: bool = False,
     retry_failed: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Run a study's tasks that have no result yet; after Ctrl-C the same command resumes.
 
     study.py in the folder is Python code and runs with your rights, here and on a cluster: run

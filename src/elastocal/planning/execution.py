@@ -434,16 +434,14 @@ class Stop:
 @dataclass(frozen=True)
 class Execution:
     """The stops in order, and the way home, through `home_via` (k, n), where there is a home.
-    `checked` moves were tried, `blocked` of them in the way of something.  `take_off`: the load
-    hangs on the arm after the last stop.  `drift`: what a steady drift does in this order."""
+    `take_off`: the load hangs on the arm after the last stop.  `drift`: what a steady drift does in
+    this order."""
 
     stops: tuple[Stop, ...]
     home_via: Array
     home_travel: float
     take_off: bool
     motion: Motion
-    checked: int
-    blocked: int
     drift: Drifting | None = None
 
     @property
@@ -520,19 +518,11 @@ def nearest_first(cost: Array) -> list[int]:
 
 
 def schedule(
-    q: Array,
-    motion: Motion,
-    checker: Feasibility,
-    *,
-    loads: Array | None = None,
-    read: BoolArray | None = None,
-    limits: tuple[Array, Array] | None = None,
-    via: Array | None = None,
-    alias: Alias | None = None,
-    paired: bool = False,
-    seed: int = 0,
+    q: Array, motion: Motion, checker: Feasibility, *, loads: Array | None = None,
+    read: BoolArray | None = None, limits: tuple[Array, Array] | None = None,
+    via: Array | None = None, alias: Alias | None = None, paired: bool = False, seed: int = 0,
     progress: Progress = lambda message: None,
-) -> Execution:
+) -> Execution:  # fmt: skip
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
 
     Every pose is visited under each of `loads` (L, 3) N (None: once, without load) in which it is
@@ -586,7 +576,5 @@ def _executed(
         home_travel=_time(moves, home),
         take_off=bool(moves.loaded[stops[-1].load]),
         motion=motion,
-        checked=moves.checked,
-        blocked=moves.blocked,
         drift=drift,
     )

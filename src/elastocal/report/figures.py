@@ -11,11 +11,12 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
     from matplotlib.figure import SubFigure
 
-    from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.diagnosis.diagnosis import Curve, Diagnosis
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
 
@@ -224,33 +225,7 @@ def waterfall(name: str, steps: say.Steps, floor: say.Floor) -> say.Figure:
 
 # Panels of points, lines and bands
 
-
-@dataclass(frozen=True)
-class Series:
-    """What a panel shows over x (n,): "dots"; the "mean" of y in bins of x, with twice its standard
-    error; a "band" between the two rows of y; else a line or marks as matplotlib writes them."""
-
-    how: str
-    x: Array
-    y: Array
-    colour: str = SERIES[0]
-    label: str = ""
-    size: float = 1.6
-    line: str = "-"
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Axes with labels; where `height` is given they reach as far above zero, which has a line, as
-    below it.  `ticks` are places of x and their names."""
-
-    x: str
-    y: str
-    series: Sequence[Series]
-    height: float | None = None
-    title: str = ""
-    note: str = ""
-    ticks: tuple[Sequence[float], Sequence[str]] | None = None
+Panel: TypeAlias = Callable[["Axes"], object]  # draws into its axes
 
 
 def panelled(
@@ -265,7 +240,7 @@ def panelled(
         for axes in grid[len(panels) :]:
             axes.set_visible(False)
         for axes, panel in zip(grid, panels, strict=False):
-            _panel(axes, panel)
+            panel(axes)
         legends = [axes.get_legend_handles_labels() for axes in grid]
         handles, labels = max(legends, key=lambda each: len(each[1]))
         if labels:
@@ -274,27 +249,15 @@ def panelled(
     return say.Figure(name, title, draw, height, caption)
 
 
-def _panel(axes: Axes, panel: Panel) -> None:
-    if panel.height is not None:
-        axes.axhline(0, color=FAINT, linewidth=0.8)
-        axes.set_ylim(-panel.height, panel.height)
-    for s in panel.series:
-        if s.how == "dots":
-            dots(axes, s.x, s.y, s.colour, s.size, s.label)
-        elif s.how == "band":
-            axes.fill_between(s.x, *s.y, color=s.colour, alpha=0.25, linewidth=0, label=s.label)
-        elif s.how == "mean":
-            axes.errorbar(*running_mean(s.x, s.y), color=s.colour, linewidth=1.4, elinewidth=0.8,
-                          linestyle=s.line, label=s.label)  # fmt: skip
-        else:
-            axes.plot(s.x, s.y, s.how, color=s.colour, linewidth=1.4, markersize=s.size,
-                      markeredgewidth=1.8, label=s.label)  # fmt: skip
-    axes.set(xlabel=panel.x, ylabel=panel.y)
-    axes.set_title(panel.title)
-    axes.text(0.01, 0.97, panel.note, transform=axes.transAxes, va="top", fontsize=8)
-    if panel.ticks is not None:
-        places, names = panel.ticks
-        axes.set_xticks(places, names, rotation=90 if max(map(len, names)) > 2 else 0)
+def level(axes: Axes, height: float) -> None:
+    """Axes that reach as far above zero, which has a line, as below it."""
+    axes.axhline(0, color=FAINT, linewidth=0.8)
+    axes.set_ylim(-height, height)
+
+
+def line(axes: Axes, x: Array, y: Array, how: str, colour: str, **more: Any) -> None:
+    size = {"markersize": 1.6, "markeredgewidth": 1.8} | more
+    axes.plot(x, y, how, color=colour, linewidth=1.4, **size)
 
 
 def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = "") -> None:
@@ -351,19 +314,21 @@ ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
 
 
 def unknown_curves(d: Diagnosis) -> say.Figure:
-    panels = []
-    for curve in d.curves:
+    def panel(axes: Axes, curve: Curve) -> None:
         wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
         high, y_unit = ORDINATE.get(curve.y_unit, (1.0, curve.y_unit))
         x, y, sd = wide * np.array(curve.x), high * np.array(curve.y), high * np.array(curve.sd)
-        band = np.stack([y - 2 * sd, y + 2 * sd])
-        panels.append(Panel(
-            f"{say.short_name(say.driver_name(curve.driver), LONGEST_ENTRY)} in {x_unit}",
-            f"{say.short_name(say.driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}",
-            [Series("-", x, np.zeros(len(x)), FAINT),
-             Series("band", x, band, label="± 2 standard deviations"),
-             Series("-", x, y, INK, "estimated shape")],
-        ))  # fmt: skip
+        line(axes, x, 0 * x, "-", FAINT)
+        axes.fill_between(x, y - 2 * sd, y + 2 * sd, color=SERIES[0], alpha=0.25, linewidth=0,
+                          label="± 2 standard deviations")  # fmt: skip
+        line(axes, x, y, "-", INK, label="estimated shape")
+        driver, entry = (
+            say.short_name(say.driver_name(name), LONGEST_ENTRY)
+            for name in (curve.driver, curve.entry)
+        )
+        axes.set(xlabel=f"{driver} in {x_unit}", ylabel=f"{entry} in {y_unit}")
+
+    panels = [partial(panel, curve=curve) for curve in d.curves]
     title = "Error curves of the joints" if d.groups else "Shape of the unknown dependence"
     caption = (
         "Motion of the arm beyond the model, as a smooth function of its driver. If the band "
@@ -409,23 +374,12 @@ def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
             for v in (moved + left, moved)
         )
         joint, table, lead = index(f.where), observed.table, observed.lead[good]
-        kind, series = model.chain.kinds[joint], list[Series]()
-        q, unit = _in_unit(kind, table.q[lead, joint])
         # From where the joint came, 0 where that is not known.
         came = np.zeros(len(lead))
         if table.approach is not None:
             came = np.sign(table.approach[lead, joint])
-        sides = np.unique(came)
-        for k, one in enumerate(sides):
-            own = came == one
-            told = "" if len(sides) == 1 else f" ({'from below' if one > 0 else 'from above'})"
-            series += [
-                Series("dots", q[own], seen[own], SERIES[k], f"readings{told}", 1.8),
-                Series("_", q[own], explained[own], SERIES[k], f"effect{told}", 9),
-            ]
-        height = reach(np.concatenate([seen, explained]))
-        motion = f"motion in {'µrad' if kind == 'revolute' else 'µm'}"
-        panels.append(Panel(f"joint in {unit}", motion, series, height, say.effect_at(f)))
+        each = model.chain.kinds[joint], table.q[lead, joint], came, seen, explained
+        panels.append(partial(_by_side, say.effect_at(f), *each))
     caption = (
         "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
         "each reading when all is fitted."
@@ -435,18 +389,40 @@ def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
         yield panelled("effects", title, panels, caption, 0.6 + 2.2 * len(panels))
 
 
+def _by_side(
+    title: str, kind: str, q: Array, came: Array, seen: Array, explained: Array, axes: Axes
+) -> None:
+    level(axes, reach(np.concatenate([seen, explained])))
+    (q, unit), sides = _in_unit(kind, q), np.unique(came)
+    for k, one in enumerate(sides):
+        own = came == one
+        told = "" if len(sides) == 1 else f" ({'from below' if one > 0 else 'from above'})"
+        dots(axes, q[own], seen[own], SERIES[k], 1.8, f"readings{told}")
+        line(axes, q[own], explained[own], "_", SERIES[k], markersize=9, label=f"effect{told}")
+    motion = f"motion in {'µrad' if kind == 'revolute' else 'µm'}"
+    axes.set(xlabel=f"joint in {unit}", ylabel=motion)
+    axes.set_title(title)
+
+
 def plan_curve(plan: Plan) -> say.Figure:
     n, value = (np.array([getattr(s, name) for s in plan.curve]) for name in ("poses", "value"))
     bound = np.array([math.nan if s.bound is None else s.bound for s in plan.curve])
-    series = [
-        Series("_--", n, bound, SERIES[1], "no plan can be better (on the pool)", 12),
-        Series("o-", n, value, label="best plan found", size=6),
-        Series("", n[:1], np.zeros(1)),  # zero is seen
-    ]
     name = "ρ₀" if plan.of_test_poses else plan.criterion
     unit = f" in {plan.unit}" if plan.unit else ""
-    panel = Panel("poses", f"{name}{unit}", series, ticks=(n.tolist(), [*map(str, n)]))
+
+    def panel(axes: Axes) -> None:
+        told = "no plan can be better (on the pool)"
+        line(axes, n, bound, "_--", SERIES[1], markersize=12, label=told)
+        line(axes, n, value, "o-", SERIES[0], markersize=6, label="best plan found")
+        line(axes, n[:1], np.zeros(1), "", SERIES[0])  # zero is seen
+        axes.set(xlabel="poses", ylabel=f"{name}{unit}")
+        _ticks(axes, n.tolist(), [*map(str, n)])
+
     return panelled("curve", "Criterion against the number of poses", [panel], "", 3.0)
+
+
+def _ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
+    axes.set_xticks(places, names, rotation=90 if max(map(len, names)) > 2 else 0)
 
 
 # Of residuals
@@ -500,46 +476,53 @@ class Residuals:
         x = np.argsort(order)[own] + 0.6 * (marker - (many - 1) / 2) / many
         several = 1 < many <= len(SERIES)
         every = range(0, len(labels), -(-len(labels) // MOST_LABELS))
-        ticks = list(every), [say.short_name(labels[i]) for i in every]
-        panels = []
-        for name, unit, values in zip(self.components, self.units, self.value.T, strict=True):
-            series = [
-                Series("dots", x[at], values[at], SERIES[m],
-                       say.short_name(table.marker_names[used[m]]) if several else "",
-                       2.6 if len(shown) <= 1500 else 1.6)
-                for m in range(many if several else 1)
-                for at in (shown[marker[shown] == m] if several else shown,)
-            ]  # fmt: skip
+
+        def panel(axes: Axes, name: str, unit: str, values: Array) -> None:
             height = reach(self.value[:, [u == unit for u in self.units]])
-            beyond = int((np.abs(values) > height).sum())
-            note, last = f"{beyond} beyond this axis" * bool(beyond), name == self.components[-1]
-            axis = "configuration" if last else ""
-            panels.append(Panel(axis, f"{name} in {unit}", series, height, note=note, ticks=ticks))
+            level(axes, height)
+            for m in range(many if several else 1):
+                at = shown[marker[shown] == m] if several else shown
+                label = say.short_name(table.marker_names[used[m]]) if several else ""
+                size = 2.6 if len(shown) <= 1500 else 1.6
+                dots(axes, x[at], values[at], SERIES[m], size, label)
+            axes.set_ylabel(f"{name} in {unit}")
+            if name == self.components[-1]:
+                axes.set_xlabel("configuration")
+            if beyond := int((np.abs(values) > height).sum()):
+                axes.text(0.01, 0.97, f"{beyond} beyond this axis", transform=axes.transAxes,
+                          va="top", fontsize=8)  # fmt: skip
+            _ticks(axes, every, [say.short_name(labels[i]) for i in every])
+
+        each = zip(self.components, self.units, self.value.T, strict=True)
+        panels = [partial(panel, name=n, unit=u, values=v) for n, u, v in each]
         caption = "Observed minus predicted, by configuration" + " and marker" * several + "."
         return panelled(
             "residuals", "Residuals by configuration, marker and direction", panels,
             caption + self._thinned(len(shown)), 0.7 + 1.3 * len(panels), columns=6, sharex=True,
         )  # fmt: skip
 
-    def _over(self, x: Array, shown: IntArray, size: float, *lines: str) -> list[Series]:
+    def _over(
+        self, axes: Axes, x: Array, shown: IntArray, size: float, lines: Sequence[str]
+    ) -> None:
         """Of positions over x (observations,): dots of the `shown`, running means of all."""
-        each = list(enumerate(self.lengths.T))
-        return [
-            *(Series("dots", x[shown], v[shown], SERIES[k], size=size) for k, v in each),
-            *(Series("mean", x, v, SERIES[k], self.components[k], line=lines[k % len(lines)])
-              for k, v in each),
-        ]  # fmt: skip
+        level(axes, reach(self.lengths))
+        for k, v in enumerate(self.lengths.T):
+            dots(axes, x[shown], v[shown], SERIES[k], size)
+        for k, v in enumerate(self.lengths.T):
+            axes.errorbar(*running_mean(x, v), color=SERIES[k], linewidth=1.4, elinewidth=0.8,
+                          linestyle=lines[k % len(lines)], label=self.components[k])  # fmt: skip
 
     def over_joints(self) -> say.Figure:
-        n, shown, height = self.lengths.shape[1], self.shown, reach(self.lengths)
+        n, shown = self.lengths.shape[1], self.shown
         if len(shown) * n > MOST_JOINT_DOTS:
             shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
-        panels = []
-        for j, kind in enumerate(self.kinds):
-            q, unit = _in_unit(kind, self.observed.table.q[self.observed.lead, j])
-            label = "" if j % 2 else "residual in µm"
-            series = self._over(q, shown, 1.3, "-")
-            panels.append(Panel(f"joint {j + 1} in {unit}", label, series, height))
+
+        def panel(axes: Axes, j: int) -> None:
+            q, unit = _in_unit(self.kinds[j], self.observed.table.q[self.observed.lead, j])
+            self._over(axes, q, shown, 1.3, "-")
+            axes.set(xlabel=f"joint {j + 1} in {unit}", ylabel="" if j % 2 else "residual in µm")
+
+        panels = [partial(panel, j=j) for j in range(len(self.kinds))]
         caption = (
             "Over joint positions; lines are means of equally many readings with twice their "
             "standard error. A wave or slope is an effect that the model lacks."
@@ -556,8 +539,11 @@ class Residuals:
         at, unit = self.observed.table.time[self.observed.lead] / 60, "min"
         if float(np.ptp(at)) > 180:
             at, unit = at / 60, "h"
-        series = self._over(at, self.shown, 1.5, "-", "--", ":")
-        panel = Panel(f"time in {unit}", "residual in µm", series, reach(self.lengths))
+
+        def panel(axes: Axes) -> None:
+            self._over(axes, at, self.shown, 1.5, ("-", "--", ":"))
+            axes.set(xlabel=f"time in {unit}", ylabel="residual in µm")
+
         caption = (
             "Over time; lines are means with twice their standard error. A slope is a drift, a "
             "step something that moved."
