@@ -21,7 +21,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from copy import copy
 from io import StringIO
 from itertools import pairwise
@@ -76,7 +76,8 @@ class Told(TyperGroup):
                     bool(word) or before == "--backend",  # empty like its variable: none is chosen
                     f"an empty argument{place} says nothing; give a value, or leave it out",
                 )
-            code = super().main(*args, **(extra | {"standalone_mode": False}))
+            how = extra | {"standalone_mode": False}
+            code = 0 if self._helped(words) else super().main(*args, **how)
         except (Exception, KeyboardInterrupt) as error:
             code = _ended(error)
         if code == INTERRUPTED:
@@ -96,6 +97,16 @@ class Told(TyperGroup):
             if isinstance(error, typer.Exit | typer.Abort) or hasattr(error, "show"):
                 raise  # typer's own, as a usage error
             raise typer.Exit(_ended(error, reading, len(interrupts) > before)) from None
+
+    def _helped(self, words: Sequence[str]) -> bool:
+        """Whether `words` are VERB --help, which is then shown.  As inherited it would wait for the
+        options before the verb, whose reading loads pydantic and CasADi (0.3 s)."""
+        if len(words) != 2 or words[0] not in self.commands or words[1] not in HELP:
+            return False
+        above = typer.Context(self, info_name="elastocal", **self.context_settings)
+        with suppress(typer.Exit):
+            self.commands[words[0]].make_context(words[0], [words[1]], parent=above)
+        return True
 
 
 app = typer.Typer(

@@ -3,7 +3,6 @@
 import gc
 import logging
 import os
-import sys
 from typing import Annotated
 
 # Many small matrices: a second thread of the linear algebra library only waits for the first.
@@ -21,7 +20,7 @@ from elastocal import __version__
 
 # Importing a command registers it.
 from elastocal.cli import measuring, using  # noqa: F401
-from elastocal.cli.app import HELP, app
+from elastocal.cli.app import app
 from elastocal.screen import close_streams, complain, prepare_streams, say
 
 # New containers between two searches for garbage in cycles.  Python's own 700 has every import and
@@ -46,8 +45,6 @@ def options(
     ] = None,
 ) -> None:
     """Calibrate industrial robot arms and explain what is left over."""
-    if sys.argv[-1] in HELP:
-        return  # which need not wait for pydantic and CasADi (0.3 s)
     from elastocal.model.evaluate import VARIABLE, checked, chosen_backend
 
     # By the environment, so that processes which a command starts choose the same.

@@ -301,16 +301,13 @@ def distal_placements(chain: Chain) -> list[Array]:
 
 
 def _carried(body: CarriedBody, cell: Cell, chain: Chain) -> Body:
-    solid = body.solid
-    if body.on == "base":
-        return Body(_moved(data_base(cell), solid), WORLD, "carried")
-    if body.on == "flange":
-        return Body(_moved(chain.flange_placement, solid), chain.n_joints - 1, "carried")
-    links = [f"link{i + 1}" for i in range(chain.n_joints)]
-    valid = ["base", *links, "flange"]
-    told = f"{cell.source}: [workspace] body '{solid.name}' is on '{body.on}'"
-    check_known(body.on, valid, told, "valid:")
-    return Body(solid, links.index(body.on), "carried")
+    places = {"base": (WORLD, data_base(cell))}
+    places |= {f"link{i + 1}": (i, np.eye(4)) for i in range(chain.n_joints)}
+    places["flange"] = chain.n_joints - 1, chain.flange_placement
+    told = f"{cell.source}: [workspace] body '{body.solid.name}' is on '{body.on}'"
+    check_known(body.on, places, told, "valid:")
+    carrier, T = places[body.on]
+    return Body(_moved(T, body.solid), carrier, "carried")
 
 
 def hanging(load: HangingLoad) -> Iterator[Body]:

@@ -173,11 +173,10 @@ class Moves:
         maps = (Roadmap(points, times, False, checker), Roadmap(points, times, True, checker))
         loaded, free = (forces != 0).any(axis=1), np.ones(sides.shape, dtype=bool)
         for roadmap in maps if signs is not None else ():
-            own = np.flatnonzero(loaded[load] == roadmap.loaded)
-            stretches = [[(int(side), int(leave[v])) for side in sides[v]] for v in own]
-            roadmap.check(move for both in stretches for move in both)
-            for v, both in zip(own, stretches, strict=True):
-                free[v] = [roadmap.check([move]) for move in both]
+            own = loaded[load] == roadmap.loaded
+            ends = np.broadcast_to(leave[own, None], sides[own].shape)
+            roadmap.check(zip(sides[own].ravel().tolist(), ends.ravel().tolist(), strict=True))
+            free[own] = np.isfinite(roadmap.direct[sides[own], ends])
         return cls(points, times, maps, loaded, home, signs, pose, load, leave, sides, free)
 
     @cached_property

@@ -26,7 +26,6 @@ from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import judgement_view as words
 from elastocal.report.figures import Residuals, uncertainty_map, waterfall
-from elastocal.report.judgement_view import judgement, warnings_beside
 from elastocal.text import listed, printable, some
 from elastocal.units import Array
 
@@ -52,12 +51,12 @@ def calibration_blocks(
     """An identification; `truth` and `published` (SI) stand beside the estimates."""
     budget = cache(lambda: gap_budget(result))
     yield say.Fold("", lambda: [_key(result, budget())])
-    yield judgement(result)
+    yield words.judgement(result)
     yield say.Lines([
         ("Error (rms)", error_line(result)),
         ("Expected", at_new_poses(result.predicted)),
         *(("Next", f.remedy) for f in next_steps(result)),
-        *warnings_beside(result),
+        *words.warnings_beside(result),
     ])  # fmt: skip
     yield say.Fold("", lambda: _error_figures(result, budget()), figures=("waterfall", "sureness"))
     yield parameter_table(result, truth, published)
