@@ -233,9 +233,8 @@ class Choice:
             )  # fmt: skip
             if read is not None:
                 setup = replace(setup, ways=cell.design.repeats * read)
-            elif cell.design.load_states == "chosen":
-                ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
-                setup = replace(setup, ways=ways)
+            else:
+                setup, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
             pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
             relaxed = prospects(setup.problem(pool, shares).balanced(), GAIN / 10)
         except InsufficientDataError:
@@ -407,9 +406,12 @@ def single_ways(information: PoseInformation) -> IntArray:
 
 def chosen_states(
     setup: Setup, q: Array, group: IntArray, shares: IntArray, progress: Progress
-) -> tuple[IntArray, LoadStates]:
-    """The ways (K, L) in which candidates q (N, n) are best read, and why."""
+) -> tuple[Setup, LoadStates | None]:
+    """With the ways (K, L) in which candidates q (N, n) are best read, and why, where the cell asks
+    for a choice of them."""
     information, cell = setup.information, setup.information.model.cell
+    if cell.design.load_states != "chosen":
+        return setup, None
     require(
         not cell.noise.configuration or cell.model.observe == "deflection",
         f"{cell.source}: [noise] configuration_um says that a pose's readings share an "
@@ -419,7 +421,7 @@ def chosen_states(
     if len(ways) == 1:
         one = "a deflection takes its reading without load and that under the only one"
         alone = "there is one load state"
-        return information.everything, LoadStates("all", one if ways.sum() > 1 else alone)
+        return setup, LoadStates("all", one if ways.sum() > 1 else alone)
     progress("load states of the poses")
     few = np.arange(0, len(q), max(len(q) // SOME, 1))
 
@@ -448,5 +450,5 @@ def chosen_states(
     figures = setup.criterion.figure(crossed), setup.criterion.figure(least)
     if least > (1 - SIMPLER) * crossed:
         why = "choosing them for each pose would hardly lower the error"
-        return information.everything, LoadStates("all", why, *figures)
-    return best, LoadStates("chosen", "", *figures)
+        return setup, LoadStates("all", why, *figures)
+    return replace(setup, ways=best), LoadStates("chosen", "", *figures)

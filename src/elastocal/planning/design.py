@@ -48,7 +48,6 @@ from elastocal.planning.plan import (
     CandidateCounts,
     Chance,
     Gain,
-    LoadStates,
     Plan,
     PlanSize,
     predicted,
@@ -253,10 +252,7 @@ class _Design:
         self.warnings += setup.warnings
         if pins is not None and len(pins.q):
             setup = replace(setup, pinned=setup.pool(pins.q, pinned_at))
-        self.states: LoadStates | None = None
-        if self.cell.design.load_states == "chosen":
-            ways, self.states = chosen_states(setup, q, group, shares, progress)
-            setup = replace(setup, ways=ways)
+        setup, self.states = chosen_states(setup, q, group, shares, progress)
         pool = setup.pool(q, group)
         if cap := self.cell.design.cap:
             state = self.checkpoint.finished(
