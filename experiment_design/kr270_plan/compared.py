@@ -18,11 +18,11 @@ from elastocal.identification.options import Options
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, shares_of
-from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, plan_forces
 from elastocal.planning.plan import Plan
+from elastocal.planning.search import Checkpoint
 from elastocal.planning.setup import set_up
 from elastocal.planning.test_poses import test_poses
 from elastocal.simulation import simulate, values_from
