@@ -56,7 +56,6 @@ _VARIABLES = {
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "elastocal",
-    "font.family": "sans-serif",
     "font.size": 10.5,
     "text.parse_math": False,  # names from files are not formulas
     "text.color": INK,
@@ -69,8 +68,6 @@ _STYLE: dict[str, Any] = {
     "axes.facecolor": "none",
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.unicode_minus": True,
-    "axes.prop_cycle": None,
     "grid.color": GRID,
     "grid.linewidth": 0.6,
     "xtick.color": FAINT,
