@@ -252,7 +252,7 @@ def level(axes: Axes, height: float) -> None:
     axes.set_ylim(-height, height)
 
 
-def line(axes: Axes, x: Array, y: Array, how: str, colour: str, **more: Any) -> None:
+def stroke(axes: Axes, x: Array, y: Array, how: str, colour: str, **more: Any) -> None:
     size = {"markersize": 1.6, "markeredgewidth": 1.8} | more
     axes.plot(x, y, how, color=colour, linewidth=1.4, **size)
 
@@ -315,10 +315,10 @@ def unknown_curves(d: Diagnosis) -> say.Figure:
         wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
         high, y_unit = ORDINATE.get(curve.y_unit, (1.0, curve.y_unit))
         x, y, sd = wide * np.array(curve.x), high * np.array(curve.y), high * np.array(curve.sd)
-        line(axes, x, 0 * x, "-", FAINT)
+        stroke(axes, x, 0 * x, "-", FAINT)
         axes.fill_between(x, y - 2 * sd, y + 2 * sd, color=SERIES[0], alpha=0.25, linewidth=0,
                           label="± 2 standard deviations")  # fmt: skip
-        line(axes, x, y, "-", INK, label="estimated shape")
+        stroke(axes, x, y, "-", INK, label="estimated shape")
         driver, entry = (
             say.short_name(say.driver_name(name), LONGEST_ENTRY)
             for name in (curve.driver, curve.entry)
@@ -395,7 +395,7 @@ def _by_side(
         own = came == one
         told = "" if len(sides) == 1 else f" ({'from below' if one > 0 else 'from above'})"
         dots(axes, q[own], seen[own], SERIES[k], 1.8, f"readings{told}")
-        line(axes, q[own], explained[own], "_", SERIES[k], markersize=9, label=f"effect{told}")
+        stroke(axes, q[own], explained[own], "_", SERIES[k], markersize=9, label=f"effect{told}")
     motion = f"motion in {'µrad' if kind == 'revolute' else 'µm'}"
     axes.set(xlabel=f"joint in {unit}", ylabel=motion)
     axes.set_title(title)
@@ -409,9 +409,9 @@ def plan_curve(plan: Plan) -> say.Figure:
 
     def panel(axes: Axes) -> None:
         told = "no plan can be better (on the pool)"
-        line(axes, n, bound, "_--", SERIES[1], markersize=12, label=told)
-        line(axes, n, value, "o-", SERIES[0], markersize=6, label="best plan found")
-        line(axes, n[:1], np.zeros(1), "", SERIES[0])  # zero is seen
+        stroke(axes, n, bound, "_--", SERIES[1], markersize=12, label=told)
+        stroke(axes, n, value, "o-", SERIES[0], markersize=6, label="best plan found")
+        stroke(axes, n[:1], np.zeros(1), "", SERIES[0])  # zero is seen
         axes.set(xlabel="poses", ylabel=f"{name}{unit}")
         _ticks(axes, n.tolist(), [*map(str, n)])
 
