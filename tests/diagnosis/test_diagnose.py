@@ -24,6 +24,7 @@ from support.registered import forgotten, write_example
 import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell.arm_description import CartesianNoise
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins
 
@@ -33,7 +34,7 @@ IMITATED = {
     "payload_error:load": ("link_mass_error", "link3"),
     "off_axis_compliance:joint3": ("link_bending", "link2"),
 }
-RIPPLE = "gear_ripple:joint5"
+RIPPLE, DRIVEN = "gear_ripple:joint5", "thermal_expansion:link2"
 PLAIN = [k for k in FAULTS if k not in (*IMITATED, RIPPLE)]
 
 
@@ -45,7 +46,7 @@ def named(d: Diagnosis) -> set[tuple[str, str]]:
     return {(e.effect, e.where) for e in d.effects}
 
 
-@pytest.mark.parametrize("name", sometimes(PLAIN, "thermal_expansion:link2"))
+@pytest.mark.parametrize("name", sometimes(PLAIN, DRIVEN))
 def test_an_effect_is_named_with_its_place_size_and_time(name: str) -> None:
     """And the gap falls step by step to the noise; no reading is taken for faulty beside it."""
     d, fault = diagnosed(name), FAULTS[name]
@@ -72,6 +73,15 @@ def test_an_effect_is_named_with_its_place_size_and_time(name: str) -> None:
     # Three axes of tracker noise, and what the joints' scatter adds.
     assert np.sqrt(3) * SIGMA < 1.1 * rms[-1] and rms[-1] < 3 * np.sqrt(3) * SIGMA
     assert d.noise.faulty == ()
+
+
+def test_an_interval_holds_the_values_at_other_likely_time_constants() -> None:
+    (model, table), (found,) = campaign(DRIVEN), diagnosed(DRIVEN).effects
+    (p,) = found.parameters
+    for tau in found.settings["time_constant_s"] * np.array([0.8, 1.25]):
+        spec = model.cell.model.with_effect(*FAULTS[DRIVEN].key, {"time_constant_s": tau})
+        fit = fit_baseline(Model.assembled(model.chain, replace(model.cell, model=spec)), table)
+        assert abs(fit.x[fit.model.names.index(p.name)] - p.value) < 1.96 * p.std
 
 
 def test_a_ripple_is_named_with_its_order_and_amplitude() -> None:

@@ -168,20 +168,9 @@ WRONG_DH = {
         "line 2, column lower_m: the joint is revolute; leave this blank and give.*rad or deg",
     ),
 }
-
-
-@pytest.mark.parametrize("text, message", WRONG_DH.values(), ids=WRONG_DH.keys())
-def test_wrong_tables_are_explained(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "dh.csv"
-    path.write_text(text)
-    with pytest.raises(InputError, match=message) as caught:
-        read_dh(path)
-    assert str(path) in str(caught.value)
-
-
 MASSES = "link,mass_kg,com_x_m,com_y_m,com_z_m\n"
 ALL = "".join(f"{i},1,0,0,0\n" for i in range(1, 7))
-WRONG_MASSES = {
+WRONG = WRONG_DH | {
     "unknown link": (MASSES + "link7,1,0,0,0\n", r"line 2, column link: unknown link 'link7'"),
     "twice": (MASSES + ALL + "link2,1,0,0,0\n", "line 8, column link: 'link2' appears twice"),
     "missing": (MASSES + ALL[: -2 * len("6,1,0,0,0\n")], "no row for link5, link6"),
@@ -192,13 +181,13 @@ WRONG_MASSES = {
 }
 
 
-@pytest.mark.parametrize("text, message", WRONG_MASSES.values(), ids=WRONG_MASSES.keys())
-def test_wrong_masses_are_explained(tmp_path: Path, text: str, message: str) -> None:
-    masses = tmp_path / "masses.csv"
-    masses.write_text(text)
+@pytest.mark.parametrize("text, message", WRONG.values(), ids=WRONG.keys())
+def test_wrong_tables_are_explained(tmp_path: Path, text: str, message: str) -> None:
+    path, dh = tmp_path / "wrong.csv", write(tmp_path / "dh.csv", HEADER, UR5)
+    path.write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        read_dh(write(tmp_path / "dh.csv", HEADER, UR5), masses_path=masses)
-    assert str(masses) in str(caught.value)
+        read_dh(dh, masses_path=path) if "mass_kg" in text else read_dh(path)
+    assert str(path) in str(caught.value)
 
 
 # --- tables as people write them
