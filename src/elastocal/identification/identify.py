@@ -335,7 +335,10 @@ def _estimates(
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     solution, model = method.solution, method.solution.problem.model
     reduction, x, dof = solution.reduction, solution.fit.x, method.spread.dof
-    bends = bent(solution, method.spread.matrix)
+    held = np.zeros(len(model.parameters))
+    if (known := method.functions) is not None:
+        held[known.columns] = known.sigma / known.std
+    bends = bent(solution, method.spread.matrix, held[reduction.kept])
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
@@ -351,11 +354,11 @@ def _estimates(
             partners[d].append(parameter.name)
         if terms:
             shares = {parameter.name: 1.0} | {model.names[d]: f for d, f in terms.items()}
-            held = {model.names[d]: float(x[d]) for d in terms}
-            combination = Combination(shares, parameter.unit, value, spread, ci, held)
+            absorbed = {model.names[d]: float(x[d]) for d in terms}
+            combination = Combination(shares, parameter.unit, value, spread, ci, absorbed)
             combinations.append(combination)
             note = f"only as {combination.expression}"
-            found[int(c)] = estimate(c, combined_with=tuple(held), note=note)
+            found[int(c)] = estimate(c, combined_with=tuple(absorbed), note=note)
         else:
             found[int(c)] = estimate(c, value=value, std=spread, ci95=ci, dof=float(dof[k]))
     invisible = set(reduction.invisible.tolist())

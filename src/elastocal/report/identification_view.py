@@ -199,6 +199,8 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
 def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, findings.ALONE)), len(result.combinations)
     text = f"{alone} of {say.counted(len(result.ordinary), 'parameter')}"
+    if (tied := result.finding("mostly_prior")) is not None:
+        text += f", {len(tied.numbers['parameters'])} of them mostly by their prior"
     if n:
         absorbed = len(names_of(result, findings.ABSORBED))
         text += (
