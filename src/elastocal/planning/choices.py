@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import ElastocalError, InsufficientDataError, require
+from elastocal.errors import InsufficientDataError, require
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
@@ -314,7 +314,7 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
     for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):
         choice.progress(f"within {minutes:.4g} minutes: {repeats} readings each")
         read = found[-1].read if found else None
-        with suppress(ElastocalError):
+        with suppress(InsufficientDataError):
             found += _fitting(choice, cell, minutes, drawn, repeats, read)
         values = [fit.value for fit in found]
         if len(found) > WORSE and min(values[-WORSE:]) > min(values):
