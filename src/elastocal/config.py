@@ -45,7 +45,7 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.above import ByValue
 from elastocal.errors import GONE, InputError, require
-from elastocal.files import check_exists, check_nesting, read_text
+from elastocal.files import DEEPEST, check_exists, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array, rotation_from_rpy, to_si
 
@@ -55,6 +55,13 @@ FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is chec
 UNIT_SUFFIX = re.compile(
     r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"
     r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
+)
+# A key of DEEPEST parts where a key may begin, for which tomllib takes time that grows with their
+# square.
+_DOTTED = re.compile(
+    r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.)"""
+    rf"{{{DEEPEST - 1}}}",
+    re.MULTILINE,
 )
 JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(.+)_(deg|rad|mm|m)", re.ASCII)
@@ -244,7 +251,12 @@ def tables_in(kind: Any) -> list[tuple[Any, bool]]:
 def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """The parsed TOML file of at most `max_bytes`; `what` names it in messages."""
     text = read_text(path, what, max_bytes)
-    check_nesting(path, text)
+    if found := _DOTTED.search(text):
+        line = text.count("\n", 0, found.end()) + 1
+        raise InputError(
+            f"{path}, line {line}: nested more than {DEEPEST} deep; no key needs more than a few "
+            "levels, so check the dots there"
+        )
     try:
         return tomllib.loads(text)
     except RecursionError:

@@ -26,13 +26,6 @@ from elastocal.text import SHOWN
 UNFINISHED = ".tmp"
 # Elements within each other, and parts of a dotted key: a file that people write has six.
 DEEPEST = 32
-# A key of that many parts where a key may begin, for which tomllib takes time that grows with their
-# square.
-_DOTTED = re.compile(
-    r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.)"""
-    rf"{{{DEEPEST - 1}}}",
-    re.MULTILINE,
-)
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
@@ -147,16 +140,6 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
         raise InputError(f"{path}: not JSON ({error}); {remedy}") from None
     except RecursionError:
         raise InputError(f"{path}: lists within lists without end; {remedy}") from None
-
-
-def check_nesting(path: str | Path, text: str) -> None:
-    """Raise InputError, naming the line, where a key of the TOML `text` has DEEPEST parts."""
-    if found := _DOTTED.search(text):
-        line = text.count("\n", 0, found.end()) + 1
-        raise InputError(
-            f"{path}, line {line}: nested more than {DEEPEST} deep; no key needs more than a few "
-            "levels, so check the dots there"
-        )
 
 
 def decoded(

@@ -164,14 +164,8 @@ def simulate(
     Raises ElastocalError where a pose has no static equilibrium.
     """
     rng = np.random.default_rng(rng)
-    if noise:
-        return _unsteady(model, rows, x, rng)
-    return _read(model, rows, x, rng, False)
-
-
-def _unsteady(model: Model, rows: Measurements, x: Array, rng: np.random.Generator) -> Measurements:
-    """Readings of joints that settle anew at each visit and of configurations that are off as a
-    whole, by a base or tracker that drifts."""
+    if not noise:
+        return _read(model, rows, x, rng, False)
     cell, n_joints, visit = model.cell, model.chain.n_joints, visits(rows)
     settled, scatter = rows, cell.noise.of_joints(n_joints)
     if scatter.any():

@@ -125,7 +125,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
         told = f"{folder}: holds no {name}; a study has one, with its {what}"
         require((folder / name).is_file(), told)
     path, whole = folder / "study.toml", folder.resolve()
-    stated = checked(StudyFile, read_toml(path, "study file", 1_000_000), path)
+    stated = checked(StudyFile, read_toml(path, "study file"), path)
     for name in stated.columns:
         require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
     chosen = _with_options(path, stated.options, options)

@@ -778,7 +778,4 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
 
 
 def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
-    names = (given,) if isinstance(given, str) else tuple(given)
-    for each in names:
-        require(isinstance(each, str), f"{option(name)} takes names; found {quoted(each)}")
-    return names
+    return (given,) if isinstance(given, str) else tuple(given)

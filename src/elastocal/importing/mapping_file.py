@@ -151,7 +151,6 @@ class MappingTable(Table):
 
 # Reads a mapping file and the presets: TOML → checked tables, the user's keys on top.
 
-MAX_BYTES = 1_000_000
 # A key of [source.columns] with its unit cut off: what two keys for the same column share.
 _UNIT = re.compile(r"_[A-Za-z]+$")
 
@@ -175,7 +174,7 @@ def read_mapping(
     options = f"{option('length_unit')}, {option('angle_unit')}"
     checked(MappingTable, {"units": given}, options)
     where = option("presets") if path is None else str(path)
-    data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file", MAX_BYTES)
+    data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file")
     if presets and data.get("source"):
         raise InputError(
             f"{where}: has [[source]] tables, so {option('presets', presets[0])} has no place; "
