@@ -202,11 +202,14 @@ def assemble(
 def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str]]:
     names, q = points.texts.get("configuration"), points.q
     if names is None:
-        known, codes, firsts = Labels.of(map(tuple, q.tolist())), list[int](), list[Array]()
+        known, codes = Labels.of(map(tuple, q.tolist())), list[int]()
+        firsts, n = np.empty_like(q), 0  # of each configuration, and how many there are
         for row in q[np.unique(known.codes, return_index=True)[1]]:
-            near = (np.abs(np.reshape(firsts, (-1, q.shape[1])) - row) <= spread).all(axis=1)
-            codes.append(int(np.argmax(near)) if near.any() else len(firsts))
-            firsts += [] if near.any() else [row]
+            near = (np.abs(firsts[:n] - row) <= spread).all(axis=1)
+            codes.append(int(np.argmax(near)) if near.any() else n)
+            if not near.any():
+                firsts[n] = row
+                n += 1
         return [str(codes[code] + 1) for code in known.codes], []
     known = Labels.of(names)
     low = np.full((len(known.names), q.shape[1]), np.inf)
