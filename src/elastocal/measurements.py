@@ -624,11 +624,8 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
     """Write the table as CSV, or Parquet where the ending says so (.parquet, .pq); it reads back
     bit for bit.  Whole or not at all."""
     for name in (*measurements.configuration_labels, *measurements.marker_names):
-        if not is_label(name):
-            raise InputError(
-                f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
-                "its ends"
-            )
+        told = "cannot stand in a table; use one line without blanks at its ends"
+        require(is_label(name), f"label {quoted(name)} {told}")
     columns = measurements.columns()
     infinite = {header for header, values in columns.items()
                 if values.dtype != object and not np.isfinite(values).all()}  # fmt: skip

@@ -203,10 +203,8 @@ def check_registered(thing: object, base: type, what: str, example: str) -> None
     if isinstance(thing, type) and issubclass(thing, base):
         raise InputError(f"register {what}, {thing.__name__}(), not its class")
     kind = type(thing)
-    if not isinstance(thing, base):
-        raise InputError(
-            f"{what} is an object of a class derived from {base.__name__}; found {kind.__name__}"
-        )
+    told = f"{what} is an object of a class derived from {base.__name__}; found {kind.__name__}"
+    require(isinstance(thing, base), told)
     name = getattr(thing, "name", None)
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
         raise InputError(

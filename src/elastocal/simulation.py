@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.errors import InputError, option
+from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements, visits, with_moves
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Conditions, random_table
@@ -126,11 +126,8 @@ def expand_plan(
     """
     forces = [plan.force]
     if load is not None:
-        if np.any(plan.force != 0):
-            raise InputError(
-                f"{plan.source}: the plan has forces of its own; leave {option('load')} away "
-                "or drop them"
-            )
+        told = f"the plan has forces of its own; leave {option('load')} away or drop them"
+        require(not plan.force.any(), f"{plan.source}: {told}")
         forces = [plan.force, plan.force + load]
     stated = plan.marker_names == marker_names and plan.marker.any()
     parts = [

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO
 
 import numpy as np
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
 from elastocal.files import atomic_write, check_size, decoded, open_input
 from elastocal.text import (
     cell_meaning,
@@ -264,11 +264,8 @@ def match_columns(
     `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
     """
     for i, text in enumerate(header, start=1):
-        if not text:
-            raise InputError(
-                f"{source}: column {i} of {len(header)} has no name in the header; name it or "
-                "remove the separator too many"
-            )
+        told = "has no name in the header; name it or remove the separator too many"
+        require(bool(text), f"{source}: column {i} of {len(header)} {told}")
     for text, times in Counter(header).items():
         if times > 1:
             raise InputError(f"{source}: column {quoted(text)} appears {times} times; keep one")
@@ -518,10 +515,8 @@ def _read(
     marks: dict[str, str] = {}
     while some := list(islice(rows, ROWS_AT_ONCE)):
         found += [number for number, _ in some]
-        if len(found) > MAX_ROWS:
-            raise InputError(
-                f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
-            )
+        told = f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
+        require(len(found) <= MAX_ROWS, told)
         for cells in (cells for _, cells in some if not "".join(cells).isascii()):
             for i in columns:  # of numbers alone: labels stay as they are written
                 cells[i] = plain_minus(cells[i])

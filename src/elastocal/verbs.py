@@ -689,11 +689,9 @@ def _targets(
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
     placed = oriented or (found.ndim == 2 and found.shape[1] == 3)
-    if not (placed and len(found) and np.isfinite(found).all()):
-        raise InputError(
-            f"{option('targets')} takes positions (n, 3) in m, poses (n, 4, 4) or a file; found an "
-            f"array of shape {np.shape(targets)}"
-        )
+    right = placed and len(found) > 0 and bool(np.isfinite(found).all())
+    told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found an array of shape"
+    require(right, f"{option('targets')} {told} {np.shape(targets)}")
     if oriented:
         return targets_at("targets", found[:, :3, 3], found[:, :3, :3], frame, force)
     return targets_at("targets", found, None, frame, force)

@@ -24,13 +24,9 @@ from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing import joining
 from elastocal.importing.exports import FORCES, Records, joint_stems, read_records
 from elastocal.importing.joining import Joined
-from elastocal.importing.mapping_file import (
-    LoadStatesTable,
-    MappingTable,
-    SourceTable,
-)
+from elastocal.importing.mapping_file import LoadStatesTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
-from elastocal.model.chain import joint_limits
+from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
@@ -157,11 +153,8 @@ def assemble(
     settings, n = mapping.join, len(points)
     numbers, units = dict(points.numbers), dict(points.units)
     stems = joint_stems(numbers)
-    if not stems:
-        raise InputError(
-            f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
-            'role = "joints"'
-        )
+    told = 'map q1_deg … in [source.columns], or add a [[source]] with role = "joints"'
+    require(bool(stems), f"{where}: no joint values; {told}")
     kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
     forces = forces_of(where, points, mapping.loads)
     if forces is not None:
@@ -306,31 +299,22 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
 SLACK = 1e-6  # rad or m beyond a limit that rounding explains
 
 
-def against_cell(
-    cell: Cell, table: Measurements, columns: Columns, spherical: bool
-) -> tuple[NominalFit | None, str]:
-    """The fit to the nominal arm (None without positions or with few poses), and why the cell's
-    limits refuse the table ("" where they do not).
-
-    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
-    """
-    chain = load_chain(cell)
+def beyond_limits(cell: Cell, chain: Chain, table: Measurements, columns: Columns) -> str:
+    """Why the limits of the cell refuse the table; "" where they do not."""
     lower, upper = joint_limits(cell, chain)
     beyond = (table.q < lower - SLACK) | (table.q > upper + SLACK)
-    refused = ""
-    if beyond.any():
-        rows = np.flatnonzero(beyond.any(axis=1))
-        i, j = int(rows[0]), int(np.argmax(beyond[rows[0]]))
-        revolute = chain.kinds[j] == "revolute"
-        factor, unit = (180 / np.pi, "°") if revolute else (1e3, " mm")
-        refused = (
-            f"{columns['note_source'][i]}: joint{j + 1} ({chain.joints[j].name}) at "
-            f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
-            f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} ({len(rows)} of "
-            f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
-            "the limits of the cell"
-        )
-    return nominal_fit(chain, cell, table, spherical), refused
+    if not beyond.any():
+        return ""
+    rows = np.flatnonzero(beyond.any(axis=1))
+    i, j = int(rows[0]), int(np.argmax(beyond[rows[0]]))
+    factor, unit = (180 / np.pi, "°") if chain.kinds[j] == "revolute" else (1e3, " mm")
+    return (
+        f"{columns['note_source'][i]}: joint{j + 1} ({chain.joints[j].name}) at "
+        f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
+        f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} ({len(rows)} of "
+        f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
+        "the limits of the cell"
+    )
 
 
 @dataclass(frozen=True)
@@ -361,7 +345,8 @@ def import_files(
     `name`: what messages call the table.  Nothing is written.
     """
     where, table = mapping
-    names = () if cell is None else tuple(joint.name for joint in load_chain(cell).joints)
+    chain = None if cell is None else load_chain(cell)
+    names = () if chain is None else tuple(joint.name for joint in chain.joints)
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
     spherical = False
@@ -385,12 +370,11 @@ def import_files(
     by_role, warnings = with_loads_of_names(by_role, table.loads)
     points = joining.pooled(by_role["points"])
     log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
-    if log is not None and not log.q.shape[1]:
-        raise InputError(
-            f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
-        )
-    joined = None if log is None else joining.join(points, log, table.join)
-    if log is not None and joined is not None:
+    joined = None
+    if log is not None:
+        told = "map q1_deg … (or q#_deg) in its [source.columns]"
+        require(log.q.shape[1] > 0, f"{log.files[0]}: no joint values; {told}")
+        joined = joining.join(points, log, table.join)
         points = _with_joint_values(points, log, joined)
     columns, kinds, doubts = assemble(where, points, table)
     # Numbers with the digits that read back exactly.
@@ -401,7 +385,7 @@ def import_files(
     try:  # as the reader of `identify` reads it, and as the cell asks for it
         measured = read_measurements(
             f"{name} (not written)",
-            joint_kinds=kinds if cell is None else load_chain(cell).kinds,
+            joint_kinds=kinds if chain is None else chain.kinds,
             marker_names=() if cell is None else tuple(cell.tool.markers),
             observe=observe if cell is None else cell.model.observe,
             text=text,
@@ -410,16 +394,16 @@ def import_files(
         row = int(line[1]) - 2 if (line := re.search(r"line (\d+)", str(error))) else -1
         told = f" (from {points.where(row)})" if 0 <= row < len(points) else ""
         raise InputError(f"{error}{told}") from None
-    fit, refused = (
-        against_cell(cell, measured, columns, spherical) if cell is not None else (None, "")
-    )
+    fit, refused = None, ""
+    if cell is not None and chain is not None:
+        refused = beyond_limits(cell, chain, measured, columns)
+        fit = nominal_fit(chain, cell, measured, spherical)
     warnings += [
         *(() if joined is None else joined.warnings),
         *doubts,
         *plausibility(columns, measured, None if cell is None else cell.model.observe),
     ]
-    if fit is not None and fit.warning:
-        warnings.append(fit.warning)
+    warnings += [fit.warning] if fit is not None and fit.warning else []
     return Imported(
         tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
     )
@@ -446,8 +430,6 @@ def _assigned(
     A file goes to the first source whose `files` pattern fits its name; sources without a pattern
     share the rest: one takes them all, several take one file each, in order.
     """
-    if not files:
-        raise InputError("no files to import; name the tracker's export and the joint log")
     chosen: dict[int, SourceTable] = {}
     for i, path in enumerate(files):
         if path in files[:i]:

@@ -21,12 +21,7 @@ import numpy as np
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
-from elastocal.importing.mapping_file import (
-    ColumnKey,
-    SourceTable,
-    TextSourceKeys,
-    UnitsTable,
-)
+from elastocal.importing.mapping_file import ColumnKey, SourceTable, TextSourceKeys, UnitsTable
 from elastocal.tables import MAX_LINE, NUMBER, column, first_bad_cell
 from elastocal.text import listed, quoted
 from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
@@ -57,11 +52,8 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
     data = read_bytes(path, "export", MAX_BYTES)
     if not data.strip():
         raise InputError(f"{source}: empty file; export it again")
-    if data.startswith(_BINARY):
-        raise InputError(
-            f"{source}: is a workbook, bag, archive or other binary file; export its table as text "
-            "(CSV)"
-        )
+    told = "is a workbook, bag, archive or other binary file; export its table as text (CSV)"
+    require(not data.startswith(_BINARY), f"{source}: {told}")
     text, name = _decode(source, data, encoding)
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
@@ -93,11 +85,9 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
     if pattern is None:
         return None
     expression = compiled(where, "unit_comment", pattern)
-    if "unit" not in expression.groupindex:
-        raise InputError(
-            f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
-            "that is the unit so"
-        )
+    told = "has no group (?P<unit>…); name the part that is the unit so"
+    named = "unit" in expression.groupindex
+    require(named, f"{where}: unit_comment = {quoted(pattern)} {told}")
     found = (match["unit"] for text in comments if (match := expression.search(text)))
     return next((unit for unit in found if unit and known_unit(unit)), None)
 
@@ -467,11 +457,9 @@ class Records:
 
     def clock(self, how: str) -> Array:
         """(n,) s on the file's clock, by which rows are to be joined."""
-        if "time" not in self.numbers:
-            raise InputError(
-                f"{self.source}: no times, by which [join] is to join by {how}; map time_s or "
-                "time_text in [source.columns], or join by order or name"
-            )
+        told = "map time_s or time_text in [source.columns], or join by order or name"
+        told = f"{self.source}: no times, by which [join] is to join by {how}; {told}"
+        require("time" in self.numbers, told)
         return self.numbers["time"]
 
     @property

@@ -485,11 +485,8 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
 def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     names = _names_of(log)
     for pool, has in ((log, bool(names)), (points, "configuration" in points.texts)):
-        if not has:
-            raise InputError(
-                f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
-                "configuration in [source.columns], and a pattern in [source.names]"
-            )
+        told = "map name or configuration in [source.columns], and a pattern in [source.names]"
+        require(has, f"{pool.files[0]}: no names of poses, by which [join] is to join; {told}")
     q, row = log.q, np.full(len(points), -1)
     key = _keys(points.texts["configuration"], names) or _key
     unused: set[int] = set(range(len(log)))

@@ -184,11 +184,8 @@ def read_mapping(
     if presets:
         data = {**data, "source": [{"preset": name} for name in presets]}
     checked(MappingTable, data, where)
-    if not data.get("source"):
-        raise InputError(
-            f'{where}: no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or '
-            f"give {option('presets')}"
-        )
+    told = f'no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or give'
+    require(bool(data.get("source")), f"{where}: {told} {option('presets')}")
     merged = {"source": [_with_preset(where, s) for s in data["source"]]}
     table = checked(MappingTable, data | merged | {"units": data.get("units", {}) | given}, where)
     for k, source in enumerate(table.source or ()):
