@@ -31,25 +31,20 @@ from elastocal.plugins import load_plugins
 CELL = f"""\
 [robot]
 urdf = "{KR270}"
-
 [tool.markers_m]
 M1 = [0.25, 0.0, 0.0]
 M2 = [-0.10, 0.20, 0.1118]
 M3 = [-0.10, -0.20, 0.1118]
-
 [tracker]
 position_m = [3.5, -2.0, 0.6]
 sigma_um = 10
-
 [model]
 effects = ["base_frame", "joint_offset", "marker_position"]
-
 [design]
 poses = 8
 candidates = 40
 criterion = "D"
 interest = ["joint_offset"]
-
 [plugins]
 modules = ["three_lobes.py"]
 """

@@ -36,6 +36,7 @@ def test_what_imitates_a_withheld_effect_of_many_is_not_sure() -> None:
 def test_noise_of_poses_is_nothing() -> None:
     why = diagnosed("pose_noise_claimed")
     assert why.verdict == "nothing_significant" and not why.effects
+    assert "measure more poses" in why.findings[0].remedy  # nothing would have been seen
     assert why.probability_nothing > max(c.probability for c in why.candidates)
 
 

@@ -6,11 +6,11 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from support.calibration import PLACED, cell_of, measured, planar_chain, table_at
-from support.cells import kr270_cell, kr270_chain, random_table
+from support.cells import kr270_cell, kr270_chain, random_poses, random_table
 from support.stick import model as of_stick
 from support.stick import stick
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
@@ -120,6 +120,18 @@ def test_nothing_is_claimed_where_there_are_no_curves():
         assert any(part.group.name in told for told in fit.warnings)
         note = fit[model.names[part.group.columns[0, 0]]].note
         assert "do not show" in note
+
+
+def test_what_readings_do_not_show_is_known_by_its_size() -> None:
+    """Not by how a nearly free exchange of two parameters bends the readings."""
+    effects = (*PLACED, "joint_offset", "link_geometry", "joint_curve:joint2", "joint_curve:joint3")
+    nominal, chain = Nominal(settings=dict.fromkeys(JOINTS[1:], CURVE)), kr270_chain()
+    cell, rng = kr270_cell(effects, nominal=nominal), np.random.default_rng(2)
+    m = Model.assembled(chain, replace(cell, tool=Tool(np.zeros(3), {"M1": np.array([0, 0, 0.1])})))
+    x = m.nominal + [(p.typical or 1e-3) * rng.normal() for p in m.parameters]
+    table = table_at(random_poses(chain, 60, 1), ((0, 0, 0),), ("M1",))
+    fit = identify(m, measured(m, table, x, 5e-5, rng))
+    assert all(fit[n].std < 3e-3 for n in m.names if not m.shrunk[m.names.index(n)])
 
 
 # Weights that nobody knows and the compliances that they bend: a product, fitted as one.

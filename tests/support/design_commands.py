@@ -27,26 +27,20 @@ q_deg = [30, -60, 60, 20, 50, 10]
 BARE = f"""\
 [robot]
 urdf = "{KR270}"
-
 [tool]
 load_point_m = [0.20, 0.0, 0.25]
-
 [tool.markers_m]
 M1 = [0.25, 0.0, 0.05]
 M2 = [-0.12, 0.22, 0.10]
 M3 = [-0.05, -0.10, 0.25]
-
 [tracker]
 position_m = [3.0, 0.0, 1.0]
 sigma_um = 10
-
 [model]
 observe = "deflection"
 effects = ["joint_compliance"]
-
 [model.nominal]
 joint_compliance = [0.35e-6, 0.28e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6]
-
 [design]
 poses = 5
 loads_N = [[0, 0, 0], [0, 0, -2600]]
@@ -87,9 +81,7 @@ def planned(cell: Path, *extra: object, output: str = "plan.csv") -> dict[str, A
     """plan.json of a design that must end well."""
     result = design(cell, *extra, output=output)
     assert result.exit_code == 0, result.stderr
-    path = (cell.parent / output).with_suffix(".json")
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return found
+    return dict(json.loads((cell.parent / output).with_suffix(".json").read_text("utf-8")))
 
 
 def everything_in(folder: Path) -> list[str]:

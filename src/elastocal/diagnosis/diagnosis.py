@@ -458,8 +458,13 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         "probability_nothing": d.probability_nothing,
         "probability_unknown": d.probability_unknown,
     }
-    settled = d.verdict in ("explained", "nothing_significant")
-    yield Finding(d.verdict, "good" if settled else "care", numbers, _remedy(d.verdict))
+    # "No effect" is no finding where it is the less likely half, or none would have been seen.
+    unseen = d.verdict == "nothing_significant" and (
+        d.doubtful or not any(c.visible for c in d.candidates)
+    )
+    settled = d.verdict in ("explained", "nothing_significant") and not unseen
+    remedy = UNSEEN if unseen else _remedy(d.verdict)
+    yield Finding(d.verdict, "good" if settled else "care", numbers, remedy)
     if d.groups:
         shares = tuple(g.share for g in d.groups)
         low, high = zip(*(g.share_ci90 for g in d.groups), strict=True)
@@ -504,6 +509,12 @@ def _kept_back(has: str) -> str:
         f"The cell that {option('cell_out')} writes has {has} only where it does better on poses "
         f"kept back (identify with {option('test')})."
     )
+
+
+UNSEEN = (
+    "These readings do not show whether an effect is missing: measure more poses, spread over the "
+    "whole range of every joint, and under more than one load."
+)
 
 
 def _remedy(verdict: Verdict) -> str:
