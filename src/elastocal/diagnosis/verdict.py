@@ -213,9 +213,9 @@ class FewAnswer(SumAnswer):
     def _mistimed(self, k: int) -> Array:
         """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
         moment at which item k changes and the one at which it was found to."""
-        chosen, dataset = self.selected.chosen, self.dataset
-        item, every = chosen.items[k], times_of(dataset.table)[dataset.lead]
-        kinds, time = [setting.kind for setting in item.what.settings], np.unique(every)
+        chosen, every = self.selected.chosen, self._times
+        item, time = chosen.items[k], np.unique(every)
+        kinds = [setting.kind for setting in item.what.settings]
         if "change_time" not in kinds or len(time) < 4:
             return np.zeros(DRAWS)
         s = kinds.index("change_time")
@@ -224,10 +224,15 @@ class FewAnswer(SumAnswer):
         after = np.searchsorted(time, self.rng.choice(tried[:, s], DRAWS, p=p))
         moment = self.rng.uniform(time[after - 1], time[after])
         apart = np.abs(moment - item.settings[s]) / np.ptp(time)
-        n_new = NEW_POSES * round(len(time) / len(dataset.blocks.member))
+        n_new = NEW_POSES * round(len(every) / len(self.dataset.blocks.member))
         changed = (every > item.settings[s]).mean()
         step = mean_square(chosen.data, chosen.signal(k)) / changed
         return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
+
+    @property
+    def _times(self) -> Array:
+        """Of every visit, or its row."""
+        return times_of(self.dataset.visit_table.take(self.dataset.present.ravel()))
 
     def _constants(self, k: int, s: int) -> tuple[Array, Array, Grams]:
         """Settings (G, …) of item k with constant s at all values that it may have, the others as
@@ -235,22 +240,18 @@ class FewAnswer(SumAnswer):
         chosen, dataset = self.selected.chosen, self.dataset
         item, data = chosen.items[k], chosen.beside(k)
         assert isinstance(item.what, Hypothesis)
-        found, kind, grid = (
-            item.settings[s],
-            item.what.settings[s].kind,
-            dataset.grids[item.what.key],
-        )
-        if kind == "change_time":
-            values = moments_between(np.unique(times_of(dataset.table)[dataset.lead]))
+        found, setting = item.settings[s], item.what.settings[s]
+        grid = dataset.grids[item.what.key]
+        if setting.kind == "change_time":
+            values = moments_between(np.unique(self._times))
             values = values[np.argsort(np.abs(values - found))[:CHANGE_TIMES]]
-        elif kind == "time_constant":  # as probable from here to twice it as to half of it
-            values = found * np.geomspace(1 / FARTHEST, FARTHEST, 33)
+        elif setting.kind == "time_constant":  # as probable from here to twice it as to half of it
             ends = grid.values[:, s]
-            values = values[(values >= ends.min()) & (values <= ends.max())]
+            values = found * np.geomspace(1 / FARTHEST, FARTHEST, 33)
+            values = np.unique(np.clip(values, ends.min(), ends.max()))
         else:
-            setting = item.what.settings[s]
             values = found + grid.step[grid.nearest(item.settings), s] * np.linspace(-1, 1, 33)
-            values = values[(values >= setting.lower) & (values <= setting.upper)]
+            values = np.unique(np.clip(values, setting.lower, setting.upper))
         tried = np.repeat(item.settings[None], len(values), axis=0)
         tried[:, s] = values
         grams = Grams(dataset, data, project(data, chosen.noise))
