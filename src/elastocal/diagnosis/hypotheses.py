@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-from scipy.optimize import least_squares
+import scipy  # whose `optimize` loads where it is used
 from scipy.special import logsumexp
 
 from elastocal.cell.arm_description import EffectChoice
@@ -464,7 +464,8 @@ class StartSearch:
             c = C[:, 0]
             return np.append((self._unexplained - c * (c @ self._unexplained)) / noise, values)
 
-        return start_of(least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS).x)
+        found = scipy.optimize.least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS)
+        return start_of(found.x)
 
     def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """The amplitude's (rows, size, starts), by the whole model at each start."""

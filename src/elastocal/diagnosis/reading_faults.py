@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy  # whose `ndimage` loads where it is used, as `stats` does
 from scipy import special
-from scipy.ndimage import binary_opening
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
@@ -173,15 +173,13 @@ def _beside(
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     if not faulty.any():
         return True
-    from scipy.stats import hypergeom  # slow to import, seldom asked for
-
     table, lead, moment = dataset.table, dataset.lead, dataset.moment
     loaded = np.any(table.force != 0, axis=1)[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
         group = numbered(label)
         found, size = np.bincount(group, faulty), np.bincount(group)
         # Each group's count given the total is hypergeometric; the most conspicuous one decides.
-        p = hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(size)
+        p = scipy.stats.hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(size)
         if len(size) > 1 and p < ACCIDENT:
             return False
     return True
@@ -193,5 +191,6 @@ def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
     for marker in np.unique(marker_of):
         mine = np.flatnonzero(marker_of == marker)
         mine = mine[np.argsort(dataset.moment[mine], kind="stable")]
-        out[mine] = binary_opening(suspect[mine], np.ones(RUN))
+        if suspect[mine].sum() >= RUN:
+            out[mine] = scipy.ndimage.binary_opening(suspect[mine], np.ones(RUN))
     return out

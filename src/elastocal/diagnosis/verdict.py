@@ -219,7 +219,7 @@ class FewAnswer(SumAnswer):
         if "change_time" not in kinds or len(time) < 4:
             return np.zeros(DRAWS)
         s = kinds.index("change_time")
-        tried, p, _ = self._constants(k, s)
+        tried, p, _ = self._constants[k][s]
         # Between the two visits at any moment.
         after = np.searchsorted(time, self.rng.choice(tried[:, s], DRAWS, p=p))
         moment = self.rng.uniform(time[after - 1], time[after])
@@ -234,9 +234,17 @@ class FewAnswer(SumAnswer):
         """Of every visit, or its row."""
         return times_of(self.dataset.visit_table.take(self.dataset.present.ravel()))
 
-    def _constants(self, k: int, s: int) -> tuple[Array, Array, Grams]:
-        """Settings (G, …) of item k with constant s at all values that it may have, the others as
-        found, their probabilities (G,), and the sums by which these were judged."""
+    @cached_property
+    def _constants(self) -> list[list[tuple[Array, Array, Array]]]:
+        """Of every constant of each item: settings (G, …) with it at all values that it may have,
+        the others as found, their probabilities (G,), and the item's coefficients (G, width)."""
+        chosen = self.selected.chosen
+        return [
+            [self._tried(k, s) for s in range(len(item.what.settings))]
+            for k, item in enumerate(chosen.items)
+        ]
+
+    def _tried(self, k: int, s: int) -> tuple[Array, Array, Array]:
         chosen, dataset = self.selected.chosen, self.dataset
         item, data = chosen.items[k], chosen.beside(k)
         assert isinstance(item.what, Hypothesis)
@@ -256,17 +264,14 @@ class FewAnswer(SumAnswer):
         tried[:, s] = values
         grams = Grams(dataset, data, project(data, chosen.noise))
         evidence = grams.of(item.what, tried).evidence(item.what.scales)
-        return tried, special.softmax(evidence), grams
+        estimates = grams.estimates(item.what, tried, chosen.scales[k])
+        return tried, special.softmax(evidence), estimates
 
     def _by_constants(self, k: int) -> Array:
         """Variance (width,) of item k's coefficients because its constants are estimated, too."""
-        chosen = self.selected.chosen
-        what, scale, out = chosen.items[k].what, chosen.scales[k], np.zeros(1)
-        for s in range(len(what.settings)):
-            assert isinstance(what, Hypothesis)
-            tried, p, grams = self._constants(k, s)
-            off = grams.estimates(what, tried, scale) - chosen.at.beta[chosen.spans[k]]
-            out = out + p @ off**2
+        chosen, out = self.selected.chosen, np.zeros(1)
+        for _, p, estimates in self._constants[k]:
+            out = out + p @ (estimates - chosen.at.beta[chosen.spans[k]]) ** 2
         return out
 
     @cached_property

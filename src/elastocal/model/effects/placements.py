@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
 from elastocal.model import rigid
@@ -56,7 +55,7 @@ class BaseFrame(Effect):
         nominal = cell.model.nominal
         position = np.zeros(3) if nominal.base_position is None else nominal.base_position
         rotation = np.eye(3) if nominal.base_rotation is None else nominal.base_rotation
-        vector = Rotation.from_matrix(rotation).as_rotvec()
+        vector = ca.evalf(rigid.vector_from_rotation(rotation)).elements()
         known = zip(KEYS, MOVE, [*position, *vector], strict=True)
         return tuple(ParameterSpec(k, u, float(v), 3e-3) for k, u, v in known)
 
