@@ -68,6 +68,16 @@ def test_a_joint_that_lost_its_zero_is_to_be_remastered_and_trusted():
     assert "The zero of joint 5 is off by 4.9° (known to 0.0035°): remaster it" in found.remedy
 
 
+def test_no_zero_stands_for_links_that_move_the_markers_more(tmp_path):
+    """Heights of a SCARA are told apart by tilts alone: metres of a zero are a millimetre there."""
+    scara = "a_mm,alpha_deg,d_mm,theta0_deg,type\n260,0,210,0,revolute\n240,180,0,0,revolute\n"
+    path = cell(tmp_path, sigma=5)
+    (tmp_path / "dh.csv").write_text(scara + "0,0,0,0,prismatic\n0,0,40,0,revolute\n")
+    q = poses(40, 3)[:, :4] * [1.5, 3, 0.08, 1] + [0, 0, 0.08, 0]
+    fit = ec.identify(path, ec.simulate(path, q, draw=2, seed=2, repeats=2))
+    assert fit.verdict.trusted and fit.finding("joint_zero") is None
+
+
 def test_a_zero_is_named_though_nothing_is_to_be_trusted(tmp_path):
     path = cell(tmp_path)
     lost = {"joint2.offset": np.radians(-12.0)}

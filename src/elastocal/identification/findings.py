@@ -19,7 +19,7 @@ from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding
 from elastocal.identification.sentences import AT_BOUND, STATE_NOISE, made, more_poses
-from elastocal.identification.solve import Solution
+from elastocal.identification.solve import FAR, Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import Parameter
@@ -261,23 +261,27 @@ LARGEST = 0.5  # beyond it the points hardly move, as of a tip that touches one,
 NEARLY = 0.1  # share of the square that a scale leaves of what it explains
 SOME = 400  # readings that are enough for it
 FEWEST_POSES = 8
-FAR = 10.0  # typical deviations from nominal, beyond which an arm that works has no parameter
 # What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
 # effect is in the cell because someone named it: their sizes are findings, no evidence.
 STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
 
 
 def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
-    """Values whose interval leaves nominal out, and which lie more than FAR typical deviations off;
-    doubted unless the noise explains the residual, and held-out poses agree (`explained`)."""
+    """Values whose interval leaves nominal out, and which lie more than FAR typical deviations off,
+    of a combination all that it may hold; doubted unless the noise explains the residual, and
+    held-out poses agree (`explained`)."""
     ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
-    ends |= {next(iter(c.terms)): c.ci95 for c in result.combinations}
+    typical = {p.name: p.typical or 0.0 for p in result.model.parameters}
+    for c in result.combinations:
+        name = next(iter(c.terms))
+        ends[name] = c.ci95
+        typical[name] = math.hypot(*(share * typical[n] for n, share in c.terms.items()))
     half = {name: (high - low) / 2 for name, (low, high) in ends.items()}
     far = [
         (p, float(x) - p.nominal)
         for p, x in zip(result.model.parameters, result.x, strict=True)
         if p.effect in STATED_BY_FILE and p.typical and p.name in half
-        and abs(float(x) - p.nominal) > max(FAR * p.typical, half[p.name])
+        and abs(float(x) - p.nominal) > max(FAR * typical[p.name], half[p.name])
     ]  # fmt: skip
     zeros = [(p, off) for p, off in far if p.effect == JointOffset.name]
     if zeros:
@@ -302,7 +306,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
         )
         yield _care("scale", remedy, readings_over_file=scale, likely=likely)
         return
-    sizes = {p.name: abs(off) / (p.typical or 1.0) for p, off in far}
+    sizes = {p.name: abs(off) / typical[p.name] for p, off in far}
     others = [(p, off) for p, off in far if p.effect != JointOffset.name]
     others.sort(key=lambda found: -sizes[found[0].name])
     if others:

@@ -40,6 +40,7 @@ from elastocal.units import Array, BoolArray, IntArray, Progress
 # to 1e-15, so this is a structural dependence and not rounding.
 STRUCTURAL = 1e-7
 ROUNDING = 1e-9
+FAR = 10.0  # typical deviations from nominal, beyond which an arm that works has no parameter
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,9 @@ def reduce(
     typical deviation moves the data: a parameter below `threshold` is not worth a column (at 1
     the variance it would add equals the squared bias it would remove).  Pivoted QR in the order
     of `ranks` (columns,), by default the effects': first what a user asks for by name; link
-    geometry takes the rest.
+    geometry takes the rest.  There a kept column that would have to deviate by more than FAR for a
+    typical deviation of a dropped one is exchanged for that one, which makes the volume of those
+    kept larger each time (Gu and Eisenstat 1996, SIAM J. Sci. Comput. 17, 848).
     `threshold` 0 keeps everything that is structurally independent.
     """
     # The triangular factor has the same geometry as B at any number of rows.
@@ -111,7 +114,7 @@ def reduce(
     length = np.linalg.norm(R, axis=0)
     visible = length > max(threshold, STRUCTURAL * length.max(initial=0.0), 1e-300)
     basis, chosen = np.zeros((len(R), 0)), np.zeros(0, dtype=np.int64)
-    if ranks is None:
+    if by_effect := ranks is None:
         ranks = np.array([effect_of(p.effect).rank for p in parameters])
     for rank in np.unique(ranks[visible]):
         candidates = np.flatnonzero(visible & (ranks == rank))
@@ -126,11 +129,18 @@ def reduce(
         least = np.maximum(threshold, STRUCTURAL * length[own])
         chosen = np.append(chosen, own[far > least])
         basis = linalg.qr(R[:, chosen], mode="economic")[0]
-    kept = np.sort(chosen)
-    dropped = np.setdiff1d(np.arange(R.shape[1]), kept)
-    mixing = np.zeros((len(kept), len(dropped)))
-    if mixing.size:
-        mixing = least_norm(R[:, kept], R[:, dropped]) * sizes[kept][:, None] / sizes[dropped]
+    while True:
+        kept = np.sort(chosen)
+        dropped = np.setdiff1d(np.arange(R.shape[1]), kept)
+        if not len(kept) or not len(dropped):
+            mixing = np.zeros((len(kept), len(dropped)))
+            break
+        mixing = least_norm(R[:, kept], R[:, dropped])
+        k, d = np.unravel_index(np.abs(mixing).argmax(), mixing.shape)
+        if not by_effect or np.abs(mixing[k, d]) <= FAR:
+            mixing *= sizes[kept][:, None] / sizes[dropped]
+            break
+        chosen = np.append(np.delete(kept, k), dropped[d])
     return Reduction(kept, dropped, mixing, dropped[~visible[dropped]], threshold=threshold)
 
 
