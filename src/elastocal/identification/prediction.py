@@ -30,7 +30,7 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.solve import EXACT, Solution, reduce
+from elastocal.identification.solve import EXACT, Solution, deviates, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
@@ -142,6 +142,7 @@ def left_open(
     open_ = reduction.dropped[~model.shrunk[reduction.dropped]]
     mixing = np.zeros((len(kept), len(open_)))
     typical = typical_sizes(model.parameters, x, kept)
+    typical = np.where(deviates(model), solution.problem.sizes, typical)
     if len(open_) and own.any():
         R = solution.fit.of_free.R * typical[free]
         columns, rest = np.searchsorted(free, kept[own]), np.searchsorted(free, open_)

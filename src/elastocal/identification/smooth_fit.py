@@ -28,7 +28,7 @@ from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Course, FunctionPrior, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, is_placed
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates
 from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import Part, Problem, RFactor, same_size
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
@@ -241,8 +241,7 @@ def sized_of(model: Model, free: IntArray) -> IntArray:
     would be left without a prior.
     """
     own = ordinary(model, free)
-    known = [p.typical is not None and np.isinf([p.lower, p.upper]).all() for p in model.parameters]
-    found = own[(np.array(known) & ~is_placed(model))[own]]
+    found = own[deviates(model)[own]]
     return found if len(found) < len(own) else found[:0]
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import EPS, Fit, PriorRows, drawing_root, fit, moved
@@ -142,6 +142,39 @@ def reduce(
             break
         chosen = np.append(np.delete(kept, k), dropped[d])
     return Reduction(kept, dropped, mixing, dropped[~visible[dropped]], threshold=threshold)
+
+
+# How large the errors of this arm are.
+
+CERTAIN = 0.99  # of typical errors, that chance does not make them look larger
+
+
+def deviates(model: Model) -> BoolArray:
+    """Which parameters (parameters,) deviate from nominal by a size that is known, to either side,
+    but for what registration places."""
+    known = [p.typical is not None and np.isinf([p.lower, p.upper]).all() for p in model.parameters]
+    return np.array(known, dtype=bool) & ~is_placed(model)
+
+
+def errors_of_arm(found: Fit, chosen: Reduction, problem: Problem) -> float:
+    """Factor by which the errors of this arm exceed typical ones, the `sizes` of the problem; 1
+    where these may be as large by chance.
+
+    Of every kept parameter that `deviates`, |X − nominal| over the deviation that typical errors,
+    its own and of those it stands for, and the noise give it.  Their median resists a joint that
+    lost its zero; that of k normal ones follows from the Beta distribution of order statistics.
+    """
+    model, kept, sizes = problem.model, chosen.kept, problem.sizes
+    own = deviates(model)[kept]
+    shares = chosen.mixing * sizes[chosen.dropped]
+    noise = residual_sigma(found, len(kept)) ** 2 * np.diag(found.cofactor())
+    spread = np.sqrt(sizes[kept] ** 2 + (shares**2).sum(axis=1) + noise)
+    off = np.sort((np.abs(found.x - model.nominal)[kept] / spread)[own])
+    if not (k := len(off)):
+        return 1.0
+    m = (k + 1) // 2
+    limit = special.ndtri((1 + special.betaincinv(m, k - m + 1, CERTAIN)) / 2)
+    return float(off[m - 1] / special.ndtri(0.75)) if off[m - 1] > limit else 1.0
 
 
 # Which parameters are fitted: a minimal complete set, a wider one.
@@ -323,6 +356,10 @@ def solve(
         kept = reduction.kept
         found = fit_kept(problem, found.x, reduction)
         sigma, r_factor = residual_sigma(found, len(kept)), found.of_free
+        # So are the sizes of this arm's errors.
+        factor = np.where(deviates(problem.model), errors_of_arm(found, reduction, started), 1.0)
+        problem = replace(problem, sizes=started.sizes * factor)
+    found = replace(found, problem=problem)
     left = reduction.seen(problem.free, r_factor.R, problem.sizes)
     if left is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)
