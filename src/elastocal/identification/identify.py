@@ -64,6 +64,7 @@ from elastocal.identification.solve import (
     bent,
     choose,
     fit_kept,
+    of_this_arm,
     posed,
     residual_sigma,
     solve,
@@ -249,7 +250,8 @@ def summarise(
     sigma = residual_sigma(final, spent)
     noise, parts = noise_of(found, sigma)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
-    estimates, combinations = _estimates(found, left_out)
+    sized = replace(found, solution=of_this_arm(solution, found.spread.std))
+    estimates, combinations = _estimates(sized, left_out)
     determined = tuple(model.names[c] for c in kept)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage = solution.crossed
@@ -273,7 +275,7 @@ def summarise(
             weights.apply(heldout), absolute=weights.absolute,
         ),
         faulty_report=report, active=found.active, prior_share=found.prior_share,
-        smooth=found.smooth, left=left_open(solution, found.limits), copies=copies,
+        smooth=found.smooth, left=left_open(sized.solution, found.limits), copies=copies,
         shown=_shown(solution, covariance),
     )  # fmt: skip
     predicted = predicted_error(

@@ -144,39 +144,6 @@ def reduce(
     return Reduction(kept, dropped, mixing, dropped[~visible[dropped]], threshold=threshold)
 
 
-# How large the errors of this arm are.
-
-CERTAIN = 0.99  # of typical errors, that chance does not make them look larger
-
-
-def deviates(model: Model) -> BoolArray:
-    """Which parameters (parameters,) deviate from nominal by a size that is known, to either side,
-    but for what registration places."""
-    known = [p.typical is not None and np.isinf([p.lower, p.upper]).all() for p in model.parameters]
-    return np.array(known, dtype=bool) & ~is_placed(model)
-
-
-def errors_of_arm(found: Fit, chosen: Reduction, problem: Problem) -> float:
-    """Factor by which the errors of this arm exceed typical ones, the `sizes` of the problem; 1
-    where these may be as large by chance.
-
-    Of every kept parameter that `deviates`, |X − nominal| over the deviation that typical errors,
-    its own and of those it stands for, and the noise give it.  Their median resists a joint that
-    lost its zero; that of k normal ones follows from the Beta distribution of order statistics.
-    """
-    model, kept, sizes = problem.model, chosen.kept, problem.sizes
-    own = deviates(model)[kept]
-    shares = chosen.mixing * sizes[chosen.dropped]
-    noise = residual_sigma(found, len(kept)) ** 2 * np.diag(found.cofactor())
-    spread = np.sqrt(sizes[kept] ** 2 + (shares**2).sum(axis=1) + noise)
-    off = np.sort((np.abs(found.x - model.nominal)[kept] / spread)[own])
-    if not (k := len(off)):
-        return 1.0
-    m = (k + 1) // 2
-    limit = special.ndtri((1 + special.betaincinv(m, k - m + 1, CERTAIN)) / 2)
-    return float(off[m - 1] / special.ndtri(0.75)) if off[m - 1] > limit else 1.0
-
-
 # Which parameters are fitted: a minimal complete set, a wider one.
 
 # A typical deviation must move the data by this many standard deviations to earn a column:
@@ -356,10 +323,6 @@ def solve(
         kept = reduction.kept
         found = fit_kept(problem, found.x, reduction)
         sigma, r_factor = residual_sigma(found, len(kept)), found.of_free
-        # So are the sizes of this arm's errors.
-        factor = np.where(deviates(problem.model), errors_of_arm(found, reduction, started), 1.0)
-        problem = replace(problem, sizes=started.sizes * factor)
-    found = replace(found, problem=problem)
     left = reduction.seen(problem.free, r_factor.R, problem.sizes)
     if left is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)
@@ -381,6 +344,39 @@ def with_placed(problem: Problem, tolerance: float) -> tuple[Problem, Array]:
 def is_placed(model: Model) -> NDArray[np.bool_]:
     """Which parameters (parameters,) registration places: base, markers, cable."""
     return np.array([effect_of(p.effect).registered for p in model.parameters], dtype=bool)
+
+
+def deviates(model: Model) -> BoolArray:
+    """Which parameters (parameters,) deviate from nominal by a size that is known, to either side,
+    but for what registration places."""
+    known = [p.typical is not None and np.isinf([p.lower, p.upper]).all() for p in model.parameters]
+    return np.array(known, dtype=bool) & ~is_placed(model)
+
+
+CERTAIN = 0.99  # of typical errors, that chance does not make them look larger
+
+
+def of_this_arm(solution: Solution, std: Array) -> Solution:
+    """The same with the sizes of what is held as large as the errors of this arm, where those are
+    larger than typical; `std` (kept,) of the estimates.
+
+    Of every kept parameter that `deviates`, |X − nominal| over the deviation that typical errors,
+    its own and of those it stands for, and the noise give it.  Their median resists a joint that
+    lost its zero; that of k normal ones follows from the Beta distribution of order statistics.
+    """
+    fit, problem, chosen = solution.fit, solution.problem, solution.reduction
+    kept, sizes, known = chosen.kept, problem.sizes, deviates(problem.model)
+    shares = chosen.mixing * sizes[chosen.dropped]
+    spread = np.sqrt(sizes[kept] ** 2 + (shares**2).sum(axis=1) + std**2)
+    off = np.abs(fit.x - problem.model.nominal)[kept] / spread
+    off = np.sort(off[known[kept] & ~np.isin(kept, chosen.with_prior)])
+    if not (k := len(off)):
+        return solution
+    m = (k + 1) // 2
+    if off[m - 1] <= special.ndtri((1 + special.betaincinv(m, k - m + 1, CERTAIN)) / 2):
+        return solution
+    sizes = sizes * np.where(known, off[m - 1] / special.ndtri(0.75), 1.0)
+    return replace(solution, fit=replace(fit, problem=replace(problem, sizes=sizes)))
 
 
 def posed(
