@@ -100,29 +100,22 @@ def readings(tmp_path_factory):
     return kr270_readings(tmp_path_factory.mktemp("cell"))
 
 
-def with_cell(tmp_path, readings, mapping="", points=None, log=None):
-    cell, degrees, measured = readings
-    files = {
-        "p.txt": spatialanalyzer(measured if points is None else points),
-        "j.dat": krl(degrees) if log is None else log,
-    }
-    return imported(tmp_path, files, mapping, ("spatialanalyzer", "kuka"), cell)
+def with_cell(tmp_path, readings, points, marker="M2", joints=6):
+    text = spatialanalyzer(points).replace("M2", marker)
+    files = {"p.txt": text, "j.dat": krl(readings[1][:, :joints])}
+    return imported(tmp_path, files, "", ("spatialanalyzer", "kuka"), readings[0])
 
 
 def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
     moved = readings[2] + np.random.default_rng(0).normal(0, 3.0, readings[2].shape)
-    assert with_cell(tmp_path, readings, points=moved).warnings == ()
+    assert with_cell(tmp_path, readings, moved).warnings == ()
 
 
 def test_markers_and_joints_must_be_the_cells(tmp_path, readings):
-    cell, degrees, points = readings
-    text = spatialanalyzer(points).replace("M2", "M5")
     with pytest.raises(InputError, match=r"line 3.*'M5' is no marker of the cell.*from .*p.txt"):
-        imported(tmp_path, {"p.txt": text, "j.dat": krl(degrees)}, "",
-                 ("spatialanalyzer", "kuka"), cell)  # fmt: skip
+        with_cell(tmp_path, readings, readings[2], marker="M5")
     with pytest.raises(InputError, match="5 joint columns"):
-        imported(tmp_path, {"p.txt": spatialanalyzer(points), "j.dat": krl(degrees[:, :5])}, "",
-                 ("spatialanalyzer", "kuka"), cell)  # fmt: skip
+        with_cell(tmp_path, readings, readings[2], joints=5)
 
 
 UNITS = """
@@ -203,6 +196,6 @@ def test_deflections_need_both_states(tmp_path, readings):
 def test_numbers_of_any_size_are_told_as_implausible(tmp_path, readings):
     points = readings[2].copy()
     points[3] = 1e250
-    found = with_cell(tmp_path, readings, points=points)
+    found = with_cell(tmp_path, readings, points)
     assert found.fit is None
     assert any("from the tracker" in w for w in found.warnings)

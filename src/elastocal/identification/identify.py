@@ -335,10 +335,7 @@ def _estimates(
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     solution, model = method.solution, method.solution.problem.model
     reduction, x, dof = solution.reduction, solution.fit.x, method.spread.dof
-    held = np.zeros(len(model.parameters))
-    if (known := method.functions) is not None:
-        held[known.columns] = known.sigma / known.std
-    bends = bent(solution, method.spread.matrix, held[reduction.kept])
+    bends = bent(solution, method.spread.matrix)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []

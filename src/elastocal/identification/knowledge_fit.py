@@ -243,31 +243,29 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     no parameters; InsufficientDataError where an equality names a parameter that readings, prior
     and equalities do not determine.
     """
-    solution, own, names = before.solution, before.functions, before.solution.problem.model.names
-    problem, fit, prior = solution.problem, solution.fit, options.prior
-    sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
+    solution, names = before.solution, before.solution.problem.model.names
+    fit, own, prior = solution.fit, solution.fit.known, options.prior
+    told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
+    sigma, spare = before.beside or (residual_sigma(fit, len(told)), min(told.values()))
     P, target = np.zeros((0, len(names))), np.zeros(0)
     if prior is not None:
         P, target = (sigma * rows for rows in prior.rows(names))
     stated = len(P)
-    if own is not None:
-        problem = replace(problem, free=np.union1d(problem.free, fit.columns))
-        solution = replace(solution, fit=replace(fit, problem=problem))
-        free = ~(P != 0).any(axis=0)[own.columns]
-        ties = PriorRows.near(own.mean[free], own.std[free] / sigma)
-        rows = np.zeros((len(ties.P), len(names)))
-        rows[:, own.columns[free]] = ties.P
-        P, target = np.vstack([P, rows]), np.append(target, ties.target)
+    problem = replace(solution.problem, free=np.union1d(solution.problem.free, fit.columns))
+    solution = replace(solution, fit=replace(fit, problem=problem))
+    rows = np.zeros((len(own.P), len(names)))
+    rows[:, fit.columns] = own.P
+    left = ~rows[:, P.any(axis=0)].any(axis=1)
+    P, target = np.vstack([P, rows[left]]), np.append(target, own.target[left])
     whole = PriorRows(P, target, (options.constraints or Constraints()).resolve(names))
     columns = fitted_columns(solution, whole, sigma)
     known = whole.restricted(columns, fit.x)
     progress("fitting with the prior" if len(P) else "fitting under constraints")
     found = KnownFit(least_squares(problem, columns, fit.x, known=known), known, sigma)
     progress("intervals with the prior" if len(P) else "intervals under constraints")
-    told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
-    spare = own.dof if own else min(told.values())
-    dof = np.array([spare if own else told.get(c, spare) for c in columns.tolist()])
-    many = np.isin(columns, [] if own is None else own.columns)
+    told = {} if before.beside else told
+    dof = np.array([told.get(c, spare) for c in columns.tolist()])
+    many = np.isin(columns, fit.columns[own.P.any(axis=0)])
     spread = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
     shares = {
@@ -303,15 +301,13 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
     parameters they made estimable.  At active bounds the true distribution is smaller (χ̄²): the
     test is cautious.
     """
-    fit, own = before.solution.fit, before.functions
+    fit, own = before.solution.fit, before.solution.fit.known
     stated = rows + len(found.best.active) - (len(found.names) - len(fit.columns))
     if stated < 1:
         return ()
-    grown = found.objective - float(fit.whitened @ fit.whitened)
-    dof = max(float(before.spread.dof.min()), 1.0)
-    if own is not None:
-        away = (fit.x[own.columns] - own.mean) * own.sigma / own.std
-        grown, dof = grown - float(away @ away), own.dof
+    away = own.P @ fit.x[fit.columns] - own.target
+    grown = found.objective - float(fit.whitened @ fit.whitened + away @ away)
+    _, dof = before.beside or (0.0, max(float(before.spread.dof.min()), 1.0))
     F = max(grown, 0.0) / (stated * found.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
