@@ -36,6 +36,7 @@ FACTORS: dict[str, dict[str, float]] = {
     "force": {"N": 1.0, "kN": 1000.0},
     "torque": {"Nm": 1.0, "kNm": 1000.0, "Nmm": 1e-3},
     "temperature": {"C": 1.0, "K": 1.0, "F": 5 / 9},
+    "mass": {"kg": 1.0},
     "number": {"": 1.0},
 }
 _ZERO = {"K": -273.15, "F": -160 / 9}  # °C at the zero of the scale

@@ -78,6 +78,7 @@ T = '[source.optional]\ntemperature_C = "T"\n'
     [
         ("name,x,", "name,x [m],", r"'x \[m\]' says m, but the mapping has x_mm; write x_m", GOOD),
         ("200,", "abc,", r"data.csv, line 3, column x: 'abc' is not a number", GOOD),
+        ("200,2,", '"200,5",2.5,', r"x: '200,5' has ',' in it.*decimal points; set decimal", GOOD),
         ("3_M1,300,3,3,21", "3_M1,300", r"line 4: 2 columns, but q1_deg is column 5", GOOD),
         ("name,x,y", "name,x,x", r"x_mm = 'x' could be column 2 \(x\) or 3 \(x\)",
          GOOD.replace('y_mm = "y"', "y_mm = 3")),

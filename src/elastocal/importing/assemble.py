@@ -361,7 +361,7 @@ def import_files(
         if role in ("joints", "both") and joint_stems(found.numbers):
             found = joining.with_joints(where, found, table.joints, names)
         by_role["joints" if role == "joints" else "points"].append(found)
-        understood.append(found.understood)
+        understood.append(found.understood | {"role": role})
     if not by_role["points"]:
         raise InputError(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "

@@ -22,8 +22,8 @@ from elastocal.errors import ElastocalError, InputError, require
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import ColumnKey, SourceTable, TextSourceKeys, UnitsTable
-from elastocal.tables import MAX_LINE, NUMBER, column, first_bad_cell
-from elastocal.text import listed, quoted
+from elastocal.tables import MAX_LINE, NUMBER, THOUSANDS, column, first_bad_cell
+from elastocal.text import listed, plain_minus, quoted
 from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
 
 MAX_BYTES = 300_000_000
@@ -233,6 +233,15 @@ def _by_numbers(content: Numbered) -> list[str]:
     return sorted(DELIMITER_NAMES, key=numbers, reverse=True)
 
 
+# Blanks and apostrophes between thousands as office programs write them.
+_PLAIN = str.maketrans("\u00a0\u202f\u2009\u2019", "   '")
+
+
+def _is_number(text: str) -> bool:
+    """Whether a cell is a number in any style."""
+    return bool(NUMBER.fullmatch(text) or THOUSANDS.fullmatch(text))
+
+
 class NumberCells:
     """How the numbers of one file are written."""
 
@@ -243,7 +252,7 @@ class NumberCells:
         self.missing = {*MISSING, *(text.strip().casefold() for text in missing)}
         self.decimal = decimal
         if decimal == "auto":
-            bare = [self._bare(cell) for cell in sample]
+            bare = [text for cell in sample if _is_number(text := self._bare(cell))]
             # Where a cell has both, the last is the decimal mark and the other is told as wrong.
             both = next((cell for cell in bare if "." in cell and "," in cell), None)
             points, commas = (any(mark in cell for cell in bare) for mark in ".,")
@@ -251,7 +260,7 @@ class NumberCells:
             self.decimal = max(".,", key=both.rfind) if both else usual
 
     def _bare(self, cell: str) -> str:
-        text = cell.strip()
+        text = plain_minus(cell.strip()).translate(_PLAIN)
         return text.replace(self.thousands, "") if self.thousands else text
 
     def looks_numeric(self, cell: str) -> bool:
@@ -261,27 +270,23 @@ class NumberCells:
     def value(self, source: str, line: int, header: str, cell: str) -> float | None:
         """The number, None for a cell without a value."""
         text = self._bare(cell)
-        pointed = self.decimal == "," and "." in text
-        if self.decimal == "," and not pointed:
-            text = text.replace(",", ".")
-        if not pointed and text.casefold() in self.missing:
+        if text.casefold() in self.missing:
             return None
-        if not pointed and NUMBER.fullmatch(text) and math.isfinite(number := float(text)):
-            return number
         where = f"{source}, line {line}, column {header}"
-        if pointed:
+        others = [mark for mark in ",.' " if mark in text and mark != self.decimal]
+        if others and _is_number(text):
             raise InputError(
-                f"{where}: {quoted(cell)} has a decimal point, but the file is read with decimal "
-                "commas; set decimal or thousands in [source.text]"
+                f"{where}: {quoted(cell)} has {' and '.join(map(quoted, others))} in it, but the "
+                f"file is read with decimal {'points' if self.decimal == '.' else 'commas'}; set "
+                "decimal or thousands in [source.text]"
             )
-        if self.decimal == "." and "," in cell and NUMBER.fullmatch(cell.strip()):
-            raise InputError(
-                f"{where}: {quoted(cell)} has a comma, but the file is read with decimal points; "
-                'set decimal = "," or thousands = "," in [source.text]'
-            )
-        found = first_bad_cell(source, [(line, [self._bare(cell)])], {0: header}, True)
-        advice = "if such lines are no readings, pass over them with ignore in [source.text]"
-        raise InputError(f"{found or f'{where}: {quoted(cell)} is not a number'}; {advice}")
+        if NUMBER.fullmatch(text) and math.isfinite(number := float(text.replace(",", "."))):
+            return number
+        found = first_bad_cell(source, [(line, [text])], {0: header}, True)
+        raise InputError(
+            f"{found or f'{where}: {quoted(cell)} is not a number'}, or list it in missing if it "
+            "means no value, or pass over such lines with ignore, both in [source.text]"
+        )
 
 
 def seconds_of(
@@ -553,7 +558,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         numbers["time"], of["time"] = np.array(seconds), "s"
     used = {i for c in every for i in c.index}
     understood = {
-        "file": name, "preset": source.preset, "role": source.role or "both",
+        "file": name, "preset": source.preset, "role": "",
         "encoding": encoding, "layout": table.layout, "decimal": cells.decimal,
         "columns": tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)

@@ -129,7 +129,7 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
     if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
         raise InputError(
             f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
-            f"({listed(map(quoted, patterns), 3)}), as do not {len(bad) - 1} others; {NAMED}, or "
+            f"({listed(map(quoted, patterns), 3)}), nor do {len(bad) - 1} others; {NAMED}, or "
             'unmatched = "ignore" to leave such points out'
         )
     found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}

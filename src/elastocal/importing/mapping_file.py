@@ -417,13 +417,14 @@ def resolve(
         return tuple(columns)
     needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in unstated
                              if (unit := USUAL.get(q := c.quantities[0])))]  # fmt: skip
+    more = f"; a mapping file says it by [units] or a key such as {next(iter(unstated.values()))}"
+    more = more if needed else " of a mapping file"
     if by_key := [key for c, key in unstated.items() if c.quantities[0] not in USUAL]:
         needed.append(f"{listed(by_key)} in [source.columns]")
     several = len(unstated) > 1
     raise InputError(
         f"{source}: column{'s' * several} {listed((quoted(c.header) for c in unstated), 12)} "
-        f"state{'s' * (not several)} no unit; give {' and '.join(needed)}; a mapping file says "
-        f"it by [units] or a key such as {next(iter(unstated.values()))} in [source.columns]"
+        f"state{'s' * (not several)} no unit; give {' and '.join(needed)}{more}"
     )
 
 
