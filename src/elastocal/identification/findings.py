@@ -718,13 +718,17 @@ def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
 
 
 def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
-    # Unit columns: what is judged is how far they are from parallel, not their units.
-    scaled = solution.fit.r_factor.R
-    scaled = scaled / np.linalg.norm(scaled, axis=0)
-    kept = min(len(solution.reduction.kept), scaled.shape[1])
-    _, singular, Vt = linalg.svd(scaled[:kept])
+    # Unit columns: what is judged is how far they are from parallel, not their units.  What has a
+    # prior of its own is noise to the others.
+    reduction, factor = solution.reduction, solution.fit.r_factor
+    random = np.isin(reduction.kept, reduction.with_prior)
+    own = np.flatnonzero(~random)
+    if factor.columns > len(own):
+        factor = factor.of_columns(np.append(np.flatnonzero(random), own))
+    scaled = factor.R[factor.columns - len(own) :, factor.columns - len(own) :]
+    _, singular, Vt = linalg.svd(scaled / np.linalg.norm(scaled, axis=0))
     if singular[0] > ILL_CONDITIONED * singular[-1]:
-        worst = tuple(result.determined[i] for i in np.argsort(-np.abs(Vt[-1]))[:3])
+        worst = tuple(result.determined[own[i]] for i in np.argsort(-np.abs(Vt[-1]))[:3])
         condition = float(singular[0] / singular[-1])
         yield _note("ill_conditioned", condition_number=condition, parameters=worst)
 

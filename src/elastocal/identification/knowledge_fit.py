@@ -335,4 +335,5 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * problem.sizes[dropped] / problem.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0
-    return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
+    invisible = np.setdiff1d(before.invisible, columns)
+    return Reduction(columns, dropped, mixing, invisible, before.with_prior)

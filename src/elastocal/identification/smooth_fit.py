@@ -515,7 +515,7 @@ class _Search:
         method = self.options.resolved
         if not self.estimating:
             method = "ols" if problem.weights.kind == "none" else "wls"
-        shares = zip(columns[k:], share[k:].tolist(), strict=True)
+        shares = zip(columns, share.tolist(), strict=True)
         return MethodResult(
             method, solution, covariance, noise, good, standard=self.standard,
             prior_share={model.names[c]: part for c, part in shares if not model.shrunk[c]},
