@@ -186,30 +186,27 @@ def intervals_with_knowledge(
 ) -> Covariance:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
-    auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
-    active; else the profile {v: S(v) − Ŝ ≤ t² σ²} of the linearised model under the constraints,
-    S(v) the least objective with the parameter at v.  profile: that of the nonlinear one.
+    auto: t intervals of the posterior covariance where no inequality is active, which bounds cut
+    off (`MethodResult.told`); else the profile {v: S(v) − Ŝ ≤ t² σ²} of the model linearised under
+    the constraints, S(v) the least objective with the parameter at v.  profile: of the nonlinear.
 
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
     Parameters that are `many` (columns,), those of smooth functions, have t intervals in any case.
     """
     known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
-    assert known.system is not None
     # A posterior variance V moves with the noise's variance s² by the readings' share of it,
     # d log V = (1 − share) d log s²: by Satterthwaite it has dof/(1 − share)² where s² has dof.
     left = 1 - np.nan_to_num(found.prior_share, nan=1.0)
     full = np.full(len(left), np.inf)
     dof = np.divide(of_readings, left**2, out=full, where=left > 1e-6)
     inside = not any(a.kind != "equality" for a in found.best.active)
-    plain = Covariance("t", matrix, dof, "").interval(x, LEVEL)
     if kind == "auto" and inside:
         name, text = ("t under constraints", "equalities taken for exact, bounds cut off")
         if len(known.P):
             name, text = ("posterior", "readings and prior together, the prior taken at its word")
-        lower, upper = known.system.lower[:, None], known.system.upper[:, None]
-        plain = np.clip(plain, lower, upper)
-        return Covariance(name, matrix, dof, f"{text}; assumes normal noise", ends=plain)
+        return Covariance(name, matrix, dof, f"{text}; assumes normal noise")
+    plain = Covariance("t", matrix, dof, "").interval(x)
     ends = np.where(many[:, None], plain, x[:, None])
     # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
     rises = (found.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, require
+from elastocal.errors import ElastocalError, InputError
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import ColumnKey, SourceTable, TextSourceKeys, UnitsTable
@@ -52,8 +52,11 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
     data = read_bytes(path, "export", MAX_BYTES)
     if not data.strip():
         raise InputError(f"{source}: empty file; export it again")
-    told = "is a workbook, bag, archive or other binary file; export its table as text (CSV)"
-    require(not data.startswith(_BINARY), f"{source}: {told}")
+    if data.startswith(_BINARY):
+        raise InputError(
+            f"{source}: is a workbook, bag, archive or other binary file; export its table as text "
+            "(CSV)"
+        )
     text, name = _decode(source, data, encoding)
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
@@ -85,9 +88,11 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
     if pattern is None:
         return None
     expression = compiled(where, "unit_comment", pattern)
-    told = "has no group (?P<unit>…); name the part that is the unit so"
-    named = "unit" in expression.groupindex
-    require(named, f"{where}: unit_comment = {quoted(pattern)} {told}")
+    if "unit" not in expression.groupindex:
+        raise InputError(
+            f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
+            "that is the unit so"
+        )
     found = (match["unit"] for text in comments if (match := expression.search(text)))
     return next((unit for unit in found if unit and known_unit(unit)), None)
 
@@ -96,8 +101,8 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
     try:
         return re.compile(pattern)
     except re.error as error:
-        told = f"{where}: {key} = {quoted(pattern)} is no regular expression: {error}"
-        raise InputError(told) from None
+        what = f"{key} = {quoted(pattern)} is no regular expression: {error}"
+        raise InputError(f"{where}: {what}") from None
 
 
 @dataclass(frozen=True)
@@ -233,13 +238,9 @@ def _by_numbers(content: Numbered) -> list[str]:
     return sorted(DELIMITER_NAMES, key=numbers, reverse=True)
 
 
-# Blanks and apostrophes between thousands as office programs write them.
+# A number in any style, and blanks and apostrophes in it as office programs write them.
+_STYLED = re.compile(f"{NUMBER.pattern}|{THOUSANDS.pattern}")
 _PLAIN = str.maketrans("\u00a0\u202f\u2009\u2019", "   '")
-
-
-def _is_number(text: str) -> bool:
-    """Whether a cell is a number in any style."""
-    return bool(NUMBER.fullmatch(text) or THOUSANDS.fullmatch(text))
 
 
 class NumberCells:
@@ -252,7 +253,7 @@ class NumberCells:
         self.missing = {*MISSING, *(text.strip().casefold() for text in missing)}
         self.decimal = decimal
         if decimal == "auto":
-            bare = [text for cell in sample if _is_number(text := self._bare(cell))]
+            bare = [text for cell in sample if _STYLED.fullmatch(text := self._bare(cell))]
             # Where a cell has both, the last is the decimal mark and the other is told as wrong.
             both = next((cell for cell in bare if "." in cell and "," in cell), None)
             points, commas = (any(mark in cell for cell in bare) for mark in ".,")
@@ -272,20 +273,20 @@ class NumberCells:
         text = self._bare(cell)
         if text.casefold() in self.missing:
             return None
-        where = f"{source}, line {line}, column {header}"
         others = [mark for mark in ",.' " if mark in text and mark != self.decimal]
-        if others and _is_number(text):
+        if others and _STYLED.fullmatch(text):
             raise InputError(
-                f"{where}: {quoted(cell)} has {' and '.join(map(quoted, others))} in it, but the "
-                f"file is read with decimal {'points' if self.decimal == '.' else 'commas'}; set "
-                "decimal or thousands in [source.text]"
+                f"{source}, line {line}, column {header}: {quoted(cell)} has "
+                f"{' and '.join(map(quoted, others))} in it, but the file is read with decimal "
+                f"{'points' if self.decimal == '.' else 'commas'}; set decimal or thousands in "
+                "[source.text]"
             )
         if NUMBER.fullmatch(text) and math.isfinite(number := float(text.replace(",", "."))):
             return number
         found = first_bad_cell(source, [(line, [text])], {0: header}, True)
         raise InputError(
-            f"{found or f'{where}: {quoted(cell)} is not a number'}, or list it in missing if it "
-            "means no value, or pass over such lines with ignore, both in [source.text]"
+            f"{found}, or list it in missing if it means no value, or pass over such lines with "
+            "ignore, both in [source.text]"
         )
 
 
@@ -359,11 +360,11 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
         kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
         rows.append((line, [name, *(kept.get(axis, "") for axis in axes)]))
     passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
-    require(
-        bool(rows),
-        f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
-        "its format in [source.text]",
-    )
+    if not rows:
+        raise InputError(
+            f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
+            "its format in [source.text]"
+        )
     # Axes that no row has (E1 … of a robot without them) are no columns.
     used = [0, *(i for i in range(1, len(axes) + 1) if any(cells[i] for _, cells in rows))]
     rows = [(line, [cells[i] for i in used]) for line, cells in rows]
@@ -462,9 +463,11 @@ class Records:
 
     def clock(self, how: str) -> Array:
         """(n,) s on the file's clock, by which rows are to be joined."""
-        told = "map time_s or time_text in [source.columns], or join by order or name"
-        told = f"{self.source}: no times, by which [join] is to join by {how}; {told}"
-        require("time" in self.numbers, told)
+        if "time" not in self.numbers:
+            raise InputError(
+                f"{self.source}: no times, by which [join] is to join by {how}; map time_s or "
+                "time_text in [source.columns], or join by order or name"
+            )
         return self.numbers["time"]
 
     @property
