@@ -55,6 +55,7 @@ def refused(tmp_path, match, mapping=GOOD, **files):
         ("[[source]]", '[loads]\nfull = [0, 0, -1]\n[[source]]', "no file says which load"),
         ("[[source]]", '[[source]]\nload = "full"', r"line 2: load 'full' is not in \[loads\]"),
         ("[[source]]", "[joints]\nsign = [1, 1]\n[[source]]", "sign has 2 numbers.*1 joints"),
+        ("[[source]]", "[joints]\noffset_mm = [2]\n[[source]]", "is 2 for joint 1, which is in"),
         (
             "[[source]]",
             "[joints]\ncoupling = [{ joint = 3, of = 1, factor = 1.0 }]\n[[source]]",

@@ -118,6 +118,7 @@ def test_files_without_joint_values(tmp_path, text, preset, message):
         ("Z (Millimeters)", ("Z", "mm")),
         ("x_m", ("x", "m")),
         ("Y, in", ("Y", "in")),
+        ("T [°F]", ("T", "F")),
         ("field.position0", ("field.position0", None)),
         ("[mm]", ("[mm]", None)),
         ("Point ID", ("Point ID", None)),

@@ -30,7 +30,7 @@ from elastocal.identification.solve import (
     residual_sigma,
 )
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.text import listed, quoted
+from elastocal.text import listed, quoted, some
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # A fit with knowledge: where its constraints let it go, and how far.
@@ -310,12 +310,11 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
     if p > CONTRADICTED:
         return ()
-    what = [f"'{a.label}'" for a in found.best.active]
-    what += ["the prior"] if rows else []
+    what = [*["the prior"] * bool(rows), *(f"'{a.label}'" for a in found.best.active)]
     return (
-        f"The readings contradict {listed(what, 6)}: without, they are fitted better than noise "
-        f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "
-        "names, units and signs of what is stated, and whether the model lacks an effect.",
+        f"The readings contradict {some(what, 6, ' and ')}: without, they are fitted better than "
+        f"noise explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). "
+        "Check names, units and signs of what is stated, and whether the model lacks an effect.",
     )
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError
 from elastocal.importing import exports
 from elastocal.importing.exports import Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, NamesTable
@@ -183,8 +183,14 @@ def with_joints(
                 f"{where}: [joints] {key} has {len(given)} numbers, but there are {n} joints; give "
                 "one per joint"
             )
-    for value in joints.sign or ():
-        require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
+        for j, (value, unit) in enumerate(zip(given or (), units, strict=False), 1):
+            if key == "sign" and abs(value) != 1:
+                raise InputError(f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
+            if key != "sign" and value and not key.endswith(unit):
+                raise InputError(
+                    f"{where}: [joints] {key} is {value:g} for joint {j}, which is in {unit}; give "
+                    f"offset_{unit}"
+                )
     none = [0.0] * n
     offset = np.where(np.array(units) == "deg", joints.offset_deg or none, joints.offset_mm or none)
     before = np.take_along_axis(records.q, taken, axis=1) * (joints.sign or [1.0] * n) + offset
