@@ -260,8 +260,7 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     progress("fitting with the prior" if len(P) else "fitting under constraints")
     found = KnownFit(least_squares(problem, columns, fit.x, known=known), known, sigma)
     progress("intervals with the prior" if len(P) else "intervals under constraints")
-    told = {} if before.beside else told
-    dof = np.array([told.get(c, spare) for c in columns.tolist()])
+    dof = np.array([spare if before.beside else told.get(c, spare) for c in columns.tolist()])
     many = np.isin(columns, fit.columns[own.P.any(axis=0)])
     spread = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.

@@ -407,8 +407,9 @@ def refuse_nonsense(
     if (angle := float(np.median(turned))) > POOREST and (sane or _placed(model, every)):
         raise InsufficientDataError(
             f"{table.source}: after the fit the rotations are {np.degrees(angle):.3g}° (median) "
-            "from the model; check the order of qw, qx, qy, qz, and that they turn the target's "
-            "axes into the tracker's; for a target mounted at an angle fit marker_orientation"
+            "from the model; check the order of qw, qx, qy, qz (rx, ry, rz are a rotation vector, "
+            "not Euler angles), and that they turn the target's axes into the tracker's; for a "
+            "target mounted at an angle fit marker_orientation"
         )
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return

@@ -214,13 +214,11 @@ def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str
     np.maximum.at(high, known.codes, q)
     span = high - low
     which = [known.names[c] for c in np.flatnonzero(np.any(span > spread, axis=1))]
-    if not which:
-        return names, []
     return names, [
         f"{len(which)} configurations have rows whose joint values differ by up to "
         f"{span.max():.3g} (in the columns' unit): {listed(which, 8)}; if these are "
         "different poses, name them apart"
-    ]
+    ] if which else []  # fmt: skip
 
 
 def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:

@@ -261,7 +261,8 @@ class NumberCells:
             self.decimal = max(".,", key=both.rfind) if both else usual
 
     def _bare(self, cell: str) -> str:
-        text = plain_minus(cell.strip()).translate(_PLAIN)
+        text = cell.strip()
+        text = text if text.isascii() else plain_minus(text).translate(_PLAIN)
         return text.replace(self.thousands, "") if self.thousands else text
 
     def looks_numeric(self, cell: str) -> bool:
@@ -273,6 +274,9 @@ class NumberCells:
         text = self._bare(cell)
         if text.casefold() in self.missing:
             return None
+        own = ("," if self.decimal == "." else ".") not in text and NUMBER.fullmatch(text)
+        if own and math.isfinite(number := float(text.replace(",", "."))):
+            return number
         others = [mark for mark in ",.' " if mark in text and mark != self.decimal]
         if others and _STYLED.fullmatch(text):
             raise InputError(
@@ -281,8 +285,6 @@ class NumberCells:
                 f"{'points' if self.decimal == '.' else 'commas'}; set decimal or thousands in "
                 "[source.text]"
             )
-        if NUMBER.fullmatch(text) and math.isfinite(number := float(text.replace(",", "."))):
-            return number
         found = first_bad_cell(source, [(line, [text])], {0: header}, True)
         raise InputError(
             f"{found}, or list it in missing if it means no value, or pass over such lines with "
