@@ -172,8 +172,8 @@ def table_rows(
     if not rows:
         raise InputError(f"{source}: a header but no readings below it; export the points")
     if named and not header_line:  # which line comes nearest, and what it lacks
-        absent = [mapping_file.lacking(asked, cells) for _, cells in rows[:SAMPLE]]
-        least, (number, cells) = min(zip(absent, rows, strict=False), key=lambda row: len(row[0]))
+        lacks = [(mapping_file.lacking(asked, row[1]), row) for row in rows[:SAMPLE]]
+        least, (number, cells) = min(lacks, key=lambda one: (len(one[0]), -len(one[1][1])))
         raise InputError(
             f"{source}: no line has all the columns that the mapping names; line {number} has "
             f"{listed(map(quoted, cells), 12)}, but not {listed(least, 8)}: correct "
@@ -624,8 +624,8 @@ def likely_presets(path: Path) -> list[str]:
     """The presets that read most rows of a file; none where no preset reads it."""
     rows = dict[str, int]()
     for name in mapping_file.PRESETS:
-        where, mapping = mapping_file.read_mapping(None, [name])
+        where, mapping = mapping_file.read_mapping(None, [name], "mm", "deg")
         for source in mapping.source or ():
             with suppress(ElastocalError):
-                rows[name] = len(read_records(where, path, source, UnitsTable()))
+                rows[name] = len(read_records(where, path, source, mapping.units))
     return [name for name, n in rows.items() if n == max(rows.values())]
