@@ -16,7 +16,6 @@ columns = { name = "name", x_mm = "x", y_mm = "y", z_mm = "z" }
 names = { pattern = '^(?P<configuration>\w+?)_(?P<marker>\w+)$' }
 [[source]]
 files = ["joints*"]
-role = "joints"
 columns = { name = "name", q1_deg = "a", q2_deg = "b" }
 """
 ORDER = re.sub("names = .*", "names = { pattern = '(?P<marker>M.)' }", NAMED)
