@@ -283,9 +283,13 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
     if zeros:
         told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
                 f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
+        turned = zeros[-1][0].where == f"joint{result.model.chain.n_joints}"
+        turned &= result.observations.kind == "pose"
+        turned &= "marker_orientation" not in {p.effect for p in result.model.parameters}
         yield _note(
             "joint_zero",
-            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration.",
+            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration."
+            + " Where the target is mounted at an angle, fit marker_orientation." * turned,
             joints=tuple(p.where for p, _ in zeros), values=tuple(v for _, v in zeros),
             units=tuple(p.unit for p, _ in zeros), ci95_half=tuple(half[p.name] for p, _ in zeros),
         )  # fmt: skip

@@ -198,16 +198,13 @@ def intervals_with_knowledge(
     # A posterior variance V moves with the noise's variance s² by the readings' share of it,
     # d log V = (1 − share) d log s²: by Satterthwaite it has dof/(1 − share)² where s² has dof.
     left = 1 - np.nan_to_num(found.prior_share, nan=1.0)
-    full = np.full(len(left), np.inf)
-    dof = np.divide(of_readings, left**2, out=full, where=left > 1e-6)
-    inside = not any(a.kind != "equality" for a in found.best.active)
-    if kind == "auto" and inside:
+    dof = np.where(left > 1e-6, of_readings / np.maximum(left, 1e-6) ** 2, np.inf)
+    if kind == "auto" and all(a.kind == "equality" for a in found.best.active):
         name, text = ("t under constraints", "equalities taken for exact, bounds cut off")
         if len(known.P):
             name, text = ("posterior", "readings and prior together, the prior taken at its word")
         return Covariance(name, matrix, dof, f"{text}; assumes normal noise")
-    plain = Covariance("t", matrix, dof, "").interval(x)
-    ends = np.where(many[:, None], plain, x[:, None])
+    ends = np.where(many[:, None], Covariance("t", matrix, dof, "").interval(x), x[:, None])
     # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
     rises = (found.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
     for k in np.flatnonzero(~many).tolist():

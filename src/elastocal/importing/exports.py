@@ -321,7 +321,6 @@ RAPID_AXES = (*(f"rax_{i}" for i in range(1, 7)), *(f"eax_{letter}" for letter i
 NOT_CONNECTED = 9e9  # what RAPID writes for an external axis that does not exist
 NO_JOINTS = dict.fromkeys(("o_robtarget", "o_jointtarget"), "the position before a correction")
 NO_JOINTS["robtarget"] = "no joint values"
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 # Names begin where a word does, and no part gives back what it took: a line that is no statement
 # is looked through once, not from each of its letters.
 _KRL = re.compile(r"(?:(?<![\w$])([$A-Za-z_][\w$]*+(?:\[\s*+\d++\s*+\])?)\s*+=\s*+)?\{([^{}]*+)\}")
@@ -354,7 +353,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
             ignored.append((line, f"{name} {values}"))
             continue
         for axis, cell in values.items():
-            if not _NUMBER.fullmatch(cell):
+            if not NUMBER.fullmatch(cell):
                 raise InputError(
                     f"{source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
                     "values, not expressions"
