@@ -395,8 +395,8 @@ def bent(solution: Solution, covariance: Array) -> Array:
     moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
         return none  # so far out the arm has no equilibrium
-    target, known = looked.weights.apply(moved.T / 2), found.known
-    ties, free = known.P * size, np.eye(len(kept))
+    target, known, free = looked.weights.apply(moved.T / 2), found.known, np.eye(len(kept))
+    ties = known.P * size * np.sqrt(len(residual) / len(found.residual))  # as among all readings
     if known.system is not None:
         free = linalg.null_space(known.system.A * size)
     rows = np.vstack([looked.weights.apply(B), ties]) @ free
