@@ -33,7 +33,7 @@ from elastocal.model.effects.compliances import (
     weight_torque,
 )
 from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
+from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
 from elastocal.text import counted, listed
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
@@ -285,7 +285,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
                 f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
         turned = zeros[-1][0].where == f"joint{result.model.chain.n_joints}"
         turned &= result.observations.kind == "pose"
-        turned &= "marker_orientation" not in {p.effect for p in result.model.parameters}
+        turned &= MarkerOrientation.name not in {p.effect for p in result.model.parameters}
         yield _note(
             "joint_zero",
             f"The zero of {listed(told)}: remaster it, or command the arm by this calibration."
