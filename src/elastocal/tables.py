@@ -202,7 +202,7 @@ NO_UNIT = ("",)
 IGNORED = ("#", "_", "note")
 # Seen in other people's tables: they make a name such as x_cm a wrong unit, not a typing error.
 OTHER_UNITS = {unit for units in FACTORS.values() for unit in units if unit}
-OTHER_UNITS |= {"km", "nm", "inch", "urad", "grad", "turn", "kg", "mNm"}
+OTHER_UNITS |= {"km", "nm", "inch", "urad", "grad", "turn", "mNm"}
 
 
 # What a table may hold

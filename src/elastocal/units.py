@@ -36,15 +36,16 @@ FACTORS: dict[str, dict[str, float]] = {
     "force": {"N": 1.0, "kN": 1000.0},
     "torque": {"Nm": 1.0, "kNm": 1000.0, "Nmm": 1e-3},
     "temperature": {"C": 1.0, "K": 1.0, "F": 5 / 9},
+    "mass": {"kg": 1.0},
     "number": {"": 1.0},
 }
 _ZERO = {"K": -273.15, "F": -160 / 9}  # °C at the zero of the scale
 _ALIASES = {
-    "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
-    "meter": "m", "meters": "m", "metre": "m", "metres": "m", "micron": "um", "microns": "um",
-    "µm": "um", "μm": "um", "inch": "in", "inches": "in", "°": "deg", "degree": "deg",
-    "degrees": "deg", "radian": "rad", "radians": "rad", "sec": "s", "seconds": "s", "n": "N",
-    "nm": "Nm", "n·m": "Nm", "n m": "Nm", "°c": "C", "kn": "kN", "msec": "ms", "µs": "us",
+    "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm", "meter": "m",
+    "meters": "m", "metre": "m", "metres": "m", "micron": "um", "microns": "um", "µm": "um",
+    "μm": "um", "inch": "in", "inches": "in", "°": "deg", "degree": "deg", "degrees": "deg",
+    "radian": "rad", "radians": "rad", "sec": "s", "seconds": "s", "n": "N", "nm": "Nm",
+    "n·m": "Nm", "n m": "Nm", "°c": "C", "°f": "F", "kn": "kN", "msec": "ms", "µs": "us",
 }  # fmt: skip
 _BRACKETED = re.compile(r"[\[(]([^\[\]()]++)[\])]$")
 _TAILED = re.compile(r"(?:[_/,.]|(?<!\s) )\s*+([A-Za-zµμ°]+)$")

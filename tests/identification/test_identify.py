@@ -23,6 +23,7 @@ from support.cells import COMPLIANCE, kr270_chain, random_poses
 from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.errors import InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.solve import reduce
 from elastocal.model.manipulator import Model
@@ -81,6 +82,8 @@ def test_pose_observation(stated):
         assert low < result.noise.ratio_to_stated**2 * result.dof < high
     assert_one_arm_is_covered(result, truth)
     assert len(result.residual) == 180
+    with pytest.raises(InsufficientDataError, match=r"rotations are .*check the order of qw"):
+        identify(model, replace(table, rotation=-table.rotation))  # the other way round
 
 
 def test_distance_observation():

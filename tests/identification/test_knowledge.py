@@ -10,6 +10,7 @@ from scipy import stats
 from support.calibration import measured, with_values
 from support.cells import DOWN, TABLE_2, kr270_cell, table_of
 
+import elastocal as ec
 from elastocal.errors import InputError
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import (
@@ -25,6 +26,7 @@ from elastocal.model.manipulator import Model
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
 BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"
 DOCS = Path(__file__).parents[2] / "docs" / "file-formats.md"
+WHOLE = Path(__file__).parents[1] / "golden" / "inputs" / "whole"
 
 
 @lru_cache
@@ -62,9 +64,8 @@ def test_a_prior_is_the_ridge_of_the_linear_arm():
     share = np.diag(V @ P.T @ P @ V) / np.diag(V)
     assert list(found.prior_share) == list(alone.determined)
     np.testing.assert_allclose(list(found.prior_share.values()), share, atol=1e-8)
-    for e, std, s in zip(
-        (found[n] for n in found.determined), np.sqrt(np.diag(V)), share, strict=True
-    ):
+    for n, std, s in zip(found.determined, np.sqrt(np.diag(V)), share, strict=True):
+        e = found[n]
         dof = alone.dof / (1 - s) ** 2
         assert e.dof == pytest.approx(dof, rel=1e-5)
         assert e.ci95[1] - e.value == pytest.approx(stats.t.ppf(0.975, dof) * std, rel=1e-5)
@@ -72,11 +73,8 @@ def test_a_prior_is_the_ridge_of_the_linear_arm():
 
 def test_a_prior_on_one_of_a_pair_tells_the_other():
     """With a free base and an unknown marker base.rz and joint 1 turn the arm alike."""
-    known, other, model = (
-        "joint1.offset",
-        "base.rz",
-        Model(kr270_cell(("base_frame", "joint_offset"))),
-    )
+    known, other = "joint1.offset", "base.rz"
+    model = Model(kr270_cell(("base_frame", "joint_offset")))
     table = readings(model, 7)
     alone = identify(model, table)
     assert {known, other}.isdisjoint(e.name for e in alone.estimates if e.identifiable)
@@ -152,3 +150,18 @@ def test_a_wrong_file_is_told_by_file_and_key(tmp_path, text, message):
     with pytest.raises(InputError, match=message) as error:
         read_knowledge(path)
     assert str(error.value).startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    "stated, std",
+    [('[prior."link5.ry"]\nmean = 0.0\nstd = 1e-3', 1e-3),
+     ('[[equality]]\nterms = { "link5.ry" = 1.0 }', 0.0)],
+)  # fmt: skip
+def test_what_only_knowledge_holds_is_no_wider_than_known(tmp_path, stated, std):
+    """Link 5 about y is joint 5's offset but in the second order; bounds cut what is widened."""
+    path = tmp_path / "knowledge.toml"
+    path.write_text(f'{stated}\n[[bounds]]\nparameter = "link3.rz"\nlower = -6e-4\n')
+    found = ec.identify(WHOLE / "cell.toml", WHOLE / "data.csv", knowledge=path, method="ols")
+    assert found["link5.ry"].std == pytest.approx(std, rel=1e-3)
+    assert found["link5.dz"].std < 5e-4
+    assert found["link3.rz"].ci95[0] == -6e-4

@@ -16,7 +16,6 @@ columns = { name = "name", x_mm = "x", y_mm = "y", z_mm = "z" }
 names = { pattern = '^(?P<configuration>\w+?)_(?P<marker>\w+)$' }
 [[source]]
 files = ["joints*"]
-role = "joints"
 columns = { name = "name", q1_deg = "a", q2_deg = "b" }
 """
 ORDER = re.sub("names = .*", "names = { pattern = '(?P<marker>M.)' }", NAMED)
@@ -59,7 +58,7 @@ def q1(found):
 def test_by_name_in_any_order_with_leading_zeros_and_capitals(tmp_path):
     files = named("P02_M1 P01_M1 P02_M2 P01_M2", [("p1", 10), ("p2", 20)])
     found = imported(tmp_path, files, NAMED)
-    assert found.joined.how == "name"
+    assert found.joined.how == "name" and found.understood[1]["role"] == "joints"
     assert q1(found) == [20, 10, 20, 10]
 
 

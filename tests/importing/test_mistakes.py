@@ -47,19 +47,14 @@ def refused(tmp_path, match, mapping=GOOD, **files):
         ('q1_deg = "a"', '"q#_deg" = 5', r"q#_deg takes a name with #.*q1_deg = 5"),
         ("[[source]]", '[[source]]\nfiles = ["x*"]', r"no file fits files = 'x\*'.*data.csv"),
         ("[[source]]", "[[source]]\nnames = { pattern = '(' }", "no regular expression"),
-        (
-            "[[source]]",
-            r"[[source]]" "\nnames = { pattern = '^(?P<configuration>[1-3])_' }",
-            r"data.csv, line 5: the name '4_M1' matches no pattern.*2 others",
-        ),
+        ("[[source]]", "[[source]]\nnames = { pattern = '^(?P<configuration>[1-3])_' }",
+         r"data.csv, line 5: the name '4_M1' matches no pattern.*, nor do 2 others"),
         ("[[source]]", '[loads]\nfull = [0, 0, -1]\n[[source]]', "no file says which load"),
         ("[[source]]", '[[source]]\nload = "full"', r"line 2: load 'full' is not in \[loads\]"),
         ("[[source]]", "[joints]\nsign = [1, 1]\n[[source]]", "sign has 2 numbers.*1 joints"),
-        (
-            "[[source]]",
-            "[joints]\ncoupling = [{ joint = 3, of = 1, factor = 1.0 }]\n[[source]]",
-            "joint = 3 of .joints. coupling no. 1: the file has 1",
-        ),
+        ("[[source]]", "[joints]\noffset_mm = [2]\n[[source]]", "is 2 for joint 1, which is in"),
+        ("[[source]]", "[joints]\ncoupling = [{ joint = 3, of = 1, factor = 1.0 }]\n[[source]]",
+         "joint = 3 of .joints. coupling no. 1: the file has 1"),
         ("[[source]]", '[[source]]\ntext = { decimal = "," }', r"line 2|decimal"),
     ],
 )  # fmt: skip
@@ -78,6 +73,8 @@ T = '[source.optional]\ntemperature_C = "T"\n'
     [
         ("name,x,", "name,x [m],", r"'x \[m\]' says m, but the mapping has x_mm; write x_m", GOOD),
         ("200,", "abc,", r"data.csv, line 3, column x: 'abc' is not a number", GOOD),
+        ("200,2,", '"200,5",2.5,', r"x: '200,5' has ',' in it.*decimal points; set decimal", GOOD),
+        ("name,x,y,z,a", "Report\nn,u,v,w,b", r"line 2 has 'n', 'u'.*not name = 'name'", GOOD),
         ("3_M1,300,3,3,21", "3_M1,300", r"line 4: 2 columns, but q1_deg is column 5", GOOD),
         ("name,x,y", "name,x,x", r"x_mm = 'x' could be column 2 \(x\) or 3 \(x\)",
          GOOD.replace('y_mm = "y"', "y_mm = 3")),
@@ -100,29 +97,22 @@ def readings(tmp_path_factory):
     return kr270_readings(tmp_path_factory.mktemp("cell"))
 
 
-def with_cell(tmp_path, readings, mapping="", points=None, log=None):
-    cell, degrees, measured = readings
-    files = {
-        "p.txt": spatialanalyzer(measured if points is None else points),
-        "j.dat": krl(degrees) if log is None else log,
-    }
-    return imported(tmp_path, files, mapping, ("spatialanalyzer", "kuka"), cell)
+def with_cell(tmp_path, readings, points, marker="M2", joints=6):
+    text = spatialanalyzer(points).replace("M2", marker)
+    files = {"p.txt": text, "j.dat": krl(readings[1][:, :joints])}
+    return imported(tmp_path, files, "", ("spatialanalyzer", "kuka"), readings[0])
 
 
 def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
     moved = readings[2] + np.random.default_rng(0).normal(0, 3.0, readings[2].shape)
-    assert with_cell(tmp_path, readings, points=moved).warnings == ()
+    assert with_cell(tmp_path, readings, moved).warnings == ()
 
 
 def test_markers_and_joints_must_be_the_cells(tmp_path, readings):
-    cell, degrees, points = readings
-    text = spatialanalyzer(points).replace("M2", "M5")
     with pytest.raises(InputError, match=r"line 3.*'M5' is no marker of the cell.*from .*p.txt"):
-        imported(tmp_path, {"p.txt": text, "j.dat": krl(degrees)}, "",
-                 ("spatialanalyzer", "kuka"), cell)  # fmt: skip
+        with_cell(tmp_path, readings, readings[2], marker="M5")
     with pytest.raises(InputError, match="5 joint columns"):
-        imported(tmp_path, {"p.txt": spatialanalyzer(points), "j.dat": krl(degrees[:, :5])}, "",
-                 ("spatialanalyzer", "kuka"), cell)  # fmt: skip
+        with_cell(tmp_path, readings, readings[2], joints=5)
 
 
 UNITS = """
@@ -203,6 +193,6 @@ def test_deflections_need_both_states(tmp_path, readings):
 def test_numbers_of_any_size_are_told_as_implausible(tmp_path, readings):
     points = readings[2].copy()
     points[3] = 1e250
-    found = with_cell(tmp_path, readings, points=points)
+    found = with_cell(tmp_path, readings, points)
     assert found.fit is None
     assert any("from the tracker" in w for w in found.warnings)

@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from elastocal.cli.main import app
 from elastocal.errors import InputError
+from elastocal.importing.exports import likely_presets
 
 PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
 
@@ -92,6 +93,7 @@ def test_the_unit_is_that_of_the_axes_comment_or_asked_for(tmp_path, readings):
     files["p.txt"] = files["p.txt"].replace("(in)", "")
     with pytest.raises(InputError, match=r"column 3.*no unit.*length_unit='mm'"):
         imported(tmp_path, files, presets=both)
+    assert likely_presets(tmp_path / "p.txt") == ["spatialanalyzer"]
 
 
 def test_the_preview_shown_is_what_is_printed(tmp_path, monkeypatch):

@@ -44,8 +44,7 @@ def table(path: Path) -> list[dict[str, str]]:
 @pytest.mark.parametrize("head", ["{marker}_{axis}", "{marker} {axis}"])
 def test_every_marker_of_a_row_becomes_a_reading(tmp_path, readings, head):
     folder, degrees, points = readings
-    file = wide(tmp_path / "log.csv", degrees, points, head)
-    out = tmp_path / "data.csv"
+    file, out = wide(tmp_path / "log.csv", degrees, points, head), tmp_path / "data.csv"
     done = run(file, "--preset", "wide", "--cell", folder / "cell.toml", "-o", out)
     assert done.exit_code == 0 and "Warning" not in done.output, done.output
     rows = table(out)
@@ -105,11 +104,12 @@ def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_pat
     assert done.exit_code == 0, done.output
     forces = [float(row["force_z_N"]) for row in table(tmp_path / "data.csv")]
     assert forces == pytest.approx([0.0, -2.5 * 9.80665])
-    (tmp_path / "map.toml").write_text(
-        '[[source]]\n[source.columns]\n"q#_deg" = "q#"\nx_mm = "*_x"\ny_mm = "*_y"\nz_mm = "*_z"\n'
-    )
-    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
-    assert done.exit_code == 0 and "column payload_kg of" in done.output
+    mapping, out = tmp_path / "map.toml", tmp_path / "data.csv"
+    columns = "[source.columns]\n'q#_deg' = 'q#'\nx_mm = '*_x'\ny_mm = '*_y'\nz_mm = '*_z'\n"
+    for load, told in (("", True), ("load = 'Payload'\n", False)):
+        mapping.write_text(f"[[source]]\n{columns}{load}")
+        done = run(tmp_path / "log.csv", "--map", mapping, "-o", out)
+        assert done.exit_code == 0 and ("column payload_kg of" in done.output) == told
 
 
 @pytest.mark.parametrize(

@@ -26,17 +26,12 @@ effects = ["base_frame", "joint_offset", "marker_position"]
 """
 
 
-def kr270_cell_file(folder: Path) -> Path:
-    """cell.toml and arm.urdf of a KR 270-2 with two markers."""
-    (folder / "arm.urdf").write_bytes(KR270.read_bytes())
-    path = folder / "cell.toml"
-    path.write_text(CELL, encoding="utf-8")
-    return path
-
-
 def kr270_readings(folder: Path, poses: int = 10) -> tuple[Cell, np.ndarray, np.ndarray]:
-    """The cell, joint values (poses, 6) in degrees, and points (poses, markers, 3) in mm."""
-    cell = read_cell(kr270_cell_file(folder))
+    """The cell of a KR 270-2 in cell.toml, joint values (poses, 6) in degrees, and points (poses,
+    markers, 3) in mm."""
+    (folder / "arm.urdf").write_bytes(KR270.read_bytes())
+    (folder / "cell.toml").write_text(CELL, encoding="utf-8")
+    cell = read_cell(folder / "cell.toml")
     model = Model(cell)
     degrees = np.round(np.degrees(random_poses(model.chain, poses, seed=4)), 3)
     table = table_of(np.radians(degrees), np.zeros(3), MARKERS)
@@ -44,9 +39,9 @@ def kr270_readings(folder: Path, poses: int = 10) -> tuple[Cell, np.ndarray, np.
     return cell, degrees, np.round(points, 4)
 
 
-def krl(degrees: np.ndarray, external: bool = True) -> str:
+def krl(degrees: np.ndarray) -> str:
     """A .dat file with one E6AXIS per pose."""
-    tail = ",E1 0.0,E2 0.0,E3 0.0,E4 0.0,E5 0.0,E6 0.0" if external else ""
+    tail = ",E1 0.0,E2 0.0,E3 0.0,E4 0.0,E5 0.0,E6 0.0"
     lines = ["&ACCESS RVO", "DEFDAT CALIB PUBLIC", "; poses of the campaign {not one}"]
     for i, q in enumerate(degrees, start=1):
         axes = ",".join(f"A{j} {v:.3f}" for j, v in enumerate(q, start=1))
@@ -65,36 +60,30 @@ def rapid(degrees: np.ndarray) -> str:
     return "\n".join([*lines, "ENDMODULE", ""])
 
 
-def spatialanalyzer(points: np.ndarray, shots: int = 1, unit: str = "mm") -> str:
-    """Group (pose), target (marker, an asterisk per further shot), x, y, z."""
+def spatialanalyzer(points: np.ndarray, unit: str = "mm") -> str:
+    """Group (pose), target (marker), x, y, z."""
     lines = ["// SpatialAnalyzer SA 2024", f"// AXES = CARTESIAN: X,  Y,  Z ({unit})"]
     for i, pose in enumerate(points, start=1):
-        for shot in range(shots):
-            for marker, p in zip(MARKERS, pose, strict=True):
-                xyz = ",  ".join(f"{v:.4f}" for v in p)
-                lines.append(f"P{i:02d},  {marker}{'*' * shot},  {xyz}")
+        for marker, p in zip(MARKERS, pose, strict=True):
+            xyz = ",  ".join(f"{v:.4f}" for v in p)
+            lines.append(f"P{i:02d},  {marker},  {xyz}")
     return "\n".join([*lines, ""])
 
 
-def delimited(
-    points: np.ndarray, header: str, delimiter: str = ",", decimal: str = ".", name: str = "P{}_{}"
-) -> str:
+def delimited(points: np.ndarray, header: str, delimiter: str = ",", decimal: str = ".") -> str:
     """Name, x, y, z under a header."""
     lines = [header]
     for i, pose in enumerate(points, start=1):
         for marker, p in zip(MARKERS, pose, strict=True):
             xyz = [f"{v:.4f}".replace(".", decimal) for v in p]
-            lines.append(delimiter.join([name.format(i, marker), *xyz]))
+            lines.append(delimiter.join([f"P{i}_{marker}", *xyz]))
     return "\n".join([*lines, ""])
 
 
 def imported(
-    folder: Path,
-    files: Files[str, str | bytes],
-    mapping: str | None = None,
-    presets: tuple[str, ...] = (),
-    cell: Cell | None = None,
-) -> Imported:
+    folder: Path, files: Files[str, str | bytes], mapping: str | None = None,
+    presets: tuple[str, ...] = (), cell: Cell | None = None,
+) -> Imported:  # fmt: skip
     """What `elastocal import` makes of files with these contents."""
     paths = []
     for name, content in files.items():

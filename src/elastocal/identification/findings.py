@@ -33,7 +33,7 @@ from elastocal.model.effects.compliances import (
     weight_torque,
 )
 from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
+from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
 from elastocal.text import counted, listed
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
@@ -287,9 +287,13 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
     if zeros:
         told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
                 f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
+        turned = zeros[-1][0].where == f"joint{result.model.chain.n_joints}"
+        turned &= result.observations.kind == "pose"
+        turned &= MarkerOrientation.name not in {p.effect for p in result.model.parameters}
         yield _note(
             "joint_zero",
-            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration.",
+            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration."
+            + " Where the target is mounted at an angle, fit marker_orientation." * turned,
             joints=tuple(p.where for p, _ in zeros), values=tuple(v for _, v in zeros),
             units=tuple(p.unit for p, _ in zeros), ci95_half=tuple(half[p.name] for p, _ in zeros),
         )  # fmt: skip
@@ -722,13 +726,17 @@ def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
 
 
 def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
-    # Unit columns: what is judged is how far they are from parallel, not their units.
-    scaled = solution.fit.r_factor.R
-    scaled = scaled / np.linalg.norm(scaled, axis=0)
-    kept = min(len(solution.reduction.kept), scaled.shape[1])
-    _, singular, Vt = linalg.svd(scaled[:kept])
+    # Unit columns: what is judged is how far they are from parallel, not their units.  What has a
+    # prior of its own is noise to the others.
+    reduction, factor = solution.reduction, solution.fit.r_factor
+    random = np.isin(reduction.kept, reduction.with_prior)
+    own = np.flatnonzero(~random)
+    if factor.columns > len(own):
+        factor = factor.of_columns(np.append(np.flatnonzero(random), own))
+    scaled = factor.R[factor.columns - len(own) :, factor.columns - len(own) :]
+    _, singular, Vt = linalg.svd(scaled / np.linalg.norm(scaled, axis=0))
     if singular[0] > ILL_CONDITIONED * singular[-1]:
-        worst = tuple(result.determined[i] for i in np.argsort(-np.abs(Vt[-1]))[:3])
+        worst = tuple(result.determined[own[i]] for i in np.argsort(-np.abs(Vt[-1]))[:3])
         condition = float(singular[0] / singular[-1])
         yield _note("ill_conditioned", condition_number=condition, parameters=worst)
 

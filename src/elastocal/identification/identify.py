@@ -36,13 +36,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.noise_summary import noise_of
-from elastocal.identification.options import (
-    ROBUST,
-    Course,
-    IntervalKind,
-    MethodResult,
-    Options,
-)
+from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
 from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
@@ -337,10 +331,7 @@ def _estimates(
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     solution, model = method.solution, method.solution.problem.model
     reduction, x, dof = solution.reduction, solution.fit.x, method.spread.dof
-    held = np.zeros(len(model.parameters))
-    if (known := method.functions) is not None:
-        held[known.columns] = known.sigma / known.std
-    bends = bent(solution, method.spread.matrix, held[reduction.kept])
+    bends = bent(solution, method.spread.matrix)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []

@@ -30,7 +30,7 @@ from elastocal.identification.solve import (
     residual_sigma,
 )
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.text import listed, quoted
+from elastocal.text import listed, quoted, some
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # A fit with knowledge: where its constraints let it go, and how far.
@@ -186,31 +186,25 @@ def intervals_with_knowledge(
 ) -> Covariance:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
-    auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
-    active; else the profile {v: S(v) − Ŝ ≤ t² σ²} of the linearised model under the constraints,
-    S(v) the least objective with the parameter at v.  profile: that of the nonlinear one.
+    auto: t intervals of the posterior covariance where no inequality is active, which bounds cut
+    off (`MethodResult.told`); else the profile {v: S(v) − Ŝ ≤ t² σ²} of the model linearised under
+    the constraints, S(v) the least objective with the parameter at v.  profile: of the nonlinear.
 
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
     Parameters that are `many` (columns,), those of smooth functions, have t intervals in any case.
     """
     known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
-    assert known.system is not None
     # A posterior variance V moves with the noise's variance s² by the readings' share of it,
     # d log V = (1 − share) d log s²: by Satterthwaite it has dof/(1 − share)² where s² has dof.
     left = 1 - np.nan_to_num(found.prior_share, nan=1.0)
-    full = np.full(len(left), np.inf)
-    dof = np.divide(of_readings, left**2, out=full, where=left > 1e-6)
-    inside = not any(a.kind != "equality" for a in found.best.active)
-    plain = Covariance("t", matrix, dof, "").interval(x, LEVEL)
-    if kind == "auto" and inside:
+    dof = np.where(left > 1e-6, of_readings / np.maximum(left, 1e-6) ** 2, np.inf)
+    if kind == "auto" and all(a.kind == "equality" for a in found.best.active):
         name, text = ("t under constraints", "equalities taken for exact, bounds cut off")
         if len(known.P):
             name, text = ("posterior", "readings and prior together, the prior taken at its word")
-        lower, upper = known.system.lower[:, None], known.system.upper[:, None]
-        plain = np.clip(plain, lower, upper)
-        return Covariance(name, matrix, dof, f"{text}; assumes normal noise", ends=plain)
-    ends = np.where(many[:, None], plain, x[:, None])
+        return Covariance(name, matrix, dof, f"{text}; assumes normal noise")
+    ends = np.where(many[:, None], Covariance("t", matrix, dof, "").interval(x), x[:, None])
     # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
     rises = (found.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
     for k in np.flatnonzero(~many).tolist():
@@ -243,31 +237,28 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     no parameters; InsufficientDataError where an equality names a parameter that readings, prior
     and equalities do not determine.
     """
-    solution, own, names = before.solution, before.functions, before.solution.problem.model.names
-    problem, fit, prior = solution.problem, solution.fit, options.prior
-    sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
+    solution, names = before.solution, before.solution.problem.model.names
+    fit, own, prior = solution.fit, solution.fit.known, options.prior
+    told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
+    sigma, spare = before.beside or (residual_sigma(fit, len(told)), min(told.values()))
     P, target = np.zeros((0, len(names))), np.zeros(0)
     if prior is not None:
         P, target = (sigma * rows for rows in prior.rows(names))
     stated = len(P)
-    if own is not None:
-        problem = replace(problem, free=np.union1d(problem.free, fit.columns))
-        solution = replace(solution, fit=replace(fit, problem=problem))
-        free = ~(P != 0).any(axis=0)[own.columns]
-        ties = PriorRows.near(own.mean[free], own.std[free] / sigma)
-        rows = np.zeros((len(ties.P), len(names)))
-        rows[:, own.columns[free]] = ties.P
-        P, target = np.vstack([P, rows]), np.append(target, ties.target)
+    problem = replace(solution.problem, free=np.union1d(solution.problem.free, fit.columns))
+    solution = replace(solution, fit=replace(fit, problem=problem))
+    rows = np.zeros((len(own.P), len(names)))
+    rows[:, fit.columns] = own.P
+    left = ~rows[:, P.any(axis=0)].any(axis=1)
+    P, target = np.vstack([P, rows[left]]), np.append(target, own.target[left])
     whole = PriorRows(P, target, (options.constraints or Constraints()).resolve(names))
     columns = fitted_columns(solution, whole, sigma)
     known = whole.restricted(columns, fit.x)
     progress("fitting with the prior" if len(P) else "fitting under constraints")
     found = KnownFit(least_squares(problem, columns, fit.x, known=known), known, sigma)
     progress("intervals with the prior" if len(P) else "intervals under constraints")
-    told = dict(zip(fit.columns.tolist(), before.spread.dof.tolist(), strict=True))
-    spare = own.dof if own else min(told.values())
-    dof = np.array([spare if own else told.get(c, spare) for c in columns.tolist()])
-    many = np.isin(columns, [] if own is None else own.columns)
+    dof = np.array([spare if before.beside else told.get(c, spare) for c in columns.tolist()])
+    many = np.isin(columns, fit.columns[own.P.any(axis=0)])
     spread = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
     shares = {
@@ -303,26 +294,23 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
     parameters they made estimable.  At active bounds the true distribution is smaller (χ̄²): the
     test is cautious.
     """
-    fit, own = before.solution.fit, before.functions
+    fit, own = before.solution.fit, before.solution.fit.known
     stated = rows + len(found.best.active) - (len(found.names) - len(fit.columns))
     if stated < 1:
         return ()
-    grown = found.objective - float(fit.whitened @ fit.whitened)
-    dof = max(float(before.spread.dof.min()), 1.0)
-    if own is not None:
-        away = (fit.x[own.columns] - own.mean) * own.sigma / own.std
-        grown, dof = grown - float(away @ away), own.dof
+    away = own.P @ fit.x[fit.columns] - own.target
+    grown = found.objective - float(fit.whitened @ fit.whitened + away @ away)
+    _, dof = before.beside or (0.0, max(float(before.spread.dof.min()), 1.0))
     F = max(grown, 0.0) / (stated * found.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
     if p > CONTRADICTED:
         return ()
-    what = [f"'{a.label}'" for a in found.best.active]
-    what += ["the prior"] if rows else []
+    what = [*["the prior"] * bool(rows), *(f"'{a.label}'" for a in found.best.active)]
     return (
-        f"The readings contradict {listed(what, 6)}: without, they are fitted better than noise "
-        f"explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). Check "
-        "names, units and signs of what is stated, and whether the model lacks an effect.",
+        f"The readings contradict {some(what, 6, ' and ')}: without, they are fitted better than "
+        f"noise explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). "
+        "Check names, units and signs of what is stated, and whether the model lacks an effect.",
     )
 
 
@@ -339,4 +327,5 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * problem.sizes[dropped] / problem.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0
-    return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
+    invisible = np.setdiff1d(before.invisible, columns)
+    return Reduction(columns, dropped, mixing, invisible, before.with_prior)

@@ -44,10 +44,32 @@ TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
+class PriorRows:
+    """What a fit knows of its columns besides the readings: P (k, columns) and target (k,) with
+    |target − P X|² beside whitened rows, and constraints on them."""
+
+    P: Array
+    target: Array
+    system: System | None = None
+
+    @classmethod
+    def near(cls, centre: Array, width: Array) -> PriorRows:
+        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
+        return cls(np.diag(1 / width), centre / width)
+
+    def restricted(self, columns: IntArray, x: Array) -> PriorRows:
+        """What it says of the `columns`, the others held at x.  Raises InputError where these alone
+        break a constraint."""
+        held = moved(x, columns, -x[columns])
+        system = None if self.system is None else self.system.restricted(columns, x)
+        return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
+
+
+@dataclass(frozen=True)
 class Fit:
     """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual.
 
-    `columns` (fitted,) index the parameters.
+    `columns` (fitted,) index the parameters; `known` is what the fit knew of them.
     """
 
     x: Array
@@ -57,6 +79,7 @@ class Fit:
     reason: str
     problem: Problem = field(repr=False)
     columns: NDArray[np.int64]
+    known: PriorRows
 
     @cached_property
     def B(self) -> Array:
@@ -82,28 +105,6 @@ class Fit:
         size = self.problem.sizes[self.columns]
         inverse = self.r_factor.scaled(size).half
         return (inverse @ inverse.T) * np.outer(size, size)
-
-
-@dataclass(frozen=True)
-class PriorRows:
-    """What a fit knows of its columns besides the readings: P (k, columns) and target (k,) with
-    |target − P X|² beside whitened rows, and constraints on them."""
-
-    P: Array
-    target: Array
-    system: System | None = None
-
-    @classmethod
-    def near(cls, centre: Array, width: Array) -> PriorRows:
-        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
-        return cls(np.diag(1 / width), centre / width)
-
-    def restricted(self, columns: IntArray, x: Array) -> PriorRows:
-        """What it says of the `columns`, the others held at x.  Raises InputError where these alone
-        break a constraint."""
-        held = moved(x, columns, -x[columns])
-        system = None if self.system is None else self.system.restricted(columns, x)
-        return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
 
 
 class Objective:
@@ -238,7 +239,7 @@ def fit(
     u, at, reason = objective.descend(u, tolerance, max_steps)
     return Fit(
         objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
-        problem, columns,
+        problem, columns, known,
     )  # fmt: skip
 
 

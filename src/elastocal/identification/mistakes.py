@@ -392,7 +392,8 @@ def refuse_nonsense(
     left, n = [residual], len(observed.lead)
     if apart is not None:
         left.append(apart.value - model.predict(apart.table, x, apart))
-    off = np.linalg.norm(np.concatenate(left).reshape(-1, observed.size)[:, :3], axis=1)
+    errors = np.concatenate(left).reshape(-1, observed.size)
+    off, turned = (np.linalg.norm(e, axis=1) for e in (errors[:, :3], errors[:, 3:]))
     table, length = observed.table, _length(model, observed.table)
     share = float((off > POOREST * length).mean())
     with np.errstate(over="ignore"):  # median and rms of those fitted, and of all
@@ -403,6 +404,13 @@ def refuse_nonsense(
     beyond = [(p.name, v) for p, v in zip(model.parameters, x, strict=True)
               if p.unit == "m" and not abs(v) <= LARGEST * (length + reach)]  # fmt: skip
     sane = max(fitted) <= POOREST * length and share <= FEW and not beyond
+    if (angle := float(np.median(turned))) > POOREST and (sane or _placed(model, every)):
+        raise InsufficientDataError(
+            f"{table.source}: after the fit the rotations are {np.degrees(angle):.3g}° (median) "
+            "from the model; check the order of qw, qx, qy, qz (rx, ry, rz are a rotation vector, "
+            "not Euler angles), and that they turn the target's axes into the tracker's; for a "
+            "target mounted at an angle fit marker_orientation"
+        )
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return
     fit = nominal_fit(model.chain, model.cell, every)

@@ -131,28 +131,16 @@ class SmoothPart:
 
 
 @dataclass(frozen=True)
-class FunctionPrior:
-    """What smooth functions bring into a fit: their parameters `columns` (k,) about `mean` (k,)
-    with deviations `std` (k,), and the noise `sigma` of a whitened row, known with `dof`."""
-
-    columns: IntArray
-    mean: Array
-    std: Array
-    sigma: float
-    dof: float
-
-
-@dataclass(frozen=True)
 class MethodResult:
     """The final fit, its `spread`, and the noise where it was estimated.
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
     fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
     many parameters the readings paid for (`effective`; in a fit to readings alone all fitted), and
-    `warnings` where the readings contradict them.  `smooth` are the smooth functions, whose prior
-    is `functions`, with which `standard` (N, size) are the residuals of all readings free of the
-    fit's part in them.  `limits` are the 95 % intervals of the parameters that the readings
-    `hardly_shown`, by their index.
+    `warnings` where the readings contradict them.  `smooth` are the smooth functions, `beside`
+    which σ of a whitened row and its degrees of freedom were found, and `standard` (N, size) the
+    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
+    the parameters that the readings `hardly_shown`, by their index.
     """
 
     method: str
@@ -165,7 +153,7 @@ class MethodResult:
     effective: int | None = None
     warnings: tuple[str, ...] = ()
     smooth: tuple[SmoothPart, ...] = ()
-    functions: FunctionPrior | None = None
+    beside: tuple[float, float] | None = None
     standard: Array | None = None
     limits: dict[int, tuple[float, float]] = field(default_factory=dict)
 
@@ -183,7 +171,7 @@ class MethodResult:
         A dropped parameter d is combined with it where its typical deviation s_d would shift the
         estimate by more than its standard deviation σ.  The others widen it to
         √(σ² + Σ_d (m_kd s_d)²), their typical deviations being a prior N(0, s_d²), as does what a
-        combination leaves out by being linear (`bent`).
+        combination leaves out by being linear (`bent`); bounds cut the interval off.
         """
         chosen, std = self.solution.reduction, float(self.spread.std[k])
         shift = np.abs(chosen.mixing[k]) * self.solution.problem.sizes[chosen.dropped]
@@ -191,9 +179,11 @@ class MethodResult:
                  for j in np.flatnonzero(shift > std)}  # fmt: skip
         left = np.append(shift[shift <= std], bent)
         wide = float(np.sqrt(1 + ((left / std) ** 2).sum())) if std > 0 else 1.0
-        value = float(self.solution.fit.x[chosen.kept[k]])
-        low, high = (float(value + wide * (end - value)) for end in self.ci95[k])
-        return terms, wide * std, (low, high)
+        value, system = self.solution.fit.x[chosen.kept[k]], self.solution.fit.known.system
+        ends = value + wide * (self.ci95[k] - value)
+        if system is not None:
+            ends = np.clip(ends, system.lower[k], system.upper[k])
+        return terms, wide * std, (float(ends[0]), float(ends[1]))
 
 
 # How to identify: method, noise, what is held, what becomes of faulty readings, where it starts.

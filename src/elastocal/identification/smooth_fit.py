@@ -25,7 +25,7 @@ from elastocal.identification.least_squares import Covariance, Fit, PriorRows
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import Course, FunctionPrior, MethodResult, SmoothPart
+from elastocal.identification.options import Course, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates
@@ -514,14 +514,13 @@ class _Search:
         method = self.options.resolved
         if not self.estimating:
             method = "ols" if problem.weights.kind == "none" else "wls"
-        own, shares = columns[k:], zip(columns[k:], share[k:].tolist(), strict=True)
-        sigma, std = fit.scales.sigma, fit.scales.sigma / np.diag(posterior.P[:, k:])
+        shares = zip(columns, share.tolist(), strict=True)
         return MethodResult(
             method, solution, covariance, noise, good, standard=self.standard,
             prior_share={model.names[c]: part for c, part in shares if not model.shrunk[c]},
             effective=round(effective), warnings=self._warnings(fit),
             smooth=self._parts(fit, covariance.matrix),
-            functions=FunctionPrior(own, model.nominal[own], std, sigma, spare),
+            beside=(fit.scales.sigma, spare),
         )  # fmt: skip
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:

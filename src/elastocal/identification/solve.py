@@ -22,12 +22,7 @@ from elastocal.identification.residuals import (
     predicts_better,
     rms_3d,
 )
-from elastocal.identification.weighted_problem import (
-    Problem,
-    RFactor,
-    Weights,
-    least_norm,
-)
+from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -413,15 +408,15 @@ BENDS = 24
 BENT_SAMPLE = 1000  # observations it is found from: what readings at random poses have in common
 
 
-def bent(solution: Solution, covariance: Array, held: Array) -> Array:
+def bent(solution: Solution, covariance: Array) -> Array:
     """Root mean square (kept,) of what estimates and combinations leave out by being linear.
 
     The readings determine a nonlinear function of the parameters.  Typical deviations δ of those
     dropped, with −mixing · δ of those kept, leave them where they are in the first order, and so do
     the errors of those kept, of this `covariance` (kept, kept); what estimates do in the second
     is found from the mean of the readings at both and at their opposites.  Where a length is hardly
-    told, a direction that is not told at all moves the markers by the product of the two.  A prior
-    of deviations σ/`held` (kept,), σ that of a whitened row, holds estimates against it.
+    told, a direction that is not told at all moves the markers by the product of the two.  What the
+    fit knows besides the readings holds estimates against it, equalities for exact.
     """
     problem, found, chosen = solution.problem, solution.fit, solution.reduction
     kept, dropped = chosen.kept, chosen.dropped
@@ -443,9 +438,12 @@ def bent(solution: Solution, covariance: Array, held: Array) -> Array:
     moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
         return none  # so far out the arm has no equilibrium
-    rows, target = looked.weights.apply(B), looked.weights.apply(moved.T / 2)
-    ties = np.diag(size * held)[held > 0]
-    step = least_norm(np.vstack([rows, ties]), np.pad(target, ((0, len(ties)), (0, 0))))
+    target, known, free = looked.weights.apply(moved.T / 2), found.known, np.eye(len(kept))
+    ties = known.P * size * np.sqrt(len(residual) / len(found.residual))  # as among all readings
+    if known.system is not None:
+        free = linalg.null_space(known.system.A * size)
+    rows = np.vstack([looked.weights.apply(B), ties]) @ free
+    step = free @ least_norm(rows, np.pad(target, ((0, len(ties)), (0, 0))))
     return np.asarray(size * np.sqrt((step**2).mean(axis=1)))
 
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError
 from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing import joining
 from elastocal.importing.exports import FORCES, Records, joint_stems, read_records
@@ -47,17 +47,17 @@ def forces_of(
     """
     named = points.texts.get("load")
     if named is None:
-        require(
-            not loads or bool(points.forces),
-            f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
-            "to; give load in [[source]], or a group (?P<load>…) in a pattern",
-        )
+        if loads and not points.forces:
+            raise InputError(
+                f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
+                "to; give load in [[source]], or a group (?P<load>…) in a pattern"
+            )
         return None
-    require(
-        not points.forces,
-        f"{points.source}: the load is stated by name and in columns {listed(points.forces)}; keep "
-        "one",
-    )
+    if points.forces:
+        raise InputError(
+            f"{points.source}: the load is stated by name and in columns {listed(points.forces)}; "
+            "keep one"
+        )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in loads.items():
         if isinstance(stated, LoadStatesTable):
@@ -153,8 +153,11 @@ def assemble(
     settings, n = mapping.join, len(points)
     numbers, units = dict(points.numbers), dict(points.units)
     stems = joint_stems(numbers)
-    told = 'map q1_deg … in [source.columns], or add a [[source]] with role = "joints"'
-    require(bool(stems), f"{where}: no joint values; {told}")
+    if not stems:
+        raise InputError(
+            f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
+            'role = "joints"'
+        )
     kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
     forces = forces_of(where, points, mapping.loads)
     if forces is not None:
@@ -211,12 +214,11 @@ def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str
     np.maximum.at(high, known.codes, q)
     span = high - low
     which = [known.names[c] for c in np.flatnonzero(np.any(span > spread, axis=1))]
-    told = (
+    return names, [
         f"{len(which)} configurations have rows whose joint values differ by up to "
         f"{span.max():.3g} (in the columns' unit): {listed(which, 8)}; if these are "
         "different poses, name them apart"
-    )
-    return names, [told] if which else []
+    ] if which else []  # fmt: skip
 
 
 def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
@@ -361,7 +363,7 @@ def import_files(
         if role in ("joints", "both") and joint_stems(found.numbers):
             found = joining.with_joints(where, found, table.joints, names)
         by_role["joints" if role == "joints" else "points"].append(found)
-        understood.append(found.understood)
+        understood.append(found.understood | {"role": role})
     if not by_role["points"]:
         raise InputError(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
@@ -372,8 +374,10 @@ def import_files(
     log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
     joined = None
     if log is not None:
-        told = "map q1_deg … (or q#_deg) in its [source.columns]"
-        require(log.q.shape[1] > 0, f"{log.files[0]}: no joint values; {told}")
+        if not log.q.shape[1]:
+            raise InputError(
+                f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
+            )
         joined = joining.join(points, log, table.join)
         points = _with_joint_values(points, log, joined)
     columns, kinds, doubts = assemble(where, points, table)

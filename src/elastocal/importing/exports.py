@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, require
+from elastocal.errors import ElastocalError, InputError
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import ColumnKey, SourceTable, TextSourceKeys, UnitsTable
-from elastocal.tables import MAX_LINE, NUMBER, column, first_bad_cell
-from elastocal.text import listed, quoted
+from elastocal.tables import MAX_LINE, NUMBER, THOUSANDS, column, first_bad_cell
+from elastocal.text import listed, plain_minus, quoted
 from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
 
 MAX_BYTES = 300_000_000
@@ -52,8 +52,11 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
     data = read_bytes(path, "export", MAX_BYTES)
     if not data.strip():
         raise InputError(f"{source}: empty file; export it again")
-    told = "is a workbook, bag, archive or other binary file; export its table as text (CSV)"
-    require(not data.startswith(_BINARY), f"{source}: {told}")
+    if data.startswith(_BINARY):
+        raise InputError(
+            f"{source}: is a workbook, bag, archive or other binary file; export its table as text "
+            "(CSV)"
+        )
     text, name = _decode(source, data, encoding)
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
@@ -85,9 +88,11 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
     if pattern is None:
         return None
     expression = compiled(where, "unit_comment", pattern)
-    told = "has no group (?P<unit>…); name the part that is the unit so"
-    named = "unit" in expression.groupindex
-    require(named, f"{where}: unit_comment = {quoted(pattern)} {told}")
+    if "unit" not in expression.groupindex:
+        raise InputError(
+            f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
+            "that is the unit so"
+        )
     found = (match["unit"] for text in comments if (match := expression.search(text)))
     return next((unit for unit in found if unit and known_unit(unit)), None)
 
@@ -96,8 +101,8 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
     try:
         return re.compile(pattern)
     except re.error as error:
-        told = f"{where}: {key} = {quoted(pattern)} is no regular expression: {error}"
-        raise InputError(told) from None
+        what = f"{key} = {quoted(pattern)} is no regular expression: {error}"
+        raise InputError(f"{where}: {what}") from None
 
 
 @dataclass(frozen=True)
@@ -167,8 +172,8 @@ def table_rows(
     if not rows:
         raise InputError(f"{source}: a header but no readings below it; export the points")
     if named and not header_line:  # which line comes nearest, and what it lacks
-        absent = [mapping_file.lacking(asked, cells) for _, cells in rows[:SAMPLE]]
-        least, (number, cells) = min(zip(absent, rows, strict=False), key=lambda row: len(row[0]))
+        lacks = [(mapping_file.lacking(asked, row[1]), row) for row in rows[:SAMPLE]]
+        least, (number, cells) = min(lacks, key=lambda one: (len(one[0]), -len(one[1][1])))
         raise InputError(
             f"{source}: no line has all the columns that the mapping names; line {number} has "
             f"{listed(map(quoted, cells), 12)}, but not {listed(least, 8)}: correct "
@@ -233,6 +238,11 @@ def _by_numbers(content: Numbered) -> list[str]:
     return sorted(DELIMITER_NAMES, key=numbers, reverse=True)
 
 
+# A number in any style, and blanks and apostrophes in it as office programs write them.
+_STYLED = re.compile(f"{NUMBER.pattern}|{THOUSANDS.pattern}")
+_PLAIN = str.maketrans("\u00a0\u202f\u2009\u2019", "   '")
+
+
 class NumberCells:
     """How the numbers of one file are written."""
 
@@ -243,7 +253,7 @@ class NumberCells:
         self.missing = {*MISSING, *(text.strip().casefold() for text in missing)}
         self.decimal = decimal
         if decimal == "auto":
-            bare = [self._bare(cell) for cell in sample]
+            bare = [text for cell in sample if _STYLED.fullmatch(text := self._bare(cell))]
             # Where a cell has both, the last is the decimal mark and the other is told as wrong.
             both = next((cell for cell in bare if "." in cell and "," in cell), None)
             points, commas = (any(mark in cell for cell in bare) for mark in ".,")
@@ -252,6 +262,7 @@ class NumberCells:
 
     def _bare(self, cell: str) -> str:
         text = cell.strip()
+        text = text if text.isascii() else plain_minus(text).translate(_PLAIN)
         return text.replace(self.thousands, "") if self.thousands else text
 
     def looks_numeric(self, cell: str) -> bool:
@@ -261,27 +272,24 @@ class NumberCells:
     def value(self, source: str, line: int, header: str, cell: str) -> float | None:
         """The number, None for a cell without a value."""
         text = self._bare(cell)
-        pointed = self.decimal == "," and "." in text
-        if self.decimal == "," and not pointed:
-            text = text.replace(",", ".")
-        if not pointed and text.casefold() in self.missing:
+        if text.casefold() in self.missing:
             return None
-        if not pointed and NUMBER.fullmatch(text) and math.isfinite(number := float(text)):
+        own = ("," if self.decimal == "." else ".") not in text and NUMBER.fullmatch(text)
+        if own and math.isfinite(number := float(text.replace(",", "."))):
             return number
-        where = f"{source}, line {line}, column {header}"
-        if pointed:
+        others = [mark for mark in ",.' " if mark in text and mark != self.decimal]
+        if others and _STYLED.fullmatch(text):
             raise InputError(
-                f"{where}: {quoted(cell)} has a decimal point, but the file is read with decimal "
-                "commas; set decimal or thousands in [source.text]"
+                f"{source}, line {line}, column {header}: {quoted(cell)} has "
+                f"{' and '.join(map(quoted, others))} in it, but the file is read with decimal "
+                f"{'points' if self.decimal == '.' else 'commas'}; set decimal or thousands in "
+                "[source.text]"
             )
-        if self.decimal == "." and "," in cell and NUMBER.fullmatch(cell.strip()):
-            raise InputError(
-                f"{where}: {quoted(cell)} has a comma, but the file is read with decimal points; "
-                'set decimal = "," or thousands = "," in [source.text]'
-            )
-        found = first_bad_cell(source, [(line, [self._bare(cell)])], {0: header}, True)
-        advice = "if such lines are no readings, pass over them with ignore in [source.text]"
-        raise InputError(f"{found or f'{where}: {quoted(cell)} is not a number'}; {advice}")
+        found = first_bad_cell(source, [(line, [text])], {0: header}, True)
+        raise InputError(
+            f"{found}, or list it in missing if it means no value, or pass over such lines with "
+            "ignore, both in [source.text]"
+        )
 
 
 def seconds_of(
@@ -313,7 +321,6 @@ RAPID_AXES = (*(f"rax_{i}" for i in range(1, 7)), *(f"eax_{letter}" for letter i
 NOT_CONNECTED = 9e9  # what RAPID writes for an external axis that does not exist
 NO_JOINTS = dict.fromkeys(("o_robtarget", "o_jointtarget"), "the position before a correction")
 NO_JOINTS["robtarget"] = "no joint values"
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 # Names begin where a word does, and no part gives back what it took: a line that is no statement
 # is looked through once, not from each of its letters.
 _KRL = re.compile(r"(?:(?<![\w$])([$A-Za-z_][\w$]*+(?:\[\s*+\d++\s*+\])?)\s*+=\s*+)?\{([^{}]*+)\}")
@@ -346,7 +353,7 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
             ignored.append((line, f"{name} {values}"))
             continue
         for axis, cell in values.items():
-            if not _NUMBER.fullmatch(cell):
+            if not NUMBER.fullmatch(cell):
                 raise InputError(
                     f"{source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
                     "values, not expressions"
@@ -354,11 +361,11 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
         kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
         rows.append((line, [name, *(kept.get(axis, "") for axis in axes)]))
     passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
-    require(
-        bool(rows),
-        f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
-        "its format in [source.text]",
-    )
+    if not rows:
+        raise InputError(
+            f"{source}: {what} in {len(lines)} lines{passed_over}; check the file, or "
+            "its format in [source.text]"
+        )
     # Axes that no row has (E1 … of a robot without them) are no columns.
     used = [0, *(i for i in range(1, len(axes) + 1) if any(cells[i] for _, cells in rows))]
     rows = [(line, [cells[i] for i in used]) for line, cells in rows]
@@ -457,9 +464,11 @@ class Records:
 
     def clock(self, how: str) -> Array:
         """(n,) s on the file's clock, by which rows are to be joined."""
-        told = "map time_s or time_text in [source.columns], or join by order or name"
-        told = f"{self.source}: no times, by which [join] is to join by {how}; {told}"
-        require("time" in self.numbers, told)
+        if "time" not in self.numbers:
+            raise InputError(
+                f"{self.source}: no times, by which [join] is to join by {how}; map time_s or "
+                "time_text in [source.columns], or join by order or name"
+            )
         return self.numbers["time"]
 
     @property
@@ -553,7 +562,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         numbers["time"], of["time"] = np.array(seconds), "s"
     used = {i for c in every for i in c.index}
     understood = {
-        "file": name, "preset": source.preset, "role": source.role or "both",
+        "file": name, "preset": source.preset, "role": "",
         "encoding": encoding, "layout": table.layout, "decimal": cells.decimal,
         "columns": tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
@@ -614,8 +623,8 @@ def likely_presets(path: Path) -> list[str]:
     """The presets that read most rows of a file; none where no preset reads it."""
     rows = dict[str, int]()
     for name in mapping_file.PRESETS:
-        where, mapping = mapping_file.read_mapping(None, [name])
+        where, mapping = mapping_file.read_mapping(None, [name], "mm", "deg")
         for source in mapping.source or ():
             with suppress(ElastocalError):
-                rows[name] = len(read_records(where, path, source, UnitsTable()))
+                rows[name] = len(read_records(where, path, source, mapping.units))
     return [name for name, n in rows.items() if n == max(rows.values())]

@@ -78,10 +78,10 @@ def init(
         6
     """
     target = None if output is None else Path(output)
-    require(
-        target is None or force or not target.exists(),
-        f"{target} is there already; name another file, or give {option('force', True)}",
-    )
+    if target is not None and not force and target.exists():
+        raise InputError(
+            f"{target} is there already; name another file, or give {option('force', True)}"
+        )
     found = robot
     if not isinstance(found, Robot):
         found = robot_of(Path(found), base, flange, convention, ur_model)
@@ -107,25 +107,22 @@ def robot_of(
     Base and flange are those that are found where none are named, so that a cell states them.
     """
     kind = ENDINGS.get(path.suffix.lower())
-    require(path.suffix.lower() != ".xacro", xacro_left(path, f"the ending '{path.suffix}'"))
+    if path.suffix.lower() == ".xacro":
+        raise InputError(xacro_left(path, f"the ending '{path.suffix}'"))
     if kind is None:
         raise InputError(
             f"{path}: the ending '{printable(path.suffix)}' names no robot file; give a URDF "
             "(.urdf), a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration "
             "of a UR (.conf, .yaml)"
         )
-    require(
-        ur_model is None or path.suffix.lower() == ".conf",
-        f"{option('ur_model')} is for a calibration.conf; leave it out for {path}",
-    )
+    if ur_model is not None and path.suffix.lower() != ".conf":
+        raise InputError(f"{option('ur_model')} is for a calibration.conf; leave it out for {path}")
     if kind == "dh":
         for name, given in (("base", base), ("flange", flange)):
             require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
         return replace(Robot.from_dh(path, convention), ur_model=ur_model)
-    require(
-        convention == "standard",
-        f"{option('convention')} is for DH tables; leave it out for {path}",
-    )
+    if convention != "standard":
+        raise InputError(f"{option('convention')} is for DH tables; leave it out for {path}")
     if kind == "urdf":
         return Robot.from_urdf(path, *check_urdf(path).ends(base, flange or None))
     arm = MjcfArm.read(path, base, flange)

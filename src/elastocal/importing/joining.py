@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError
 from elastocal.importing import exports
 from elastocal.importing.exports import Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, NamesTable
@@ -39,21 +39,21 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     missing += [] if heights else ["zenith or elevation"]
     if not found:
         return records
-    require(
-        not both,
-        f"{records.source}: positions are mapped twice, as {listed(both)} and as "
-        f"{listed(found)}; keep one of the two in [source.columns]",
-    )
-    require(
-        len(heights) < 2,
-        f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
-        "gives (a level line has zenith 90° and elevation 0°)",
-    )
-    require(
-        not missing,
-        f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
-        "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]",
-    )
+    if both:
+        raise InputError(
+            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
+            f"{listed(found)}; keep one of the two in [source.columns]"
+        )
+    if len(heights) > 1:
+        raise InputError(
+            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
+            "gives (a level line has zenith 90° and elevation 0°)"
+        )
+    if missing:
+        raise InputError(
+            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
+            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
+        )
     height, numbers = heights[0], dict(records.numbers)
     d = numbers.pop("range")
     alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
@@ -129,7 +129,7 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
     if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
         raise InputError(
             f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
-            f"({listed(map(quoted, patterns), 3)}), as do not {len(bad) - 1} others; {NAMED}, or "
+            f"({listed(map(quoted, patterns), 3)}), nor do {len(bad) - 1} others; {NAMED}, or "
             'unmatched = "ignore" to leave such points out'
         )
     found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}
@@ -183,8 +183,14 @@ def with_joints(
                 f"{where}: [joints] {key} has {len(given)} numbers, but there are {n} joints; give "
                 "one per joint"
             )
-    for value in joints.sign or ():
-        require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
+        for j, (value, unit) in enumerate(zip(given or (), units, strict=False), 1):
+            if key == "sign" and abs(value) != 1:
+                raise InputError(f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
+            if key != "sign" and value and not key.endswith(unit):
+                raise InputError(
+                    f"{where}: [joints] {key} is {value:g} for joint {j}, which is in {unit}; give "
+                    f"offset_{unit}"
+                )
     none = [0.0] * n
     offset = np.where(np.array(units) == "deg", joints.offset_deg or none, joints.offset_mm or none)
     before = np.take_along_axis(records.q, taken, axis=1) * (joints.sign or [1.0] * n) + offset
@@ -192,11 +198,11 @@ def with_joints(
     for k, coupling in enumerate(joints.coupling):
         for name in ("joint", "of"):
             number = getattr(coupling, name)
-            require(
-                number <= n,
-                f"{where}: {name} = {number} of [joints] coupling no. {k + 1}: the file has {n} "
-                "joints",
-            )
+            if number > n:
+                raise InputError(
+                    f"{where}: {name} = {number} of [joints] coupling no. {k + 1}: the file has "
+                    f"{n} joints"
+                )
         j, i = coupling.joint - 1, coupling.of - 1
         if units[j] != units[i]:
             raise InputError(
@@ -219,18 +225,18 @@ def _order(
 ) -> IntArray:
     """(rows, joints): the file's joint, from 0, for each joint of the robot."""
     order = joints.order or list(range(1, n + 1))
-    require(
-        max(order) <= n and len(set(order)) == len(order),
-        f"{where}: [joints] order = {order} takes each of the file's {n} joints at most once",
-    )
+    if max(order) > n or len(set(order)) != len(order):
+        raise InputError(
+            f"{where}: [joints] order = {order} takes each of the file's {n} joints at most once"
+        )
     as_stated = np.tile(np.array(order) - 1, (len(records), 1))
     columns = [records.texts[f"joint{i}"] for i in range(1, n + 1) if f"joint{i}" in records.texts]
     if joints.order is not None or len(columns) != n:
-        require(
-            joints.order is not None or joints.names is None,
-            f"{where}: [joints] names needs the joint names of the file: add "
-            'joint# = "name_#0" to [source.columns], or use order',
-        )
+        if joints.order is None and joints.names is not None:
+            raise InputError(
+                f"{where}: [joints] names needs the joint names of the file: add "
+                'joint# = "name_#0" to [source.columns], or use order'
+            )
         return as_stated
     found = list(zip(*columns, strict=True))
     wanted = joints.names or (model_names if set(model_names) <= set(found[0]) else None)
@@ -254,11 +260,11 @@ def _order(
 def pooled(records: Sequence[Records]) -> Records:
     if any(r.load is not None for r in records):
         for r in records:
-            require(
-                "load" in r.texts or r.load is not None,
-                f"{r.source}: says no load, other files do; give load in its [[source]], or a "
-                "group (?P<load>…) in its pattern",
-            )
+            if "load" not in r.texts and r.load is None:
+                raise InputError(
+                    f"{r.source}: says no load, other files do; give load in its [[source]], or a "
+                    "group (?P<load>…) in its pattern"
+                )
         records = [replace(r, texts={"load": [str(r.load)] * len(r)} | r.texts) for r in records]
     first, *others = records
     for other in others:
@@ -485,8 +491,11 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
 def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     names = _names_of(log)
     for pool, has in ((log, bool(names)), (points, "configuration" in points.texts)):
-        told = "map name or configuration in [source.columns], and a pattern in [source.names]"
-        require(has, f"{pool.files[0]}: no names of poses, by which [join] is to join; {told}")
+        if not has:
+            raise InputError(
+                f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
+                "configuration in [source.columns], and a pattern in [source.names]"
+            )
     q, row = log.q, np.full(len(points), -1)
     key = _keys(points.texts["configuration"], names) or _key
     unused: set[int] = set(range(len(log)))
@@ -533,11 +542,11 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
     first, last, standing = np.arange(len(q)), np.arange(len(q)), q
     if how == "standstill":
         first, last, standing = dwells(clock, q, still, shortest)
-        require(
-            len(first) > 0,
-            f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
-            "still_deg in [join], or join by time",
-        )
+        if not len(first):
+            raise InputError(
+                f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s "
+                "and still_deg in [join], or join by time"
+            )
     stop, apart = _nearest(at, clock[first], clock[last])
     good = apart <= settings.tolerance_s
     unused, remarks, warnings = tuple[str, ...](), list[str](), list[str]()
@@ -566,5 +575,4 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         for i in np.flatnonzero(~good)
     )
     row = np.where(good, order[first[stop]], -1)
-    told = left_out, unused, tuple(remarks), tuple(warnings)
-    return Joined(how, row, standing[stop], None, *told)
+    return Joined(how, row, standing[stop], None, left_out, unused, tuple(remarks), tuple(warnings))

@@ -28,7 +28,7 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError, check_known, option, require
+from elastocal.errors import InputError, check_known, option
 from elastocal.measurements import families
 from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
@@ -184,16 +184,19 @@ def read_mapping(
     if presets:
         data = {**data, "source": [{"preset": name} for name in presets]}
     checked(MappingTable, data, where)
-    told = f'no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or give'
-    require(bool(data.get("source")), f"{where}: {told} {option('presets')}")
+    if not data.get("source"):
+        raise InputError(
+            f'{where}: no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or '
+            f"give {option('presets')}"
+        )
     merged = {"source": [_with_preset(where, s) for s in data["source"]]}
     table = checked(MappingTable, data | merged | {"units": data.get("units", {}) | given}, where)
     for k, source in enumerate(table.source or ()):
-        require(
-            bool(source.columns),
-            f"{where}: {place('source', k)} has neither preset nor columns; say where the "
-            'numbers stand, as in x_mm = "X"',
-        )
+        if not source.columns:
+            raise InputError(
+                f"{where}: {place('source', k)} has neither preset nor columns; say where the "
+                'numbers stand, as in x_mm = "X"'
+            )
     return where, table
 
 
@@ -309,20 +312,20 @@ def wanted(
                             *((*own, False) for own in optional.items())):  # fmt: skip
         target, places = column_key(where, name), at if isinstance(at, list) else [at]
         joints = range(1, MOST_JOINTS + 1) if "#" in name else ()  # q#: one column for each
-        require(
-            not (joints and any(isinstance(part, int) for part in places)),
-            f'{where}: {name} takes a name with # or #0 in it, as in "position_#0"; write '
-            f"{name.replace('#', '1')} = {at}, … for columns by number",
-        )
-        require(
-            not target.quantities or not isinstance(at, list),
-            f"{where}: {name} takes one column; only texts such as name are joined from several",
-        )
-        require(
-            EACH not in str(at) or bool(target.quantities),
-            f"{where}: {name} = {quoted(str(at))}: {EACH} stands for the markers of a row in "
-            'places of numbers, as in x_mm = "*_x"',
-        )
+        if joints and any(isinstance(part, int) for part in places):
+            raise InputError(
+                f'{where}: {name} takes a name with # or #0 in it, as in "position_#0"; write '
+                f"{name.replace('#', '1')} = {at}, … for columns by number"
+            )
+        if target.quantities and isinstance(at, list):
+            raise InputError(
+                f"{where}: {name} takes one column; only texts such as name are joined from several"
+            )
+        if EACH in str(at) and not target.quantities:
+            raise InputError(
+                f"{where}: {name} = {quoted(str(at))}: {EACH} stands for the markers of a row in "
+                'places of numbers, as in x_mm = "*_x"'
+            )
         every = [replace(target, at=tuple(places), required=needed)]
         if joints:
             every = [
@@ -337,9 +340,8 @@ def wanted(
         for one in every:
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             before = filled.setdefault(name if one.stem == "time" else one.stem, one)
-            require(
-                before is one, f"{where}: {before.key} and {name} fill the same column; keep one"
-            )
+            if before is not one:
+                raise InputError(f"{where}: {before.key} and {name} fill the same column; keep one")
     return tuple(filled.values())
 
 
@@ -417,13 +419,14 @@ def resolve(
         return tuple(columns)
     needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in unstated
                              if (unit := USUAL.get(q := c.quantities[0])))]  # fmt: skip
+    more = f"; a mapping file says it by [units] or a key such as {next(iter(unstated.values()))}"
+    more = more if needed else " of a mapping file"
     if by_key := [key for c, key in unstated.items() if c.quantities[0] not in USUAL]:
         needed.append(f"{listed(by_key)} in [source.columns]")
     several = len(unstated) > 1
     raise InputError(
         f"{source}: column{'s' * several} {listed((quoted(c.header) for c in unstated), 12)} "
-        f"state{'s' * (not several)} no unit; give {' and '.join(needed)}; a mapping file says "
-        f"it by [units] or a key such as {next(iter(unstated.values()))} in [source.columns]"
+        f"state{'s' * (not several)} no unit; give {' and '.join(needed)}{more}"
     )
 
 
@@ -434,11 +437,11 @@ def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -
         hits = [part - 1] * (part <= width) if isinstance(part, int) else _find(part, header)
         if not hits and not target.required:
             return None
-        require(
-            bool(hits or sought),
-            f"{source}: {target.key} is column {part}, but the first reading has {width} "
-            "columns; correct the number in [source.columns], or the delimiter",
-        )
+        if not hits and not sought:
+            raise InputError(
+                f"{source}: {target.key} is column {part}, but the first reading has {width} "
+                "columns; correct the number in [source.columns], or the delimiter"
+            )
         if not hits:
             raise InputError(
                 f"{source}: no column {' or '.join(map(quoted, sought))} for {target.key}"

@@ -12,13 +12,7 @@ import numpy as np
 from elastocal.errors import option
 from elastocal.identification import findings
 from elastocal.identification.prediction import PredictedError
-from elastocal.identification.result import (
-    LOPSIDED,
-    Calibration,
-    Combination,
-    Estimate,
-    deviation,
-)
+from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.identification.sentences import next_steps
 from elastocal.model.arm import Parameter
@@ -197,10 +191,10 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
 
 
 def what_was_identified(result: Calibration) -> str:
-    alone, n = len(names_of(result, findings.ALONE)), len(result.combinations)
-    text = f"{alone} of {say.counted(len(result.ordinary), 'parameter')}"
-    if (tied := result.finding("mostly_prior")) is not None:
-        text += f", {len(tied.numbers['parameters'])} of them mostly by their prior"
+    alone, n = names_of(result, findings.ALONE), len(result.combinations)
+    text = f"{len(alone)} of {say.counted(len(result.ordinary), 'parameter')}"
+    if mostly := [p for p in alone if result.prior_share.get(p, 0.0) > findings.MOSTLY]:
+        text += f", {len(mostly)} of them mostly by their prior"
     if n:
         absorbed = len(names_of(result, findings.ABSORBED))
         text += (
