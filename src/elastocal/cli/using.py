@@ -305,7 +305,7 @@ def compensate(
     force = given_force(asked.get("load"))
     _check(targets, target, output, table, (grid, box, rotation))
     run.writes((output, ".csv"), (table, ".csv"))
-    content, commands, corrections = {}, "", ""
+    content, commands, corrections, reached = {}, "", "", False
     with run.progress() as progress:
         progress("reading")
         arm = read_calibrated(cell, result, run.plugins)
@@ -318,12 +318,12 @@ def compensate(
             found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
             if not partial:
                 single.check_reached(found)
-            kinds = found.chain.kinds
-            content["commands"] = single.summary(found, kinds, commands=output is None)
-            commands = single.commands_csv(found, kinds)
+            content["commands"] = single.summary(found, commands=output is None)
+            commands, reached = single.commands_csv(found), bool(found.reached.any())
         if table is not None and lines is not None:
             where = tool_point(arm.model.cell, asked.get("point"))
-            made = grids.correction_table(arm, lines, where, force, start, asked["seed"], progress)
+            how = force, start, asked["seed"], progress, asked["frame"]
+            made = grids.correction_table(arm, lines, where, *how)
             content["table"], corrections = grids.summary_and_csv(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(
@@ -334,7 +334,7 @@ def compensate(
         lambda: content.pop("commands", {}) | content,
         lambda screen: print_blocks(screen, compensation_blocks(content)),
     )
-    if shown and output is not None:
+    if shown and output is not None and reached:
         say(
             f"Next: Run {output.name} and measure some. 95 % of the targets should be reached "
             "within its column within95_um, measurement noise excluded."

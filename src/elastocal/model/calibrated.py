@@ -620,6 +620,11 @@ class CalibratedTool:
 
     def frames(self, rows: list[NDArray]) -> tuple[Array, Array, Array]:
         """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for;
-        the point (n, 3) m and the tool's rotation (n, 3, 3) in the flange frame."""
-        T, place, turn = self._frames(*rows, self.x)
+        the point (n, 3) m and the tool's rotation (n, 3, 3) in the flange frame.  What moves them
+        with the joints' angles is an error of the arm and no part of the frames."""
+        x = self.x.copy()
+        for group in smooth_groups(self.calibrated.model):
+            if group.basis is not None and group.lasting:
+                x[group.columns] = 0.0
+        T, place, turn = self._frames(*rows, x)
         return T, place[..., 0], turn

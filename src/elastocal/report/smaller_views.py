@@ -150,7 +150,7 @@ def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     more = len(c.status) - len(rows)
     note = f"and {more} more in the file of commands" if more else ""
     commands = say.ShownTable(heads, rows, (0, len(heads) - 1), note=note)
-    yield from compensation_blocks({"commands": summary(c, kinds, commands=False)})
+    yield from compensation_blocks({"commands": summary(c, commands=False)})
     yield say.Fold(
         "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, told=False)],
         figures=("errors",),
@@ -193,6 +193,11 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
             "first order (beside singular postures or limits)."
         )
+        if (std := table["std_um"]["rms"]) is not None:
+            yield say.Sentence(
+                f"Standard uncertainty of the tool at them: {say.length(std * 1e-6)} rms; within, "
+                f"at 95 %: {say.length(table['within95_um']['rms'] * 1e-6)}."
+            )
         yield say.Lines([(say.WARNING, text) for text in table["warnings"]])
 
 
