@@ -108,7 +108,8 @@ class Exported:
 
     `held`: parameters that the data did not determine, with the values used; `refit`: how far the
     file is from the arm before and after what it holds was fitted to it; `correction`: where its
-    joints are to be commanded besides, empty where nothing was asked for; `checked`: the largest
+    joints are to be commanded besides, empty where nothing was asked for; `T_tracker_base` (4, 4)
+    goes with what the file holds, though it may have no place for it; `checked`: the largest
     distance in m when it was read back with `checked_with`, None where it was not; `without_beta`:
     of a DH table with a column beta_rad that in m for who reads four columns only.
     """
@@ -119,6 +120,7 @@ class Exported:
     of_the_measurement: tuple[str, ...]
     refit: exportable.Refit | None
     correction: exportable.JointCorrection
+    T_tracker_base: Array
     warnings: tuple[str, ...]
     text: str = ""
     checked: float | None = None
@@ -131,12 +133,20 @@ class Exported:
         warnings, (checked, how) = (*self.warnings, *told), read
         return replace(self, text=text, warnings=warnings, checked=checked, checked_with=how)
 
+    @property
+    def base_told(self) -> str:
+        xyz, rpy = (
+            " ".join(f"{v:.9g}" for v in each) for each in placed(self.T_tracker_base).values()
+        )
+        return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
+
     def to_json(self) -> dict[str, Any]:
         return {
             "schema": SCHEMA,
             "format": self.format,
             "cannot_hold": self.cost.to_json(),
             "refit": None if self.refit is None else self.refit.to_json(),
+            "tracker_to_base": placed(self.T_tracker_base),
             "read_back": {"with": self.checked_with, "max_um": microns(self.checked)},
             "without_beta_max_um": microns(self.without_beta),
             "held": self.held,
@@ -199,10 +209,19 @@ def export(
          "equilibrium under the load and are left out"),
     )  # fmt: skip
     told = tuple(text for so, text in doubts if so)
-    done = Exported(wish.kind, cost, held, kept.of_the_measurement, refit, correction, told)
+    done = Exported(
+        wish.kind, cost, held, kept.of_the_measurement, refit, correction, pieces.T_tracker_base,
+        told,
+    )  # fmt: skip
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
     written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
     return written
+
+
+def placed(T: Array) -> dict[str, list[float]]:
+    """A placement (4, 4) as m and rad (roll, pitch, yaw)."""
+    rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
+    return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
@@ -249,11 +268,6 @@ class _Writing:
         """
         pieces, model = self.pieces, self.calibrated.model
         chain, cell = pieces.calibrated_chain(), model.cell
-
-        def placed(T: Array) -> dict[str, list[float]]:
-            rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
-            return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
-
         document = {
             "schema": PARAMETERS,
             "robot": chain.name,
@@ -337,7 +351,7 @@ class _Writing:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
             low, high = f"{sizes.min():.4g}", f"{sizes.max():.4g}"
             span = high if low == high else f"{low} to {high}"
-            told += f", fitted where it was measured, under {span} N"
+            told += f", fitted where it was measured, under {span} N, {self.done.base_told}"
         return told
 
     def random(self, poses: int) -> Measurements:

@@ -282,6 +282,8 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
         nominal = say.length(refit.nominal)
         yield say.Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
+        if refit.taken or refit.correction is not None:
+            yield say.Sentence(f"The file is fitted {done.base_told}: place it there.")
     if done.checked is not None:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
