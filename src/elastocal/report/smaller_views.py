@@ -95,6 +95,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         )
     yield say.Lines([
         ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
+        *(("Not compared", f"{text}.") for text in ["; ".join(c.not_compared)] if text),
         *(("Next", step) for step in steps),
     ])  # fmt: skip
     yield say.Fold("", lambda: [_moves(c)], figures=("moved",))
@@ -117,8 +118,11 @@ def _change_table(c: Comparison) -> say.ShownTable:
         "of such a difference where nothing has changed, corrected for all parameters. Moves the "
         "tool: rms over the poses, by this change alone."
     )
+    if any(one.name not in c.old.values for one in c.changes):
+        note += " Of smooth functions all numbers are such rms."
     table = say.ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
-    return replace(table, narrow=table.without(1, 2).when_narrow(2, 4))
+    short = table.without(1, 2)
+    return replace(table, narrow=replace(short, narrow=short.without(4).when_narrow(2)))
 
 
 def _moves(c: Comparison) -> say.Figure:
