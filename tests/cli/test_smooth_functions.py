@@ -92,7 +92,8 @@ def test_compare_takes_a_curve_as_one_and_leaves_out_one_that_a_session_does_not
 
     (one,) = (part for part in compared()["parameters"] if part["changed"])
     assert one["name"] == "joint curve of joint1" and one["change"] == one["moves"] > 1e-4
-    content = json.loads(other.read_text()) | {"open": None}
+    content = json.loads(other.read_text())
+    del content["open"]
     names = content["covariance_of"]
     kept = [k for k, name in enumerate(names) if not name.startswith("joint1.curve")]
     content["covariance"] = np.array(content["covariance"])[np.ix_(kept, kept)].tolist()
