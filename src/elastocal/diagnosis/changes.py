@@ -25,14 +25,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from elastocal.above import Result, checked_arguments
-from elastocal.cell.arm_description import Tool
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
+    CalibratedTool,
     Conditions,
+    ToolPoint,
     Valued,
     arm_with,
     given_arm,
@@ -40,7 +41,7 @@ from elastocal.model.calibrated import (
     unstated_needs,
 )
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.manipulator import Model, smooth_groups
+from elastocal.model.manipulator import smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array
 
@@ -49,7 +50,6 @@ LEVEL = 0.05  # chance that anything is called changed where nothing is
 SAME_SPACE = 1e-6  # of a column of B that others should hold
 RANK = 1e-9
 CENTRAL = 0.95
-POINT = "tool"
 NAMED = 4  # parameters in a message
 MOST_POSES = 100_000
 
@@ -261,48 +261,32 @@ def _compared(
             f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
             "both with the same effects, from poses that show them"
         )
-    tool = _tool_model(before.model)
-    at_tool = replace(table, marker=np.zeros_like(table.marker), marker_names=(POINT,))
+    cell = before.model.cell
+    load = cell.tool.load_point
+    at = load if load.any() else next(iter(cell.tool.markers.values()), load)
     # The set-up of the old campaign for both.
-    set_up = {name: value for name, value in before.values.items() if name not in own}
-    x, moved = (
-        np.array([values[name] for name in tool.names])
-        for values in (before.values, after.values | set_up)
+    pairs = zip(before.model.names, before.x, after.x, strict=True)
+    moved = np.array([b if name in own else a for name, a, b in pairs])
+    tool, tool_moved = (
+        CalibratedTool(replace(old, model=before.model, x=x), ToolPoint(at, None, "tool"))
+        for x in (before.x, moved)
     )
-    here, there = _positions(tool, at_tool, x), _positions(tool, at_tool, moved)
+    rows = tool.rows(table)
+    here, there = (each.poses(rows, table.q)[0] for each in (tool, tool_moved))
     settled = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
     if not settled.any():
         raise InsufficientDataError(
             f"none of {poses} random poses has a static equilibrium under the load; check "
             f"{option('load')}"
         )
-    columns = np.array([tool.names.index(name) for name in names])
-    rows = at_tool.take(np.flatnonzero(settled))
-    B = tool.regressor(rows, x, columns).B.reshape(len(rows.q), 3, len(names))
+    columns = [before.model.names.index(name) for name in names]
+    B = tool.sensitivity([row[settled] for row in rows], table.q[settled])[..., columns]
     chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
     changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
         forces, whose, first_order, tuple(left),
     )  # fmt: skip
-
-
-def _tool_model(model: Model) -> Model:
-    """The model with one known point of the tool as its marker: the load point, or a marker."""
-    cell = model.cell
-    load = cell.tool.load_point
-    point = load if load.any() else next(iter(cell.tool.markers.values()), load)
-    kept = tuple(c for c in cell.model.effects if CATALOGUE[c.name].stage != POINT)
-    spec = replace(cell.model, effects=kept)
-    return Model.assembled(
-        model.chain, replace(cell, tool=Tool(load_point=load, markers={POINT: point}), model=spec)
-    )
-
-
-def _positions(model: Model, table: Measurements, x: Array) -> Array:
-    """Where the tool's point is (n, 3) in m, NaN without an equilibrium."""
-    T = model.flange_poses(table, x)
-    return np.asarray(T[:, :3, :3] @ model.cell.tool.markers[POINT]) + T[:, :3, 3]
 
 
 def _covariance(arm: CalibratedArm, names: Sequence[str]) -> Array:
