@@ -81,16 +81,11 @@ def test_compare_takes_a_curve_as_one_and_leaves_out_one_that_a_session_does_not
     cell, other = folder / "curved.toml", folder / "other.json"
     truth = json.loads((folder / "truth.json").read_text())
     truth["joint1.curve_1"] += 4e-4
-    words = (f"--set={name}={value!r}" for name, value in truth.items())
-    run("simulate", cell, folder / "turns.csv", "-o", folder / "other.csv", "--seed", 2, *words)
+    sets = (f"--set={name}={value!r}" for name, value in truth.items())
+    run("simulate", cell, folder / "turns.csv", "-o", folder / "other.csv", "--seed", 2, *sets)
     run("identify", cell, folder / "other.csv", "-o", other)
-
-    def compared() -> dict:
-        return dict(
-            json.loads(run("compare", cell, folder / "result.json", other, "--json").stdout)
-        )
-
-    (one,) = (part for part in compared()["parameters"] if part["changed"])
+    words = ("compare", cell, folder / "result.json", other, "--json")
+    (one,) = (part for part in json.loads(run(*words).stdout)["parameters"] if part["changed"])
     assert one["name"] == "joint curve of joint1" and one["change"] == one["moves"] > 1e-4
     content = json.loads(other.read_text())
     del content["open"]
@@ -99,4 +94,5 @@ def test_compare_takes_a_curve_as_one_and_leaves_out_one_that_a_session_does_not
     content["covariance"] = np.array(content["covariance"])[np.ix_(kept, kept)].tolist()
     content["covariance_of"] = [names[k] for k in kept]
     other.write_text(json.dumps(content))
-    assert compared()["not_compared"] == ["joint curve of joint1 (one session alone shows it)"]
+    (left,) = json.loads(run(*words).stdout)["not_compared"]
+    assert left == "joint curve of joint1 (one session alone shows it)"
