@@ -32,7 +32,7 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.errors import InputError, InsufficientDataError, NotAcceptedError, option, require
+from elastocal.errors import InsufficientDataError, NotAcceptedError, option, require
 from elastocal.screen import complain, progress_line, say
 from elastocal.text import listed
 
@@ -331,7 +331,7 @@ def compensate(
             (table, lambda path: atomic_write(path, corrections)),
         )
     shown = run.answer(
-        lambda: content.pop("commands", {}) | content,
+        lambda: {"schema": single.SCHEMA} | content.pop("commands", {}) | content,
         lambda screen: print_blocks(screen, compensation_blocks(content)),
     )
     if shown and output is not None and reached:
@@ -474,16 +474,11 @@ def compare(
 
 def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
     """Cell and both results where the cell does not come first, as it once did not."""
-    if old.suffix.lower() == ".toml":
-        raise InputError(
-            f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
-        )
+    told = f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
+    require(old.suffix.lower() != ".toml", told)
     known = old.parent / "cell.toml" if cell is None else cell
-    if cell is None and not known.is_file():
-        raise InputError(
-            f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL "
-            f"{old} {new}"
-        )
+    told = f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL"
+    require(cell is not None or known.is_file(), f"{told} {old} {new}")
     return known, old, new
 
 

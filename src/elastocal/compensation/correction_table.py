@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.compensation import compensate as single
-from elastocal.errors import InputError, option
+from elastocal.errors import option, require
 from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.model.arm import COLUMNS
@@ -85,15 +85,15 @@ class CorrectionTable:
 def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[Array, ...]:
     """`counts` levels (one number for all) from low to high (n,); of one level the middle."""
     n, told = len(low), ",".join(map(str, counts))
-    if len(counts) not in (1, n) or min(counts) < 1:
-        raise InputError(f"{option('grid')} takes {what}, 1 or more; found '{told}'")
+    fits = len(counts) in (1, n) and min(counts) >= 1
+    require(fits, f"{option('grid')} takes {what}, 1 or more; found '{told}'")
     counts = counts * n if len(counts) == 1 else counts
     size = math.prod(counts)
-    if size > MOST_POINTS:
-        raise InputError(
-            f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the "
-            "most; give fewer levels to the joints that matter least (1 holds one in the middle)"
-        )
+    require(
+        size <= MOST_POINTS,
+        f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the most; give fewer "
+        "levels to the joints that matter least (1 holds one in the middle)",
+    )
     return tuple(
         np.linspace(a, b, k) if k > 1 else np.array([(a + b) / 2])
         for a, b, k in zip(low, high, counts, strict=True)
@@ -160,12 +160,10 @@ def _sided(arm: CalibratedArm) -> tuple[str, ...]:
     an effect of the arm follows what else a table of corrections cannot know."""
     sided: tuple[str, ...] = ()
     for name, needs in unstated_needs(arm, Conditions()).items():
-        if needs:
-            raise InputError(
-                f"{option('table')}: corrections hold at any time, and {name} follows "
-                f"{listed(COLUMNS[need] for need in needs)}; give a table of targets with that "
-                "column, or identify without the effect"
-            )
+        columns = listed(COLUMNS[need] for need in needs)
+        told = f"{option('table')}: corrections hold at any time, and {name} follows {columns}"
+        remedy = "give a table of targets with that column, or identify without the effect"
+        require(not needs, f"{told}; {remedy}")
         if "approach" in CATALOGUE[name].needed(arm.model.cell):
             sided = ("the corrections are those between both directions of a joint's last motion",)
     return sided
@@ -273,9 +271,8 @@ def _with_table(
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
     aimed = check.goals.in_base(check.T_data_base)
-    known = np.flatnonzero(
-        np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
-    )
+    usable = np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
+    known = np.flatnonzero(usable)
     moved, flange = aimed.position + correction[:, :3], None
     if aimed.rotation is not None:
         turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix()
@@ -302,11 +299,10 @@ def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
     values = numbers(option("near"), text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
     values = values / in_file_units(np.ones(n), chain.kinds)
     lower, upper = joint_limits(arm.model.cell, chain)
-    if ((values < lower) | (values > upper)).any():
-        j = int(np.argmax((values < lower) | (values > upper)))
-        raise InputError(
-            f"{option('near')}: joint {j + 1} is beyond its limits; give a posture within them"
-        )
+    out = (values < lower) | (values > upper)
+    joint = f"joint {int(np.argmax(out)) + 1}"
+    told = f"{option('near')}: {joint} is beyond its limits; give a posture within them"
+    require(not out.any(), told)
     return values
 
 
@@ -323,22 +319,19 @@ def grid_of(
     lower, upper = corners[:3], corners[3:]
     turned = None
     if rotation is not None:
-        vector = numbers(
-            option("rotation"), rotation, (3,), "a rotation vector rx,ry,rz in degrees"
-        )
+        what = "a rotation vector rx,ry,rz in degrees"
+        vector = numbers(option("rotation"), rotation, (3,), what)
         turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
-    if not (lower <= upper).all():
-        raise InputError(
-            f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
-        )
+    told = f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
+    require(bool((lower <= upper).all()), told)
     axes = _axes(lower, upper, counts, "one number, or one each for x, y and z")
     flat = [name for name, axis in zip("xyz", axes, strict=True)
             if len(axis) > 1 and axis[-1] - axis[0] < LEAST_STEP * len(axis)]  # fmt: skip
-    if flat:
-        raise InputError(
-            f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
-            f"level there by {option('grid')}"
-        )
+    require(
+        not flat,
+        f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
+        f"level there by {option('grid')}",
+    )
     return CorrectionGrid(axes, False, turned)
 
 

@@ -26,6 +26,7 @@ from scipy import special
 
 from elastocal.above import Result, checked_arguments
 from elastocal.errors import InsufficientDataError, option, require
+from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
@@ -300,13 +301,9 @@ def _covariance(arm: CalibratedArm, names: Sequence[str]) -> Array:
 
 
 def _difference(
-    old: CalibratedArm,
-    new: CalibratedArm,
-    before: Valued,
-    after: Valued,
-    own: set[str],
+    old: CalibratedArm, new: CalibratedArm, before: Valued, after: Valued, own: set[str],
     table: Measurements,
-) -> tuple[list[str], Array, Array, bool]:
+) -> tuple[list[str], Array, Array, bool]:  # fmt: skip
     """Names, z (p,), Cov z (p, p), and whether z was told to first order."""
     first, second = ([n for n in arm.determined if n in own] for arm in (old, new))
     a, b = before.values, after.values
@@ -390,15 +387,11 @@ def _tested(
         parts.setdefault(functions.get(name, name), []).append(k)
     x = np.array([old.values[name] for name in names])
     p = np.array([together(at) if n not in names else alone[at[0]] for n, at in parts.items()])
-    order = np.argsort(p)
-    family = np.empty(len(p))
-    family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
     units = {q.name: q.unit for q in old.model.parameters}
     others = {str(e["name"]): tuple(e.get("combined_with") or ()) for e in old.entries}
     changes = []
-    for (name, at), single, in_family in zip(
-        parts.items(), p.tolist(), family.tolist(), strict=True
-    ):
+    tests = zip(p.tolist(), holm(p).tolist(), strict=True)
+    for (name, at), (single, in_family) in zip(parts.items(), tests, strict=True):
         own, moves = B[..., at], rms(B[..., at] @ z[at])
         if name in units:
             (a, change, sd), unit = (float(v[at[0]]) for v in (x, z, std)), units[name]

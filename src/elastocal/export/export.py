@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
 from elastocal.cell.arm_description import Convention, Robot
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import ElastocalError, option, require
 from elastocal.export import exportable, robot_files
 from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
@@ -73,11 +73,9 @@ class Wish:
     def __post_init__(self) -> None:
         _ = self.kind
         for name, low, high in (("temperature_c", -273.15, 2000.0), ("time_s", -1e9, 1e9)):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(
-                    f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
-                )
+            if (value := getattr(self, name)) is not None:
+                told = f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
+                require(low <= value <= high, told)
         given_force(self.load)
         require(
             2 <= self.poses <= MOST_POSES,
@@ -167,8 +165,8 @@ def export(
         (option("base_frame"), wish.base_frame, FRAMED),
         (option("joint_correction"), wish.correct_joints, FITTED),
     ):
-        if given and wish.kind not in formats:
-            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.kind}")
+        said = f"{asked} goes with {listed(formats)}; found format {wish.kind}"
+        require(not given or wish.kind in formats, said)
     # The visits measured, where they are known, count under the load that was asked for.
     visits, force = calibrated.visits, given_force(wish.load)
     require(
@@ -330,11 +328,11 @@ class _Writing:
                         *((angle, "") if group.lasting else ("", time)),
                         str(number + 1), MICRO.get(unit, unit), *micro,
                     ))  # fmt: skip
-        if not rows:
-            raise InputError(
-                f"{self.calibrated.source}: this arm has no smooth function to be written as "
-                "corrections; elastocal diagnose finds those that the readings show"
-            )
+        require(
+            bool(rows),
+            f"{self.calibrated.source}: this arm has no smooth function to be written as "
+            "corrections; elastocal diagnose finds those that the readings show",
+        )
         return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
 
     @property
