@@ -320,10 +320,9 @@ def compensate(
                 single.check_reached(found)
             content["commands"] = single.summary(found, commands=output is None)
             commands, reached = single.commands_csv(found), bool(found.reached.any())
-        if table is not None and lines is not None:
-            where = tool_point(arm.model.cell, asked.get("point"))
-            how = force, start, asked["seed"], progress, asked["frame"]
-            made = grids.correction_table(arm, lines, where, *how)
+        if lines is not None:
+            how = tool_point(arm.model.cell, asked.get("point")), force, start, asked["seed"]
+            made = grids.correction_table(arm, lines, *how, progress, asked["frame"])
             content["table"], corrections = grids.summary_and_csv(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(

@@ -120,8 +120,8 @@ def correction_table(
     from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
-    arm = lasting(arm)[0]
-    sided, tool, points = _sided(arm), CalibratedTool(arm, point), grid.points()
+    kept, points = lasting(arm)[0], grid.points()
+    sided, tool = _sided(kept), CalibratedTool(kept, point)
     if force is not None and frame == "tracker":
         (T, *_), _, _ = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
         force = T[:3, :3].T @ force
@@ -145,7 +145,7 @@ def correction_table(
         before, between = _with_table(tool, check, follow(some[:, wide]))
     told = (*result.warnings, *sided)
     if status.count(EXACT) < len(status) / 2:
-        told = (*told, _mostly_inexact(arm, grid, status, point, force, seed))
+        told = (*told, _mostly_inexact(kept, grid, status, point, force, seed))
     without, with_it = (single.spread(off[:, 0])["rms"] or 0.0 for off in (before, between))
     if with_it > max(without, 1.0):  # µm
         worse = "between the grid points the tool is farther off with the table than without it"
