@@ -165,14 +165,9 @@ LONGEST_PIECE = 256  # rows solved at once
 
 
 def nominal_path(
-    chain: Chain,
-    position: Array,
-    rotation: Array | None,
-    point: Array,
-    limits: tuple[Array, Array],
-    near: Array | None,
-    seed: int = 0,
-) -> tuple[Array, BoolArray]:
+    chain: Chain, position: Array, rotation: Array | None, point: Array,
+    limits: tuple[Array, Array], near: Array | None, seed: int = 0,
+) -> tuple[Array, BoolArray]:  # fmt: skip
     """Nominal joints (n, joints) that bring `point` (3,) of the flange to places along a path, and
     whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
 
@@ -367,13 +362,9 @@ class Compensation(Result):
 
 
 def compensate(
-    arm: CalibratedArm,
-    targets: Targets,
-    point: ToolPoint,
-    near: Array | None = None,
-    seed: int = 0,
-    progress: Callable[[str], None] = lambda message: None,
-) -> Compensation:
+    arm: CalibratedArm, targets: Targets, point: ToolPoint, near: Array | None = None,
+    seed: int = 0, progress: Callable[[str], None] = lambda message: None,
+) -> Compensation:  # fmt: skip
     """Commanded joints that put the tool's point at the targets under their loads.
 
     Targets in the base frame are taken to the data's frame by the base frame as identified.  The

@@ -101,15 +101,10 @@ def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[
 
 
 def correction_table(
-    arm: CalibratedArm,
-    grid: CorrectionGrid,
-    point: ToolPoint,
-    force: Array | None = None,
-    near: Array | None = None,
-    seed: int = 0,
-    progress: Callable[[str], None] = lambda message: None,
-    frame: single.Frame = "base",
-) -> CorrectionTable:
+    arm: CalibratedArm, grid: CorrectionGrid, point: ToolPoint, force: Array | None = None,
+    near: Array | None = None, seed: int = 0,
+    progress: Callable[[str], None] = lambda message: None, frame: single.Frame = "base",
+) -> CorrectionTable:  # fmt: skip
     """The correction of every grid point under one `force` (3,) N, which stands in `frame`.
 
     The command q_c that puts the calibrated tool at the nominal target is, for the controller's
