@@ -57,6 +57,7 @@ def test_export_writes_them_as_corrections(folder: Path) -> None:
         "corrections", "--poses", 20,
     )  # fmt: skip
     assert "joint curve" in done.output
+    assert "Determined mostly by a prior: joint1.offset" in " ".join(done.output.split())
     lines = out.read_text().splitlines()
     assert lines[0].startswith("# calibrated by elastocal")
     rows = list(csv.DictReader(lines[1:]))

@@ -104,7 +104,8 @@ class Wish:
 class Exported:
     """What was written, and at which cost.
 
-    `held`: parameters that the data did not determine, with the values used; `refit`: how far the
+    `held`: parameters that the data did not determine, with the values used; `by_prior`:
+    those that owe more to a prior; `refit`: how far the
     file is from the arm before and after what it holds was fitted to it; `correction`: where its
     joints are to be commanded besides, empty where nothing was asked for; `T_tracker_base` (4, 4)
     goes with what the file holds, though it may have no place for it; `checked`: the largest
@@ -115,6 +116,7 @@ class Exported:
     format: str
     cost: exportable.Cost
     held: dict[str, float]
+    by_prior: tuple[str, ...]
     of_the_measurement: tuple[str, ...]
     refit: exportable.Refit | None
     correction: exportable.JointCorrection
@@ -148,6 +150,7 @@ class Exported:
             "read_back": {"with": self.checked_with, "max_um": microns(self.checked)},
             "without_beta_max_um": microns(self.without_beta),
             "held": self.held,
+            "by_prior": list(self.by_prior),
             "of_the_measurement": list(self.of_the_measurement),
             "warnings": list(self.warnings),
         }
@@ -208,8 +211,8 @@ def export(
     )  # fmt: skip
     told = tuple(text for so, text in doubts if so)
     done = Exported(
-        wish.kind, cost, held, kept.of_the_measurement, refit, correction, pieces.T_tracker_base,
-        told,
+        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
+        pieces.T_tracker_base, told,
     )  # fmt: skip
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
     written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()

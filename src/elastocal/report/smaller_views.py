@@ -93,6 +93,11 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
             "The sessions determined other parameters; the new ones are given in those of the old, "
             "to first order."
         )
+    if mostly := dict.fromkeys((*c.old.by_prior, *c.new.by_prior)):
+        compared.append(
+            "A change of what is determined mostly by a prior is hardly seen, and its part of the "
+            f"noise is that of the prior: {some(mostly, 8)}."
+        )
     yield say.Lines([
         ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
         *(("Not compared", f"{text}.") for text in ["; ".join(c.not_compared)] if text),
@@ -297,6 +302,8 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
             "Not determined by the data, at the values that the identification predicts with: "
             f"{some(done.held, 8)}."
         )
+    if done.by_prior:
+        yield say.Sentence(f"Determined mostly by a prior: {some(done.by_prior, 8)}.")
     if done.of_the_measurement:
         left = ", ".join(done.of_the_measurement)
         yield say.Sentence(f"Left out, effects of the measurement: {left}.")
