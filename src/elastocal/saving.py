@@ -132,7 +132,7 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
 
     if not partial:
         check_reached(found)
-    atomic_write(path, commands_csv(found, found.chain.kinds))
+    atomic_write(path, commands_csv(found))
 
 
 def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:

@@ -21,12 +21,15 @@ load_point_m = [0.2, 0.0, 0.25]
 M1 = [0.25, 0.0, 0.0]
 "[bold]M2" = [-0.1, 0.2, 0.1]
 [model]
-effects = ["joint_offset", "joint_compliance"]
+effects = ["joint_offset", "joint_compliance", "move_lag:joint2", "residual_field:base"]
+[model.nominal]
+settings.base.field_joint1_size = 1e-4
 [limits]
 joint1_deg = [-100, 100]
 """
 TRUTH = {"joint2.offset": 1e-3, "joint5.offset": -8e-4, "joint2.compliance": 2.9e-7,
-         "joint3.compliance": 4.2e-7, "joint5.compliance": 3.5e-6}  # fmt: skip
+         "joint3.compliance": 4.2e-7, "joint5.compliance": 3.5e-6,
+         "joint2.move_lag": 1e-4, "base.field_joint1_1_1": 1e-4}  # fmt: skip
 TARGETS = """x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,force_x_N,force_y_N,force_z_N
 1800,300,1500,0,120,0,0,0,-2600
 1810,300,1500,0,120,0,0,0,-2600
@@ -69,6 +72,20 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
     rows = csv.DictReader(seen.read_text().splitlines())
     x = [float(row["x_m"]) for row in rows if row["marker"] == "[bold]M2"]
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
+
+
+def test_a_table_of_corrections_says_what_commands_say_of_loads(folder):
+    words = ["--table", folder / "t.csv", "--grid", "1", "--json"]
+    bent, found = CELL + "joint5_deg = [30, 60]\n", []
+    tilted = bent.replace("[limits]", "base_rpy_deg = [0, 90, 0]\n[limits]")
+    for cell, *load in ((bent,), (bent, 0, 0, -2600), (tilted, -2600, 0, 0, "--frame", "tracker")):
+        (folder / "cell.toml").write_text(cell)
+        told = json.loads(run(folder, *words, *["--load"][: len(load)], *load).stdout)["table"]
+        assert any("no load is stated" in text for text in told["warnings"]) == (not load)
+        row = (folder / "t.csv").read_text().splitlines()[1].split(",")
+        found.append([float(v) for v in row[6:12]])
+    # The base's own field is along the tracker's axes, 0.1 mm.
+    assert np.allclose(found[1], found[2], atol=0.11) and abs(found[0][2] - found[1][2]) > 1
 
 
 def test_targets_in_another_unit_are_told_so(folder):

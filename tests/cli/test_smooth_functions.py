@@ -57,6 +57,7 @@ def test_export_writes_them_as_corrections(folder: Path) -> None:
         "corrections", "--poses", 20,
     )  # fmt: skip
     assert "joint curve" in done.output
+    assert "Determined mostly by a prior: joint1.offset" in " ".join(done.output.split())
     lines = out.read_text().splitlines()
     assert lines[0].startswith("# calibrated by elastocal")
     rows = list(csv.DictReader(lines[1:]))
@@ -75,3 +76,24 @@ def test_export_writes_them_as_corrections(folder: Path) -> None:
     half = np.array([float(row["half95"]) for row in own])
     assert (np.abs(found - true) < 1.5 * half).mean() > 0.9
     assert all(row["unit"] == "urad" for row in rows)
+
+
+def test_compare_takes_a_curve_as_one_and_leaves_out_one_that_a_session_does_not_show(folder):
+    cell, other = folder / "curved.toml", folder / "other.json"
+    truth = json.loads((folder / "truth.json").read_text())
+    truth["joint1.curve_1"] += 4e-4
+    sets = (f"--set={name}={value!r}" for name, value in truth.items())
+    run("simulate", cell, folder / "turns.csv", "-o", folder / "other.csv", "--seed", 2, *sets)
+    run("identify", cell, folder / "other.csv", "-o", other)
+    words = ("compare", cell, folder / "result.json", other, "--json")
+    (one,) = (part for part in json.loads(run(*words).stdout)["parameters"] if part["changed"])
+    assert one["name"] == "joint curve of joint1" and one["change"] == one["moves"] > 1e-4
+    content = json.loads(other.read_text())
+    del content["open"]
+    names = content["covariance_of"]
+    kept = [k for k, name in enumerate(names) if not name.startswith("joint1.curve")]
+    content["covariance"] = np.array(content["covariance"])[np.ix_(kept, kept)].tolist()
+    content["covariance_of"] = [names[k] for k in kept]
+    other.write_text(json.dumps(content))
+    (left,) = json.loads(run(*words).stdout)["not_compared"]
+    assert left == "joint curve of joint1 (one session alone shows it)"

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.cells import (
     COMPENSATOR,
@@ -20,6 +18,7 @@ from support.cells import (
     table_of,
 )
 
+import elastocal as ec
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
 from elastocal.compensation.compensate import (
@@ -37,11 +36,7 @@ from elastocal.compensation.correction_table import (
 from elastocal.errors import InputError
 from elastocal.model.calibrated import (
     CalibratedArm,
-    Conditions,
-    OpenParameters,
     ShownPoses,
-    random_table,
-    share_of_levels,
     tool_point,
 )
 from elastocal.model.chain import Chain, joint_limits
@@ -210,23 +205,9 @@ def test_targets_far_from_what_was_measured_are_told_and_a_point_known_worse_is_
 
 def test_what_no_marker_showed_is_told():
     """Tool and last link move the markers alike, so that a marker is known and the flange not."""
-    arm = arm_of("base_frame", "link_geometry:link6", "marker_position", std=0.01)
-    kept = tuple(name for name in arm.model.names if not name.startswith("link6"))
-    n = len(kept)
-    # What link 6 does to the markers went into the estimates of their places.
-    markers = tuple(arm.model.cell.tool.markers)
-    drawn = random_table(arm.model, Conditions(), 60, 0)
-    rows = replace(
-        drawn.take(np.repeat(np.arange(60), len(markers))), marker_names=markers,
-        marker=np.tile(np.arange(len(markers)), 60), position=np.zeros((60 * len(markers), 3)),
-    )  # fmt: skip
-    B = arm.model.regressor(rows, arm.x).B
-    open_ = [k for k, name in enumerate(arm.model.names) if name not in kept]
-    known = [k for k, name in enumerate(arm.model.names) if name in kept]
-    mixing = np.linalg.lstsq(B[:, known], B[:, open_], rcond=1e-9)[0]
-    typical = np.array([arm.model.parameters[k].typical for k in open_])
-    left = OpenParameters(tuple(arm.model.names[k] for k in open_), mixing, typical)
-    arm = replace(arm, determined=kept, covariance=1e-12 * np.eye(n), left=left)
+    model = arm_of("base_frame", "link_geometry:link6", "marker_position").model
+    q = np.random.default_rng(0).uniform(POSTURES.min(axis=0), POSTURES.max(axis=0), (30, 6))
+    arm = ec.identify(model, ec.simulate(model, q, seed=1)).arm
     assert np.all(commanded(arm, at_postures(None)).uncertainty.unknown < 1e-9)
     place = commanded(arm, at_postures(None), "0.1,0.2,0.3")
     assert np.all(place.uncertainty.unknown > 1e-3)
@@ -337,7 +318,6 @@ def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("x_mm,y_mm\n1,2\n", "without z_mm"),
         ("rx_deg,ry_deg,rz_deg\n1,2,3\n", "x_mm,y_mm,z_mm are missing"),
         ("x_mm,y_mm,z_mm,q1_deg\n1,2,3,4\n", "the robot has 6 joints"),
         ("x_mm,y_mm,z_mm,marker\n1,2,3,A\n1,2,3,B\n", "`point`"),
@@ -348,16 +328,3 @@ def test_tables_that_say_no_target_are_refused(tmp_path, text, told) -> None:
     path.write_text(text)
     with pytest.raises(InputError, match=told):
         read_targets(path, ("revolute",) * 6, "base")
-
-
-@given(
-    levels=st.lists(st.integers(-30, 30), min_size=1, max_size=6, unique=True),
-    angle=st.floats(-40, 40),
-)
-def test_shares_interpolate_between_levels(levels, angle):
-    values = np.array(levels, dtype=float)
-    share = share_of_levels(np.array([angle]), values)[0]
-    assert np.isclose(share.sum(), 1) and share.min() >= 0
-    # Shares of a linear function of the level give that function, clamped at the ends.
-    assert np.isclose(share @ values, np.clip(angle, values.min(), values.max()))
-    assert np.count_nonzero(share) <= 2

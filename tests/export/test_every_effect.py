@@ -129,11 +129,3 @@ def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Pat
     forearm = read_urdf(tmp_path / "warm.urdf").joints[2].placement
     assert forearm[0, 3] == pytest.approx(1.25 * (1 + 12e-6 * 10), rel=1e-15)
     assert "at 30 °C" in warm.text
-
-
-def test_an_arm_with_torque_couplings_is_exported_without_them(tmp_path: Path) -> None:
-    effects = ["base_frame", "joint_offset:joint2", "torque_coupling:joint2", "move_lag:joint3"]
-    arm = read_calibrated(*write_result(tmp_path, ROBOT, effects))
-    omitted = {o.effect: o.note for o in keep(arm, False, Conditions()).omissions}
-    assert "recorded torques" in omitted["torque_coupling"]
-    arm.save(tmp_path / "arm.urdf")

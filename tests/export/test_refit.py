@@ -127,8 +127,10 @@ def test_one_load_is_told_as_one(folder):
     visits["force_N"] = [[0, 0, -1500]] * len(visits["q"])
     (folder / "loaded.json").write_text(json.dumps(content))
     (folder / "loaded.toml").write_text((folder / "full.toml").read_text())
-    export(folder, "loaded", "loaded.urdf", "--load", 0, 0, -1500)
-    assert ", under 1500 N" in (folder / "loaded.urdf").read_text()
+    told = export(folder, "loaded", "loaded.urdf", "--load", 0, 0, -1500)
+    text = (folder / "loaded.urdf").read_text()
+    assert ", under 1500 N, with its base at xyz " in text
+    assert f'xyz="{" ".join(map(str, told["tracker_to_base"]["xyz_m"]))}"' in text
 
 
 def test_with_its_joint_correction_mujoco_does_as_well_as_elastocal(folder):

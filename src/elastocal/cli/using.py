@@ -32,7 +32,7 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.errors import InputError, InsufficientDataError, NotAcceptedError, option, require
+from elastocal.errors import InsufficientDataError, NotAcceptedError, option, require
 from elastocal.screen import complain, progress_line, say
 from elastocal.text import listed
 
@@ -305,7 +305,7 @@ def compensate(
     force = given_force(asked.get("load"))
     _check(targets, target, output, table, (grid, box, rotation))
     run.writes((output, ".csv"), (table, ".csv"))
-    content, commands, corrections = {}, "", ""
+    content, commands, corrections, reached = {}, "", "", False
     with run.progress() as progress:
         progress("reading")
         arm = read_calibrated(cell, result, run.plugins)
@@ -318,12 +318,11 @@ def compensate(
             found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
             if not partial:
                 single.check_reached(found)
-            kinds = found.chain.kinds
-            content["commands"] = single.summary(found, kinds, commands=output is None)
-            commands = single.commands_csv(found, kinds)
-        if table is not None and lines is not None:
-            where = tool_point(arm.model.cell, asked.get("point"))
-            made = grids.correction_table(arm, lines, where, force, start, asked["seed"], progress)
+            content["commands"] = single.summary(found, commands=output is None)
+            commands, reached = single.commands_csv(found), bool(found.reached.any())
+        if lines is not None:
+            how = tool_point(arm.model.cell, asked.get("point")), force, start, asked["seed"]
+            made = grids.correction_table(arm, lines, *how, progress, asked["frame"])
             content["table"], corrections = grids.summary_and_csv(made, arm, partial)
         # Nothing is written before every answer is there: a refused table leaves no commands.
         run.write(
@@ -331,10 +330,10 @@ def compensate(
             (table, lambda path: atomic_write(path, corrections)),
         )
     shown = run.answer(
-        lambda: content.pop("commands", {}) | content,
+        lambda: {"schema": single.SCHEMA} | content.pop("commands", {}) | content,
         lambda screen: print_blocks(screen, compensation_blocks(content)),
     )
-    if shown and output is not None:
+    if shown and output is not None and reached:
         say(
             f"Next: Run {output.name} and measure some. 95 % of the targets should be reached "
             "within its column within95_um, measurement noise excluded."
@@ -474,16 +473,11 @@ def compare(
 
 def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
     """Cell and both results where the cell does not come first, as it once did not."""
-    if old.suffix.lower() == ".toml":
-        raise InputError(
-            f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
-        )
+    told = f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
+    require(old.suffix.lower() != ".toml", told)
     known = old.parent / "cell.toml" if cell is None else cell
-    if cell is None and not known.is_file():
-        raise InputError(
-            f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL "
-            f"{old} {new}"
-        )
+    told = f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL"
+    require(cell is not None or known.is_file(), f"{told} {old} {new}")
     return known, old, new
 
 

@@ -22,6 +22,7 @@ from elastocal.measurements import (
     in_file_units,
     joint_columns,
     read_measurements,
+    with_moves,
 )
 from elastocal.model.calibrated import (
     CalibratedArm,
@@ -50,6 +51,8 @@ from elastocal.units import Array, BoolArray, IntArray
 
 # Targets: where the tool is to be, and in which frame that is stated.
 
+NEITHER = 1e-12  # the side that a joint came from where no move of it is known; 0 is a first visit
+
 Frame = Literal["base", "tracker"]
 FRAMES: tuple[Frame, ...] = ("base", "tracker")
 
@@ -60,7 +63,8 @@ class Targets:
 
     `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
     rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
-    without a position the tool is to be where the nominal arm has it at q.
+    without a position the tool is to be where the nominal arm has it at q.  The arm goes from row
+    to row where they are a `path`; else nobody knows how it comes to each.
     """
 
     table: Measurements
@@ -68,9 +72,21 @@ class Targets:
     position: Array | None
     rotation: Array | None
     q: Array | None
+    path: bool = True
 
     def __len__(self) -> int:
         return len(self.table)
+
+    def moved(self, q: Array, force: Array) -> Measurements:
+        """The table with its forces (n, 3) N and the arm's last move to each row at q (n, joints).
+        Joints of which no move is known came from neither side."""
+        table = replace(self.table, force=force)
+        if self.path:
+            table = with_moves(replace(table, q=q))
+            assert table.direction is not None
+            side = np.where(table.direction == 0, NEITHER, table.direction)
+            table = replace(table, direction=side)
+        return table
 
     def place(self, i: int) -> str:
         return f"{self.table.source}, line {self.table.row[i]}"
@@ -149,14 +165,9 @@ LONGEST_PIECE = 256  # rows solved at once
 
 
 def nominal_path(
-    chain: Chain,
-    position: Array,
-    rotation: Array | None,
-    point: Array,
-    limits: tuple[Array, Array],
-    near: Array | None,
-    seed: int = 0,
-) -> tuple[Array, BoolArray]:
+    chain: Chain, position: Array, rotation: Array | None, point: Array,
+    limits: tuple[Array, Array], near: Array | None, seed: int = 0,
+) -> tuple[Array, BoolArray]:  # fmt: skip
     """Nominal joints (n, joints) that bring `point` (3,) of the flange to places along a path, and
     whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
 
@@ -351,13 +362,9 @@ class Compensation(Result):
 
 
 def compensate(
-    arm: CalibratedArm,
-    targets: Targets,
-    point: ToolPoint,
-    near: Array | None = None,
-    seed: int = 0,
-    progress: Callable[[str], None] = lambda message: None,
-) -> Compensation:
+    arm: CalibratedArm, targets: Targets, point: ToolPoint, near: Array | None = None,
+    seed: int = 0, progress: Callable[[str], None] = lambda message: None,
+) -> Compensation:  # fmt: skip
     """Commanded joints that put the tool's point at the targets under their loads.
 
     Targets in the base frame are taken to the data's frame by the base frame as identified.  The
@@ -368,13 +375,58 @@ def compensate(
     """
     arm, of_one_campaign = lasting(arm)
     tool = CalibratedTool(arm, point)
-    chain = tool.chain
-    limits = joint_limits(tool.cell, chain)
+    chain, limits = tool.chain, joint_limits(tool.cell, tool.chain)
     T, place, turn = tool.frames(tool.rows(targets.table))
     force = targets.table.force
     if targets.frame == "base":
         force = np.einsum("nij,nj->ni", T[:, :3, :3], force)
-    rows = tool.rows(replace(targets.table, force=force))
+    goals = _goals(targets, chain, T, place, turn)
+    aimed = goals.in_base(T)
+    flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
+    task = Reaching(chain, aimed.position, flange, place[0], None, *limits)
+    if targets.q is None:
+        progress("nominal commands")
+        nominal = nominal_path(chain, aimed.position, flange, place[0], limits, near, seed)[0]
+    else:
+        check_limits(arm.model, replace(targets.table, q=targets.q))
+        nominal = np.clip(targets.q, *limits)
+    progress("commands")
+    every = np.arange(len(targets))
+    rows = tool.rows(targets.moved(nominal, force))
+    search = Commanding(tool, rows, goals, *limits)
+    q, after = search.commands(nominal, every)
+    lost = np.flatnonzero(~_is_reached(after))
+    if targets.q is None and len(lost):
+        progress(f"other postures for {len(lost)} points")
+        nominal[lost] = _other_postures(
+            search, chain, aimed.position[lost], None if flange is None else flange[lost],
+            place[0], lost, nominal[lost], seed,
+        )  # fmt: skip
+        q[lost], after[lost] = search.commands(nominal[lost], lost)
+    search.rows = tool.rows(targets.moved(q, force))
+    if not all(map(np.array_equal, rows, search.rows)):  # moves of the commands themselves
+        q, after = search.commands(q, every)
+    before, reached = search.misses(nominal, every), _is_reached(after)
+    progress("uncertainty")
+    result = Compensation(
+        chain, targets, point, q, nominal, before[:, 0], after[:, 0],
+        np.column_stack([before[:, 1], after[:, 1]]), _status(search, after, nominal), goals,
+        force, T, place, turn, task.errors(nominal, every)[0],
+        _uncertainty(tool, search.rows, q, reached), (),
+    )  # fmt: skip
+    told = [*_of_loads(arm, result), *_of_places(arm, result)]
+    if targets.path or targets.q is None:  # not of a grid of joints
+        told = [*_of_joints(result, limits, jumps(task, q, reached)), *told]
+    if of_one_campaign:
+        told.append(
+            f"The {listed(of_one_campaign, 4)} {'is' if len(of_one_campaign) == 1 else 'are'} of "
+            "one campaign and no part of these commands."
+        )
+    return replace(result, warnings=tuple(told))
+
+
+def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
+    """The targets in the data's frame, from that of the base by T (n, 4, 4)."""
     if targets.position is not None:
         _check_unit(targets, targets.position, chain, T)
         goals = Goals(targets.position, targets.rotation)
@@ -383,44 +435,7 @@ def compensate(
         # Fewer than six joints cannot keep the rotation too.
         goals = Goals(place, turn if chain.n_joints >= 6 else None)
         goals = goals.through(nominal_flanges(chain, targets.q))
-    goals = goals.through(T) if targets.frame == "base" else goals
-    aimed = goals.in_base(T)
-    in_base = aimed.position
-    flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
-    if targets.q is None:
-        progress("nominal commands")
-        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
-    else:
-        check_limits(arm.model, replace(targets.table, q=targets.q))
-        nominal = np.clip(targets.q, *limits)
-    progress("commands")
-    search, every = Commanding(tool, rows, goals, *limits), np.arange(len(targets))
-    q, after = search.commands(nominal, every)
-    lost = np.flatnonzero(~_is_reached(after))
-    if targets.q is None and len(lost):
-        progress(f"other postures for {len(lost)} points")
-        nominal[lost] = _other_postures(
-            search, chain, in_base[lost], None if flange is None else flange[lost], place[0],
-            lost, nominal[lost], seed,
-        )  # fmt: skip
-        q[lost], after[lost] = search.commands(nominal[lost], lost)
-    before, reached = search.misses(nominal, every), _is_reached(after)
-    progress("uncertainty")
-    task = Reaching(chain, in_base, flange, place[0], None, *limits)
-    result = Compensation(
-        chain, targets, point, q, nominal, before[:, 0], after[:, 0],
-        np.column_stack([before[:, 1], after[:, 1]]), _status(search, after, nominal), goals,
-        force, T, place, turn, task.errors(nominal, every)[0], _uncertainty(tool, rows, q, reached),
-        (),
-    )  # fmt: skip
-    path = jumps(task, q, reached)
-    told = [*_of_joints(result, limits, path), *_of_loads(arm, result), *_of_places(arm, result)]
-    if of_one_campaign:
-        told.append(
-            f"The {listed(of_one_campaign, 4)} {'is' if len(of_one_campaign) == 1 else 'are'} of "
-            "one campaign and no part of these commands."
-        )
-    return replace(result, warnings=tuple(told))
+    return goals.through(T) if targets.frame == "base" else goals
 
 
 NOWHERE = 100.0  # of the reach nearer to the origin, or as many reaches away: no tool works there
@@ -615,7 +630,7 @@ def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: BoolArray) -> Arr
     found = np.full(int(rows.sum()), np.inf)
     for name in list(arm.model.cell.tool.markers)[:MARKERS_ASKED]:
         tool = CalibratedTool(arm, tool_point(arm.model.cell, name))
-        values = tool.rows(replace(c.targets.table, force=c.force))
+        values = tool.rows(c.targets.moved(c.q, c.force))
         sure = uncertainty_at(tool, [v[rows] for v in values], c.q[rows])
         found = np.minimum(found, sure.std)
     return found
@@ -667,13 +682,13 @@ def check_status(
     )
 
 
-def commands_csv(result: Compensation, kinds: Sequence[str]) -> str:
+def commands_csv(result: Compensation) -> str:
     """The commands, one row per target in the order of the targets.
 
     Joints and corrections of a row that is not reached are left empty.  Forces stand in the
     data's frame, as in every plan, so that `simulate` can read the table.
     """
-    held = np.where(result.reached[:, None], 1.0, np.nan)
+    held, kinds = np.where(result.reached[:, None], 1.0, np.nan), result.chain.kinds
     q = in_file_units(result.q, kinds)
     blocks = [(joint_columns(kinds), held * q, f".{DIGITS}f")]
     table = result.targets.table
@@ -711,8 +726,9 @@ def table_csv(
     return csv_text(header, rows)
 
 
-def summary(result: Compensation, kinds: Sequence[str], commands: bool) -> dict[str, Any]:
-    good, names = result.reached, joint_columns(kinds)
+def summary(result: Compensation, commands: bool) -> dict[str, Any]:
+    good, kinds = result.reached, result.chain.kinds
+    names = joint_columns(kinds)
     change = in_file_units(result.q - result.nominal, kinds)
     content: dict[str, Any] = {
         "schema": SCHEMA,

@@ -11,10 +11,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.compensation import compensate as single
-from elastocal.errors import InputError, option
+from elastocal.errors import option, require
+from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
-from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint, lasting, numbers
+from elastocal.model.arm import COLUMNS
+from elastocal.model.calibrated import (
+    CalibratedArm,
+    CalibratedTool,
+    Conditions,
+    ToolPoint,
+    lasting,
+    numbers,
+    unstated_needs,
+)
 from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray
@@ -56,7 +67,8 @@ class CorrectionTable:
     the target becomes p + d, exp([dr]×) R.  NaN where there is none; `status` (N,) says why, and
     which are EXACT or FIRST_ORDER.  `oriented`: whether rotations are corrected.
     `before` and `between` (M, 2) m and rad: errors of the tool at M points between the grid's,
-    without the table and with the correction interpolated in it.  `warnings` are sentences.
+    without the table and with the correction interpolated in it.  `sure`: of the tool's position
+    at the points, NaN where none is reached.  `warnings` are sentences.
     """
 
     grid: CorrectionGrid
@@ -66,21 +78,22 @@ class CorrectionTable:
     oriented: bool
     before: Array
     between: Array
+    sure: Uncertainty
     warnings: tuple[str, ...] = ()
 
 
 def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[Array, ...]:
     """`counts` levels (one number for all) from low to high (n,); of one level the middle."""
     n, told = len(low), ",".join(map(str, counts))
-    if len(counts) not in (1, n) or min(counts) < 1:
-        raise InputError(f"{option('grid')} takes {what}, 1 or more; found '{told}'")
+    fits = len(counts) in (1, n) and min(counts) >= 1
+    require(fits, f"{option('grid')} takes {what}, 1 or more; found '{told}'")
     counts = counts * n if len(counts) == 1 else counts
     size = math.prod(counts)
-    if size > MOST_POINTS:
-        raise InputError(
-            f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the "
-            "most; give fewer levels to the joints that matter least (1 holds one in the middle)"
-        )
+    require(
+        size <= MOST_POINTS,
+        f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the most; give fewer "
+        "levels to the joints that matter least (1 holds one in the middle)",
+    )
     return tuple(
         np.linspace(a, b, k) if k > 1 else np.array([(a + b) / 2])
         for a, b, k in zip(low, high, counts, strict=True)
@@ -88,15 +101,11 @@ def _axes(low: Array, high: Array, counts: tuple[int, ...], what: str) -> tuple[
 
 
 def correction_table(
-    arm: CalibratedArm,
-    grid: CorrectionGrid,
-    point: ToolPoint,
-    force: Array | None = None,
-    near: Array | None = None,
-    seed: int = 0,
-    progress: Callable[[str], None] = lambda message: None,
-) -> CorrectionTable:
-    """The correction of every grid point under one `force` (3,) N in the base frame.
+    arm: CalibratedArm, grid: CorrectionGrid, point: ToolPoint, force: Array | None = None,
+    near: Array | None = None, seed: int = 0,
+    progress: Callable[[str], None] = lambda message: None, frame: single.Frame = "base",
+) -> CorrectionTable:  # fmt: skip
+    """The correction of every grid point under one `force` (3,) N, which stands in `frame`.
 
     The command q_c that puts the calibrated tool at the nominal target is, for the controller's
     nominal arm, the target T_nominal(q_c): the correction is what lies between the two (EXACT).
@@ -106,11 +115,13 @@ def correction_table(
     from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
-    arm = lasting(arm)[0]
-    points = grid.points()
+    kept, points = lasting(arm)[0], grid.points()
+    sided, tool = _sided(kept), CalibratedTool(kept, point)
+    if force is not None and frame == "tracker":
+        (T, *_), _, _ = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
+        force = T[:3, :3].T @ force
     progress(f"{len(points)} grid points")
-    result = single.compensate(arm, _targets(grid, points, force), point, near, seed, progress)
-    tool = CalibratedTool(arm, point)
+    result = single.compensate(arm, _targets(arm, grid, points, force), point, near, seed, progress)
     correction, status = _corrections(tool, result)
     oriented = result.goals.rotation is not None
     before = between = np.zeros((0, 2))
@@ -121,16 +132,36 @@ def correction_table(
         if not grid.joints:  # as a path, in the posture of the grid
             some = some[np.argsort(some[:, 0])]
             near = result.nominal[0]
-        check = single.compensate(arm, _targets(grid, some, force), point, near, seed)
+        check = single.compensate(arm, _targets(arm, grid, some, force), point, near, seed)
         wide = [k for k, axis in enumerate(grid.axes) if len(axis) > 1]
         values = correction[np.lexsort(points.T[::-1])]
         values = values.reshape(*(len(grid.axes[k]) for k in wide), 6)
         follow = RegularGridInterpolator([grid.axes[k] for k in wide], values)
         before, between = _with_table(tool, check, follow(some[:, wide]))
-    told: tuple[str, ...] = ()
+    told = (*result.warnings, *sided)
     if status.count(EXACT) < len(status) / 2:
-        told = (_mostly_inexact(arm, grid, status, point, force, seed),)
-    return CorrectionTable(grid, points, correction, status, oriented, before, between, told)
+        told = (*told, _mostly_inexact(kept, grid, status, point, force, seed))
+    without, with_it = (single.spread(off[:, 0])["rms"] or 0.0 for off in (before, between))
+    if with_it > max(without, 1.0):  # µm
+        worse = "between the grid points the tool is farther off with the table than without it"
+        finer = f"give more levels by {option('grid')}, or narrow [limits]"
+        told = (*told, f"{worse}; do not use it: {finer}")
+    sure = result.uncertainty
+    return CorrectionTable(grid, points, correction, status, oriented, before, between, sure, told)
+
+
+def _sided(arm: CalibratedArm) -> tuple[str, ...]:
+    """That the direction of the last motion is left out, where it counts.  Raises InputError where
+    an effect of the arm follows what else a table of corrections cannot know."""
+    sided: tuple[str, ...] = ()
+    for name, needs in unstated_needs(arm, Conditions()).items():
+        columns = listed(COLUMNS[need] for need in needs)
+        told = f"{option('table')}: corrections hold at any time, and {name} follows {columns}"
+        remedy = "give a table of targets with that column, or identify without the effect"
+        require(not needs, f"{told}; {remedy}")
+        if "approach" in CATALOGUE[name].needed(arm.model.cell):
+            sided = ("the corrections are those between both directions of a joint's last motion",)
+    return sided
 
 
 def _mostly_inexact(
@@ -145,7 +176,7 @@ def _mostly_inexact(
         tool = CalibratedTool(arm, point)
 
         def exact(q: Array) -> BoolArray:
-            tried = single.compensate(arm, _targets(grid, q, force), point, None, seed)
+            tried = single.compensate(arm, _targets(arm, grid, q, force), point, None, seed)
             return np.array(_corrections(tool, tried)[1]) == EXACT
 
         some = np.flatnonzero([s != EXACT for s in status])
@@ -174,10 +205,20 @@ def _mostly_inexact(
     )
 
 
-def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> single.Targets:
+def _targets(
+    arm: CalibratedArm, grid: CorrectionGrid, points: Array, force: Array | None
+) -> single.Targets:
     turned = None if grid.rotation is None else np.tile(grid.rotation, (len(points), 1, 1))
     place, q = (None, points) if grid.joints else (points, None)
-    return single.targets_at(option("table"), place, turned, "base", force, q)
+    targets = single.targets_at(option("table"), place, turned, "base", force, q)
+    n = len(points)
+    line = np.empty(n, dtype=np.int64)  # of each in the file, below its header
+    line[np.lexsort(points.T[::-1])] = np.arange(2, n + 2)
+    # By columns of the time the base alone may move, and the targets with it.
+    time = np.zeros(n) if arm.model.cell.model.clock == "column" else None
+    side = np.zeros((n, arm.model.chain.n_joints))
+    table = replace(targets.table, row=line, time=time, approach=side)
+    return replace(targets, table=table, path=False)
 
 
 def _corrections(
@@ -205,7 +246,7 @@ def _corrections(
 
 def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> single.Goals:
     """Where the calibrated tool is at joints q, in the base frame."""
-    rows = tool.rows(replace(result.targets.table, force=result.force))
+    rows = tool.rows(result.targets.moved(q, result.force))
     return single.Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
 
 
@@ -225,9 +266,8 @@ def _with_table(
 ) -> tuple[Array, Array]:
     """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
     aimed = check.goals.in_base(check.T_data_base)
-    known = np.flatnonzero(
-        np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
-    )
+    usable = np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
+    known = np.flatnonzero(usable)
     moved, flange = aimed.position + correction[:, :3], None
     if aimed.rotation is not None:
         turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix()
@@ -254,11 +294,10 @@ def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
     values = numbers(option("near"), text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
     values = values / in_file_units(np.ones(n), chain.kinds)
     lower, upper = joint_limits(arm.model.cell, chain)
-    if ((values < lower) | (values > upper)).any():
-        j = int(np.argmax((values < lower) | (values > upper)))
-        raise InputError(
-            f"{option('near')}: joint {j + 1} is beyond its limits; give a posture within them"
-        )
+    out = (values < lower) | (values > upper)
+    joint = f"joint {int(np.argmax(out)) + 1}"
+    told = f"{option('near')}: {joint} is beyond its limits; give a posture within them"
+    require(not out.any(), told)
     return values
 
 
@@ -275,22 +314,19 @@ def grid_of(
     lower, upper = corners[:3], corners[3:]
     turned = None
     if rotation is not None:
-        vector = numbers(
-            option("rotation"), rotation, (3,), "a rotation vector rx,ry,rz in degrees"
-        )
+        what = "a rotation vector rx,ry,rz in degrees"
+        vector = numbers(option("rotation"), rotation, (3,), what)
         turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
-    if not (lower <= upper).all():
-        raise InputError(
-            f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
-        )
+    told = f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
+    require(bool((lower <= upper).all()), told)
     axes = _axes(lower, upper, counts, "one number, or one each for x, y and z")
     flat = [name for name, axis in zip("xyz", axes, strict=True)
             if len(axis) > 1 and axis[-1] - axis[0] < LEAST_STEP * len(axis)]  # fmt: skip
-    if flat:
-        raise InputError(
-            f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
-            f"level there by {option('grid')}"
-        )
+    require(
+        not flat,
+        f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
+        f"level there by {option('grid')}",
+    )
     return CorrectionGrid(axes, False, turned)
 
 
@@ -332,6 +368,8 @@ def summary_and_csv(
         "checked_between": len(found.between),
         "error_without_um": single.spread(found.before[:, 0]),
         "error_with_um": single.spread(found.between[:, 0]),
+        "std_um": single.spread(found.sure.std),
+        "within95_um": single.spread(found.sure.within),
         "warnings": list(found.warnings),
     }
     if found.oriented:

@@ -10,7 +10,8 @@ the smaller of the campaigns' degrees of freedom.  Each alone: |z_k| / s_k again
 Welch and Satterthwaite's degrees of freedom, and by Holm's rule, so that with probability 1 − level
 no parameter is called changed that is not.  Where the campaigns determined other parameters, the
 new ones are told in those of the old: to first order, by the columns of B over random poses,
-z ← B₁⁺ B z, whose column spaces must be the same.
+z ← B₁⁺ B z, whose column spaces must be the same.  The coefficients of a smooth function are one
+thing, tested together as all of z are.
 """
 
 from __future__ import annotations
@@ -24,14 +25,16 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from elastocal.above import Result, checked_arguments
-from elastocal.cell.arm_description import Tool
 from elastocal.errors import InsufficientDataError, option, require
+from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
+    CalibratedTool,
     Conditions,
+    ToolPoint,
     Valued,
     arm_with,
     given_arm,
@@ -39,7 +42,7 @@ from elastocal.model.calibrated import (
     unstated_needs,
 )
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array
 
@@ -48,7 +51,6 @@ LEVEL = 0.05  # chance that anything is called changed where nothing is
 SAME_SPACE = 1e-6  # of a column of B that others should hold
 RANK = 1e-9
 CENTRAL = 0.95
-POINT = "tool"
 NAMED = 4  # parameters in a message
 MOST_POSES = 100_000
 
@@ -57,7 +59,8 @@ MOST_POSES = 100_000
 class ParameterChange:
     """One parameter: values and their difference in SI units, its standard deviation, p alone and
     by Holm's rule, whether that is below the level, and `moves`: rms in m at the tool.  Where no
-    reading told it from others, `combined_with`, the values are those of their sum."""
+    reading told it from others, `combined_with`, the values are those of their sum.  Of a smooth
+    function values, difference and its deviation are rms in m at the tool."""
 
     name: str
     unit: str
@@ -88,6 +91,7 @@ class Comparison(Result):
         loads_of: Where they come from: "the option", "the earlier campaign", "the later campaign",
             "the cell's plan"; empty where nothing states a load.
         first_order: Whether the new parameters were told in those of the old.
+        not_compared: What the models have and nothing was compared of, with the reason.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -106,6 +110,7 @@ class Comparison(Result):
     forces: Array
     loads_of: str
     first_order: bool
+    not_compared: tuple[str, ...]
 
     @property
     def changed(self) -> list[ParameterChange]:
@@ -152,6 +157,7 @@ class Comparison(Result):
             "changed": [c.name for c in self.changed],
             "parameters": [vars(c) for c in self.changes],
             "first_order": self.first_order,
+            "not_compared": list(self.not_compared),
             "tool": {
                 "poses": len(far),
                 "force_N": self.forces[0] if len(self.forces) == 1 else None,
@@ -233,12 +239,20 @@ def _compared(
         "with the same cell",
     )
     conditions = Conditions()
-    before, after = (
-        arm_with(arm, [n for n, needs in unstated_needs(arm, conditions).items() if not needs])
-        for arm in (old, new)
-    )
+    unstated = unstated_needs(old, conditions)
+    stated = [name for name, needs in unstated.items() if not needs]
+    before, after = (arm_with(arm, stated) for arm in (old, new))
     # The parameters of the arm itself; base and markers are set up anew in each campaign.
     own = {p.name for p in before.model.parameters if not CATALOGUE[p.effect].registered}
+    left = [f"{name.replace('_', ' ')} (follows {listed(needs)})"
+            for name, needs in unstated.items() if needs]  # fmt: skip
+    functions: dict[str, str] = {}  # parameter → the smooth function that it is part of
+    for group in smooth_groups(before.model):
+        keys = {before.model.names[k] for k in group.columns.ravel()}
+        functions |= dict.fromkeys(keys, group.name)
+        if (keys <= set(old.determined)) != (keys <= set(new.determined)):
+            left.append(f"{group.name} (one session alone shows it)")
+            own -= keys
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
@@ -248,48 +262,32 @@ def _compared(
             f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
             "both with the same effects, from poses that show them"
         )
-    tool = _tool_model(before.model)
-    at_tool = replace(table, marker=np.zeros_like(table.marker), marker_names=(POINT,))
+    cell = before.model.cell
+    load = cell.tool.load_point
+    at = load if load.any() else next(iter(cell.tool.markers.values()), load)
     # The set-up of the old campaign for both.
-    set_up = {name: value for name, value in before.values.items() if name not in own}
-    x, moved = (
-        np.array([values[name] for name in tool.names])
-        for values in (before.values, after.values | set_up)
+    pairs = zip(before.model.names, before.x, after.x, strict=True)
+    moved = np.array([b if name in own else a for name, a, b in pairs])
+    tool, tool_moved = (
+        CalibratedTool(replace(old, model=before.model, x=x), ToolPoint(at, None, "tool"))
+        for x in (before.x, moved)
     )
-    here, there = _positions(tool, at_tool, x), _positions(tool, at_tool, moved)
+    rows = tool.rows(table)
+    here, there = (each.poses(rows, table.q)[0] for each in (tool, tool_moved))
     settled = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
     if not settled.any():
         raise InsufficientDataError(
             f"none of {poses} random poses has a static equilibrium under the load; check "
             f"{option('load')}"
         )
-    columns = np.array([tool.names.index(name) for name in names])
-    rows = at_tool.take(np.flatnonzero(settled))
-    B = tool.regressor(rows, x, columns).B.reshape(len(rows.q), 3, len(names))
+    columns = [before.model.names.index(name) for name in names]
+    B = tool.sensitivity([row[settled] for row in rows], table.q[settled])[..., columns]
     chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
-    changes, p = _tested(old, new, names, z, V, level, np.sqrt((B**2).sum(axis=1).mean(axis=0)))
+    changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
-        forces, whose, first_order,
+        forces, whose, first_order, tuple(left),
     )  # fmt: skip
-
-
-def _tool_model(model: Model) -> Model:
-    """The model with one known point of the tool as its marker: the load point, or a marker."""
-    cell = model.cell
-    load = cell.tool.load_point
-    point = load if load.any() else next(iter(cell.tool.markers.values()), load)
-    kept = tuple(c for c in cell.model.effects if CATALOGUE[c.name].stage != POINT)
-    spec = replace(cell.model, effects=kept)
-    return Model.assembled(
-        model.chain, replace(cell, tool=Tool(load_point=load, markers={POINT: point}), model=spec)
-    )
-
-
-def _positions(model: Model, table: Measurements, x: Array) -> Array:
-    """Where the tool's point is (n, 3) in m, NaN without an equilibrium."""
-    T = model.flange_poses(table, x)
-    return np.asarray(T[:, :3, :3] @ model.cell.tool.markers[POINT]) + T[:, :3, 3]
 
 
 def _covariance(arm: CalibratedArm, names: Sequence[str]) -> Array:
@@ -303,13 +301,9 @@ def _covariance(arm: CalibratedArm, names: Sequence[str]) -> Array:
 
 
 def _difference(
-    old: CalibratedArm,
-    new: CalibratedArm,
-    before: Valued,
-    after: Valued,
-    own: set[str],
+    old: CalibratedArm, new: CalibratedArm, before: Valued, after: Valued, own: set[str],
     table: Measurements,
-) -> tuple[list[str], Array, Array, bool]:
+) -> tuple[list[str], Array, Array, bool]:  # fmt: skip
     """Names, z (p,), Cov z (p, p), and whether z was told to first order."""
     first, second = ([n for n in arm.determined if n in own] for arm in (old, new))
     a, b = before.values, after.values
@@ -319,7 +313,11 @@ def _difference(
         return first, z, _covariance(old, first) + _covariance(new, first), False
     # All that both fitted, set-up included, which the new campaign's choice may have moved.
     names, marked = before.model.names, tuple(before.model.cell.tool.markers)
-    known, fitted = ([n for n in names if n in arm.determined] for arm in (old, new))
+    # Smooth functions that are not compared are no one's to tell others by.
+    apart = {p.name for p in before.model.parameters if p.shrunk} - own
+    known, fitted = (
+        [n for n in names if n in arm.determined and n not in apart] for arm in (old, new)
+    )
     tables = [
         replace(table, marker=np.full(len(table.q), m), marker_names=marked or table.marker_names)
         for m in range(len(marked) or 1)
@@ -360,15 +358,11 @@ def _spanned(
 
 
 def _tested(
-    old: CalibratedArm,
-    new: CalibratedArm,
-    names: list[str],
-    z: Array,
-    V: Array,
-    level: float,
-    slope: Array,
-) -> tuple[tuple[ParameterChange, ...], float]:
-    """Each parameter by Holm's rule, and p of all together."""
+    old: CalibratedArm, new: CalibratedArm, names: list[str], functions: dict[str, str], z: Array,
+    V: Array, level: float, B: Array,
+) -> tuple[tuple[ParameterChange, ...], float]:  # fmt: skip
+    """Each parameter and each smooth function by Holm's rule, and p of all together.  `functions`:
+    parameter → that which it is part of; `B` (poses, 3, p) in m per unit at the tool."""
     require(
         bool((np.diag(V) > 0).all()),
         f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
@@ -377,23 +371,38 @@ def _tested(
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
     nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
-    p = 2 * special.stdtr(np.maximum(nu, 1.0), -np.abs(z) / std)
-    order = np.argsort(p)
-    family = np.empty(len(p))
-    family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
-    together = float((z / std) @ np.linalg.solve(V / np.outer(std, std), z / std)) / len(z)
-    smallest = float(np.min(dofs))
+    alone = 2 * special.stdtr(np.maximum(nu, 1.0), -np.abs(z) / std)
+    smallest = min(float(np.min(dofs)), 1e9)
+
+    def together(at: list[int]) -> float:
+        t = z[at] / std[at]
+        size = float(t @ np.linalg.solve(V[np.ix_(at, at)] / np.outer(std[at], std[at]), t))
+        return float(special.fdtrc(len(at), smallest, size / len(at)))
+
+    def rms(far: Array) -> float:
+        return float(np.sqrt((far**2).sum(axis=1).mean()))
+
+    parts: dict[str, list[int]] = {}
+    for k, name in enumerate(names):
+        parts.setdefault(functions.get(name, name), []).append(k)
+    x = np.array([old.values[name] for name in names])
+    p = np.array([together(at) if n not in names else alone[at[0]] for n, at in parts.items()])
     units = {q.name: q.unit for q in old.model.parameters}
     others = {str(e["name"]): tuple(e.get("combined_with") or ()) for e in old.entries}
-    columns = (each.tolist() for each in (z, std, p, family, np.abs(z) * slope))
-    changes = tuple(
-        ParameterChange(
-            n, units[n], (a := old.values[n]), a + change, change, sd, alone, in_family,
-            in_family < level, moves, others.get(n, ()),
-        )
-        for n, change, sd, alone, in_family, moves in zip(names, *columns, strict=True)
-    )  # fmt: skip
-    return changes, float(special.fdtrc(len(z), min(smallest, 1e9), together))
+    changes = []
+    tests = zip(p.tolist(), holm(p).tolist(), strict=True)
+    for (name, at), (single, in_family) in zip(parts.items(), tests, strict=True):
+        own, moves = B[..., at], rms(B[..., at] @ z[at])
+        if name in units:
+            (a, change, sd), unit = (float(v[at[0]]) for v in (x, z, std)), units[name]
+            values = a, a + change, change, sd
+        else:
+            noise = np.einsum("nik,kl,nil->ni", own, V[np.ix_(at, at)], own)
+            values, unit = (rms(own @ x[at]), rms(own @ (x + z)[at]), moves, rms(noise**0.5)), "m"
+        changes.append(ParameterChange(
+            name, unit, *values, single, in_family, in_family < level, moves, others.get(name, ()),
+        ))  # fmt: skip
+    return tuple(changes), together(list(range(len(z))))
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
 from elastocal.cell.arm_description import Convention, Robot
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import ElastocalError, option, require
 from elastocal.export import exportable, robot_files
 from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
@@ -73,11 +73,9 @@ class Wish:
     def __post_init__(self) -> None:
         _ = self.kind
         for name, low, high in (("temperature_c", -273.15, 2000.0), ("time_s", -1e9, 1e9)):
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(
-                    f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
-                )
+            if (value := getattr(self, name)) is not None:
+                told = f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
+                require(low <= value <= high, told)
         given_force(self.load)
         require(
             2 <= self.poses <= MOST_POSES,
@@ -106,9 +104,11 @@ class Wish:
 class Exported:
     """What was written, and at which cost.
 
-    `held`: parameters that the data did not determine, with the values used; `refit`: how far the
+    `held`: parameters that the data did not determine, with the values used; `by_prior`:
+    those that owe more to a prior; `refit`: how far the
     file is from the arm before and after what it holds was fitted to it; `correction`: where its
-    joints are to be commanded besides, empty where nothing was asked for; `checked`: the largest
+    joints are to be commanded besides, empty where nothing was asked for; `T_tracker_base` (4, 4)
+    goes with what the file holds, though it may have no place for it; `checked`: the largest
     distance in m when it was read back with `checked_with`, None where it was not; `without_beta`:
     of a DH table with a column beta_rad that in m for who reads four columns only.
     """
@@ -116,9 +116,11 @@ class Exported:
     format: str
     cost: exportable.Cost
     held: dict[str, float]
+    by_prior: tuple[str, ...]
     of_the_measurement: tuple[str, ...]
     refit: exportable.Refit | None
     correction: exportable.JointCorrection
+    T_tracker_base: Array
     warnings: tuple[str, ...]
     text: str = ""
     checked: float | None = None
@@ -131,15 +133,24 @@ class Exported:
         warnings, (checked, how) = (*self.warnings, *told), read
         return replace(self, text=text, warnings=warnings, checked=checked, checked_with=how)
 
+    @property
+    def base_told(self) -> str:
+        xyz, rpy = (
+            " ".join(f"{v:.9g}" for v in each) for each in placed(self.T_tracker_base).values()
+        )
+        return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
+
     def to_json(self) -> dict[str, Any]:
         return {
             "schema": SCHEMA,
             "format": self.format,
             "cannot_hold": self.cost.to_json(),
             "refit": None if self.refit is None else self.refit.to_json(),
+            "tracker_to_base": placed(self.T_tracker_base),
             "read_back": {"with": self.checked_with, "max_um": microns(self.checked)},
             "without_beta_max_um": microns(self.without_beta),
             "held": self.held,
+            "by_prior": list(self.by_prior),
             "of_the_measurement": list(self.of_the_measurement),
             "warnings": list(self.warnings),
         }
@@ -157,8 +168,8 @@ def export(
         (option("base_frame"), wish.base_frame, FRAMED),
         (option("joint_correction"), wish.correct_joints, FITTED),
     ):
-        if given and wish.kind not in formats:
-            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.kind}")
+        said = f"{asked} goes with {listed(formats)}; found format {wish.kind}"
+        require(not given or wish.kind in formats, said)
     # The visits measured, where they are known, count under the load that was asked for.
     visits, force = calibrated.visits, given_force(wish.load)
     require(
@@ -199,10 +210,19 @@ def export(
          "equilibrium under the load and are left out"),
     )  # fmt: skip
     told = tuple(text for so, text in doubts if so)
-    done = Exported(wish.kind, cost, held, kept.of_the_measurement, refit, correction, told)
+    done = Exported(
+        wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
+        pieces.T_tracker_base, told,
+    )  # fmt: skip
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
     written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()
     return written
+
+
+def placed(T: Array) -> dict[str, list[float]]:
+    """A placement (4, 4) as m and rad (roll, pitch, yaw)."""
+    rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
+    return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
@@ -249,11 +269,6 @@ class _Writing:
         """
         pieces, model = self.pieces, self.calibrated.model
         chain, cell = pieces.calibrated_chain(), model.cell
-
-        def placed(T: Array) -> dict[str, list[float]]:
-            rpy = [v + 0.0 for v in rpy_from_rotation(T[:3, :3])]
-            return {"xyz_m": [float(v) + 0.0 for v in T[:3, 3]], "rpy_rad": rpy}
-
         document = {
             "schema": PARAMETERS,
             "robot": chain.name,
@@ -316,11 +331,11 @@ class _Writing:
                         *((angle, "") if group.lasting else ("", time)),
                         str(number + 1), MICRO.get(unit, unit), *micro,
                     ))  # fmt: skip
-        if not rows:
-            raise InputError(
-                f"{self.calibrated.source}: this arm has no smooth function to be written as "
-                "corrections; elastocal diagnose finds those that the readings show"
-            )
+        require(
+            bool(rows),
+            f"{self.calibrated.source}: this arm has no smooth function to be written as "
+            "corrections; elastocal diagnose finds those that the readings show",
+        )
         return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
 
     @property
@@ -337,7 +352,7 @@ class _Writing:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
             low, high = f"{sizes.min():.4g}", f"{sizes.max():.4g}"
             span = high if low == high else f"{low} to {high}"
-            told += f", fitted where it was measured, under {span} N"
+            told += f", fitted where it was measured, under {span} N, {self.done.base_told}"
         return told
 
     def random(self, poses: int) -> Measurements:

@@ -468,8 +468,6 @@ def read_joint_correction(path: str | Path) -> JointCorrection:
     return JointCorrection({key: tuple(np.array(pairs).T) for key, pairs in rows.items()})
 
 
-# A joint correction: q_effective = f(q_commanded).
-
 GEOMETRY = (JointOffset.name, LinkGeometry.name)  # which every format holds
 STEPS = 4  # errors of millimetres are nearly linear
 SMALLEST = 1e-9  # m

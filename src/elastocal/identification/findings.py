@@ -23,6 +23,7 @@ from elastocal.identification.solve import FAR, Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import Parameter
+from elastocal.model.calibrated import MOSTLY, mostly_prior
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import (
@@ -61,7 +62,6 @@ NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
 # 94.5 % of the information: beyond it a robust method is worth its while.
 HEAVY = 1.0
 FEW_DOF_PER_PARAMETER = 1.0
-MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
 # Equations left between configurations from which their scatter says to a factor of 1.25, with
 # 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25; and from
@@ -126,8 +126,7 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
     yield from _bounds(result)
     yield from _faulty(result)
     yield from _undetermined(result)
-    mostly = tuple(sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n]))
-    if mostly:
+    if mostly := mostly_prior(shares):
         yield _note("mostly_prior", parameters=mostly, share=tuple(shares[n] for n in mostly))
     if (summary := result.residual_summary) is not None:
         yield shape_of(summary)

@@ -423,10 +423,10 @@ def summarise_residuals(
     held = np.full(len(e), np.inf) if held_out is None else held_out[free]
     table = _Table(e, spare, held, None if absolute else f)
     judged = [(group, table.judged(*group[1:])) for group in groupings(observed, free)]
-    holm = _holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
+    of_all = holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
     found = []
     for group, p in judged:
-        adjusted, holm = holm[: len(p)], holm[len(p) :]
+        adjusted, of_all = of_all[: len(p)], of_all[len(p) :]
         found.append(table.grouping(*group, adjusted))
     edges = table.edges(len(table.z))
     whole = table.summary("all", slice(None), edges, None)
@@ -532,7 +532,7 @@ def _p_normal(skewness: float, kurtosis: float, n: int) -> float:
     return float(special.chdtrc(2, z1**2 + z2**2))
 
 
-def _holm(p: Array) -> Array:
+def holm(p: Array) -> Array:
     """Holm's adjusted p-values (1979, Scand. J. Stat. 6, 65): valid under any dependence."""
     adjusted = np.full(len(p), np.nan)
     order = np.flatnonzero(np.isfinite(p))

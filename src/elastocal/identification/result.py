@@ -41,6 +41,7 @@ from elastocal.model.calibrated import (
     CalibratedTool,
     OpenParameters,
     ShownPoses,
+    mostly_prior,
     nominal_flange_rows,
     tool_point,
 )
@@ -520,6 +521,7 @@ class Calibration(scrutiny.FoundFit, Result):
             self.model, self.x, self.determined, self.covariance, self.observations.table.source,
             tuple(map(_estimate_json, self.estimates)), self.left, lacking,
             measured_loads(self.observations), self.shown, measured_visits(self.observations),
+            mostly_prior(self.prior_share),
         )  # fmt: skip
 
     @cached_property

@@ -163,6 +163,7 @@ class CalibratedArm(Valued, Saved):
         loads: (L, 3) N, the forces under which it was measured; none in results that do not say.
         shown: How sure the fit is where it was measured; None in results that do not say.
         visits: The joints and forces measured; None in results that do not say.
+        by_prior: Those of `determined` that owe more to a prior than to the readings.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -181,6 +182,7 @@ class CalibratedArm(Valued, Saved):
     loads: Array = field(default_factory=lambda: np.zeros((0, 3)))
     shown: ShownPoses | None = None
     visits: MeasuredVisits | None = field(default=None, compare=False)  # rounded in files
+    by_prior: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         return (
@@ -309,7 +311,18 @@ def read_calibrated(
         stated.loads_N.reshape(-1, 3),
         stated.measured_poses,
         visits if visits is not None and len(visits.q) and visits.q.shape == shape else None,
+        mostly_prior(stated.prior_share or {}),
     )
+
+
+MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
+
+
+def mostly_prior(shares: Mapping[str, float | None]) -> tuple[str, ...]:
+    """Of the estimates with these shares of information by a prior those that owe it more, the
+    largest share first; null or NaN where constraints fix a value."""
+    known = {name: share for name, share in shares.items() if share is not None and share > MOSTLY}
+    return tuple(sorted(known, key=lambda name: -known[name]))
 
 
 NONE = np.zeros(0)
@@ -335,6 +348,7 @@ class _Result(Table, extra="ignore"):
     loads_N: Triples = key("a list of forces, three numbers each", NONE)
     measured_poses: ShownPoses | None = key("a table")
     measured_visits: MeasuredVisits | None = key("a table")
+    prior_share: dict[str, float | None] | None = key("a table of shares")
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:
@@ -620,6 +634,11 @@ class CalibratedTool:
 
     def frames(self, rows: list[NDArray]) -> tuple[Array, Array, Array]:
         """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for;
-        the point (n, 3) m and the tool's rotation (n, 3, 3) in the flange frame."""
-        T, place, turn = self._frames(*rows, self.x)
+        the point (n, 3) m and the tool's rotation (n, 3, 3) in the flange frame.  What moves them
+        with the joints' angles is an error of the arm and no part of the frames."""
+        x = self.x.copy()
+        for group in smooth_groups(self.calibrated.model):
+            if group.basis is not None and group.lasting:
+                x[group.columns] = 0.0
+        T, place, turn = self._frames(*rows, x)
         return T, place[..., 0], turn

@@ -533,7 +533,7 @@ def _commands(c: Compensation) -> pd.DataFrame:
 
     from elastocal.compensation.compensate import commands_csv
 
-    text = StringIO(commands_csv(c, c.chain.kinds))
+    text = StringIO(commands_csv(c))
     frame = pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])
     if "configuration" in frame:
         frame["configuration"] = frame["configuration"].map(cell_meaning, na_action="ignore")

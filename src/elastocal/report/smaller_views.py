@@ -93,8 +93,14 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
             "The sessions determined other parameters; the new ones are given in those of the old, "
             "to first order."
         )
+    if mostly := dict.fromkeys((*c.old.by_prior, *c.new.by_prior)):
+        compared.append(
+            "A change of what is determined mostly by a prior is hardly seen, and its part of the "
+            f"noise is that of the prior: {some(mostly, 8)}."
+        )
     yield say.Lines([
         ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
+        *(("Not compared", f"{text}.") for text in ["; ".join(c.not_compared)] if text),
         *(("Next", step) for step in steps),
     ])  # fmt: skip
     yield say.Fold("", lambda: [_moves(c)], figures=("moved",))
@@ -117,8 +123,11 @@ def _change_table(c: Comparison) -> say.ShownTable:
         "of such a difference where nothing has changed, corrected for all parameters. Moves the "
         "tool: rms over the poses, by this change alone."
     )
+    if any(one.name not in c.old.values for one in c.changes):
+        note += " Of smooth functions all numbers are such rms."
     table = say.ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
-    return replace(table, narrow=table.without(1, 2).when_narrow(2, 4))
+    short = table.without(1, 2)
+    return replace(table, narrow=replace(short, narrow=short.without(4).when_narrow(2)))
 
 
 def _moves(c: Comparison) -> say.Figure:
@@ -150,7 +159,7 @@ def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     more = len(c.status) - len(rows)
     note = f"and {more} more in the file of commands" if more else ""
     commands = say.ShownTable(heads, rows, (0, len(heads) - 1), note=note)
-    yield from compensation_blocks({"commands": summary(c, kinds, commands=False)})
+    yield from compensation_blocks({"commands": summary(c, commands=False)})
     yield say.Fold(
         "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, told=False)],
         figures=("errors",),
@@ -193,6 +202,11 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
             "first order (beside singular postures or limits)."
         )
+        if (std := table["std_um"]["rms"]) is not None:
+            yield say.Sentence(
+                f"Standard uncertainty of the tool at them: {say.length(std * 1e-6)} rms; within, "
+                f"at 95 %: {say.length(table['within95_um']['rms'] * 1e-6)}."
+            )
         yield say.Lines([(say.WARNING, text) for text in table["warnings"]])
 
 
@@ -277,6 +291,8 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
         nominal = say.length(refit.nominal)
         yield say.Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
+        if refit.taken or refit.correction is not None:
+            yield say.Sentence(f"The file is fitted {done.base_told}: place it there.")
     if done.checked is not None:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
@@ -286,6 +302,8 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
             "Not determined by the data, at the values that the identification predicts with: "
             f"{some(done.held, 8)}."
         )
+    if done.by_prior:
+        yield say.Sentence(f"Determined mostly by a prior: {some(done.by_prior, 8)}.")
     if done.of_the_measurement:
         left = ", ".join(done.of_the_measurement)
         yield say.Sentence(f"Left out, effects of the measurement: {left}.")
