@@ -29,6 +29,7 @@ from elastocal.planning.candidates import (
     check_available,
     draw,
     joint_space,
+    poses_of,
     shares_of,
 )
 from elastocal.planning.choices import Choice, applied, chosen_states, within
@@ -322,7 +323,7 @@ class _Design:
         lots, names, told, options = list[Candidates](), list[str](), "", self.options
         if spec.taught is not None:
             self.progress(f"checking the poses of {spec.taught}")
-            table = self.model.read_plan(spec.taught)
+            table = poses_of(self.model, spec.taught)
             own, names, told = brought(*asked, table, options.pins)
             lots.append(own)
         if spec.taught is None or spec.candidates is not None:
