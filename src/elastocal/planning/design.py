@@ -182,18 +182,19 @@ class _Design:
 
     def _leave_out(self) -> None:
         """Smooth functions, and effects of what a pose has only once it stands in an order."""
+        cell, done = self.model.cell, self.options.done is not None
+        effects = dict.fromkeys(c.name for c in cell.model.effects)
+        needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
         functions = tuple(dict.fromkeys(p.effect for p in self.model.parameters if p.shrunk))
+        lasting = tuple(c for c in cell.model.effects if not needs[c.name])
+        self.whole = self.model.with_effects(lasting) if done and functions else None
         self._drop(
             functions,
             f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made for "
             "the other parameters; to show functions too, measure many poses all over the joints' "
             "ranges",
         )
-        cell = self.model.cell
-        effects = dict.fromkeys(c.name for c in cell.model.effects)
-        needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
-        open_ = tuple(name for name in effects if needs[name])
-        done = self.options.done is not None
+        open_ = tuple(name for name in effects if needs[name] and name not in functions)
         unknown = tuple(name for name in open_ if done or "temperature" in needs[name])
         self._drop(
             unknown,
@@ -225,6 +226,12 @@ class _Design:
 
     def run(self) -> Plan:
         plan = self._chosen()
+        if (gain := self._gain(plan)) is not None:
+            told = (
+                "with the smooth functions, which stay uncertain, the error at the test poses is "
+            )
+            told += f"{gain.after * 1e6:.3g} µm rms"
+            plan = replace(plan, gain=gain, warnings=(*plan.warnings, told))
         if self.conditions is None:
             return plan
         whole, fixed = self.conditions
@@ -248,7 +255,7 @@ class _Design:
         progress("information of the candidates")
         setup = set_up(
             self.model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen, self.work,
+            region, self.feasibility.seen, self.work, options.effort == "batch",
         )  # fmt: skip
         self.warnings += setup.warnings
         if pins is not None and len(pins.q):
@@ -278,6 +285,20 @@ class _Design:
         progress("random plans beside it")
         drawn = setup.problem(pool, found.shares).random_information(options.seed)
         return self._plan(setup, found, counts, targets.source, curve, drawn)
+
+    def _gain(self, plan: Plan) -> Gain | None:
+        """The plan's gain where smooth functions count, which the readings show in part."""
+        options, done, whole = self.options, self.options.done, self.whole
+        if plan.gain is None or done is None or whole is None:
+            return None
+        self.progress("gain with the smooth functions")
+        fixed = tuple(name for name in options.fixed if whole.meant_by(name))
+        known = Known(fixed, options.prior, measured(whole, done, fixed))
+        targets, sight = self.targets()[0], self.feasibility.seen
+        setup = set_up(whole, plan.q, len(plan), targets, known, sight=sight, hold=True)
+        assert setup.target_rows is not None  # a plan with a gain has test poses
+        M = setup.gathered(setup.information.blocks(plan.q, plan.readings))
+        return Gain.of(setup.target_rows, setup.prior, M, options.seed)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
