@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from elastocal.errors import ElastocalError
+from elastocal.errors import ElastocalError, option
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged
 from elastocal.identification.knowledge import Constraints
@@ -80,7 +80,7 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
-from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
+from elastocal.measurements import NEVER_YET, Measurements, in_both, numbered, order_contradicted
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
 from elastocal.model.effects.catalogue import effect_of
@@ -134,7 +134,13 @@ def identify(
 def _doubts(
     model: Model, table: Measurements, test: Measurements | None, x: Array
 ) -> Iterator[str]:
-    """Moves out of order, where any effect follows the last one, and an arm that lies."""
+    """Moves out of order, where any effect follows the last one, an arm that lies, and a test of
+    what was fitted."""
+    if test is not None and (twice := in_both(test, table)):
+        yield (
+            f"{twice} of {len(test)} readings of {test.source} ({option('test')}) are fitted too, "
+            "so that their error tests nothing; give readings of other poses"
+        )
     moves = any(effect_of(p.effect).family == "move" for p in model.parameters)
     if moves or model.cell.model.approach == BY_ORDER:
         for text in (order_contradicted(one) for one in (table, test) if one is not None):
