@@ -9,14 +9,15 @@ Signature and docstring are the one place where an option is declared, for the c
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
-from elastocal.above import checked_arguments, later, whole
-from elastocal.errors import InputError, option, require
+from elastocal.above import checked_arguments, later, shown, whole
+from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
@@ -177,8 +178,23 @@ def design(
     asked = {name: given for name, given in locals().items() if name not in ("model", "progress")}
     from elastocal.planning.design import design as run
 
-    cell, options = design_request(model, **asked)
-    return run(cell, options, progress=progress or _silent)
+    with options_named(asked):
+        cell, options = design_request(model, **asked)
+        return run(cell, options, progress=progress or _silent)
+
+
+@contextmanager
+def options_named(asked: Mapping[str, Any]) -> Iterator[None]:
+    """Messages on a key of [design] in whose place an option is `asked` name the option."""
+    try:
+        yield
+    except ElastocalError as error:
+        told = str(error)
+        for name in (name for name, given in asked.items() if given is not None):
+            key = rf"{name.replace('test_poses', 'test_pose')}(_um|_si|_deg)?"
+            where = rf"^([^:\[]*: )?(key )?(\w+ of )?\[*design\]?[ .](poses_)?{key}\]*(?= )"
+            told = re.sub(where, lambda _, name=name: option(name), told)  # type: ignore[misc]
+        raise type(error)(told) from None
 
 
 def design_request(
@@ -256,7 +272,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
     chosen = {key: made[key](v) if key in made else v for key, v in chosen.items()}
     if "candidates" in chosen:
-        told = f"takes {wish.CANDIDATES}; found {quoted(chosen['candidates'])}"
+        told = f"takes {wish.CANDIDATES}; found {shown(chosen['candidates'])}"
         found = wish.of_candidates(chosen["candidates"])
         require(found is not None, f"{option('candidates')} {told}")
         given, taught = found or (None, None)
@@ -388,7 +404,7 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats, 1)
-    if isinstance(plan, str | Path):
+    if isinstance(plan, str | Path) or hasattr(plan, "to_csv"):
         poses = made.read_plan(plan)
     elif type(plan).__name__ == "Plan":
         poses = plan.table()
@@ -771,7 +787,9 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
 
     if prior is None or isinstance(prior, GaussianPrior):
         return prior
-    require(isinstance(prior, Mapping), f"{option('prior')} takes mean and std by parameter")
+    told = 'takes mean and std by parameter, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}'
+    named = isinstance(prior, Mapping) and all(isinstance(v, Mapping) for v in prior.values())
+    require(named, f"{option('prior')} {told}; found {shown(prior)}")
     return GaussianPrior.from_dict(prior)
 
 

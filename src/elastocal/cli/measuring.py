@@ -202,7 +202,7 @@ def design(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
     )  # fmt: skip
-    with run.progress() as progress:
+    with run.progress() as progress, verbs.options_named(asked):
 
         def chosen(path: Path) -> None:
             from elastocal.diagnosis.diagnose import write_extended_cell

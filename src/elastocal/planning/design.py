@@ -94,13 +94,15 @@ class DesignOptions:
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
-        check_known(self.effort, efforts, f"effort '{self.effort}' is unknown")
+        told = f"{option('effort')} {quoted(self.effort)} is unknown"
+        check_known(self.effort, efforts, told)
         require(
             self.jobs == -1 or self.jobs >= 1,
-            f"jobs takes a number of processes, or -1 for all cores; found {self.jobs}",
+            f"{option('jobs')} takes a number of processes, or -1 for all cores; found {self.jobs}",
         )
         require(
-            all(n >= 1 for n in self.curve), f"a curve takes numbers of poses, found {self.curve}"
+            all(n >= 1 for n in self.curve),
+            f"{option('curve')} takes numbers of poses, found {self.curve}",
         )
 
 
