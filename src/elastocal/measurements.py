@@ -273,17 +273,6 @@ def numbered(*columns: NDArray[Any]) -> IntArray:
     return number
 
 
-def in_both(one: Measurements, other: Measurements) -> int:
-    """How many readings of `one` stand in the `other` too, alike to the last digit."""
-
-    def rows(table: Measurements) -> list[bytes]:
-        read = table.position if table.distance is None else table.distance
-        return [bytes(row) for row in np.column_stack([table.q, table.force, np.asarray(read)])]
-
-    there = set(rows(other))
-    return sum(row in there for row in rows(one))
-
-
 def load_states(force: Array) -> IntArray:
     """Number (n,) of each force (n, 3) in N, alike to a µN."""
     with np.errstate(over="ignore"):  # of forces beyond all measure

@@ -191,8 +191,9 @@ def options_named(asked: Mapping[str, Any]) -> Iterator[None]:
     except ElastocalError as error:
         told = str(error)
         for name in (name for name, given in asked.items() if given is not None):
-            key = rf"{name.replace('test_poses', 'test_pose')}(_um|_si|_deg)?"
-            where = rf"^([^:\[]*: )?(key )?(\w+ of )?\[*design\]?[ .](poses_)?{key}\]*(?= )"
+            key = rf"{name.replace('test_poses', 'test_pose')}(_um|_N|_si|_deg)?"
+            of_the_cell = r"([^:\[]*: )?(key )?(\w+ of )?\[*design\]?[ .](poses_)?"
+            where = rf"^(\w+: |{of_the_cell}){key}\]*(?= )"
             told = re.sub(where, lambda _, name=name: option(name), told)  # type: ignore[misc]
         raise type(error)(told) from None
 
@@ -237,14 +238,9 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        **search,
-        fixed=_names("fixed", fixed),
-        prior=_gaussian(prior) if stated is None else stated,
-        done=done,
-        curve=tuple(sorted({*curve})),
-        notes=notes,
-        pins=pins,
-    )
+        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins,
+        prior=_gaussian(prior) if stated is None else stated, curve=tuple(sorted({*curve})),
+    )  # fmt: skip
     return cell, options
 
 
@@ -289,13 +285,9 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
             told = f"{option(key)} and {option(other)} both say what the rest is worth; drop one"
             require(not (chosen[key] and chosen.get(other)), told)
             chosen.setdefault(other, None)
-    motion = {
-        key: _wish(wish.Motion, key, chosen.pop(key))
-        for key in ("load_changes", "reference_every") if key in chosen
-    }  # fmt: skip
+    motion = {k: chosen.pop(k) for k in ("load_changes", "reference_every") if k in chosen}
     if motion:
         chosen["motion"] = replace(chosen.get("motion", cell.design.motion), **motion)
-    chosen = {key: _wish(wish.DesignSpec, key, value) for key, value in chosen.items()}
     # What the cell says of the number of poses gives way to what is asked for here.
     number: dict[str, Any] = {"minutes": None} if wishes else {}
     if "poses" in chosen or "minutes" in chosen:
@@ -303,15 +295,6 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     if chosen.get("per_level"):
         number = {"poses": sum(chosen["per_level"]), "target": None, "minutes": None}
     return replace(cell.design, **(number | chosen))
-
-
-def _wish(record: Any, key: str, value: Any) -> Any:
-    """A value as a record of the cell takes it.  Raises InputError that names the option."""
-    try:
-        return getattr(record(**{key: value}), key)
-    except InputError as error:
-        named = rf"{record.__name__}: {key}|key design\.{key}(_\w+)?"
-        raise InputError(re.sub(named, lambda _: option(key), str(error))) from None
 
 
 def _plain(value: Any) -> Any:
@@ -509,16 +492,11 @@ def identify(
         covariance is None or (np.ndim(covariance) == 2 and np.size(covariance) > 0),
         f"{option('covariance')} takes a square matrix in m²; found {quoted(covariance)}",
     )
+    matrix = None if covariance is None else np.asarray(covariance, dtype=float)
     options = Options(
-        method=method,
-        noise=noise,
-        weights=weights,
-        covariance=None if covariance is None else np.asarray(covariance, dtype=float),
-        intervals=intervals,
-        fixed=_names("fixed", fixed),
-        faulty=outliers,
-        seed=cast(int, seed),
-    )
+        method=method, noise=noise, weights=weights, covariance=matrix, intervals=intervals,
+        fixed=_names("fixed", fixed), faulty=outliers, seed=cast(int, seed),
+    )  # fmt: skip
     known = knowledge_of(knowledge, physical or bounded)
     tell = progress or _silent
     tell("reading")

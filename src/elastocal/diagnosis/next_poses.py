@@ -138,9 +138,8 @@ def next_poses(
         ('measure', 5)
     """
     check(batch >= 1, f"{option('batch')} takes a number of poses, found {batch}")
-    check(
-        require is None or require > 0, f"{option('require')} takes an error in m, found {require}"
-    )
+    told = f"{option('require')} takes an error in m, found {require}"
+    check(require is None or require > 0, told)
     check(0 <= least_gain < 1, f"{option('least_gain')} takes a share from 0 to below 1")
     tell: Progress = progress or (lambda message: None)
     model = model if isinstance(model, Model) else Model(model)
@@ -176,19 +175,11 @@ def next_poses(
     plan = replace(plan, gain=(gain := plan.gain.lacking(lacking, reached)))
     verdict = verdict_of(gain, reached, required, least_gain)
     return NextPoses(
-        verdict=verdict,
-        plan=plan if verdict == "measure" else None,
-        batch=len(plan),
-        gain=gain,
-        required=required,
-        reached=reached,
-        found=() if why is None else why.effects,
-        doubts=() if why is None else _in_doubt(why),
-        least_gain=least_gain,
-        source=table.source,
-        diagnosis=why,
-        calibration=fit,
-    )
+        verdict=verdict, plan=plan if verdict == "measure" else None, batch=len(plan), gain=gain,
+        required=required, reached=reached, found=() if why is None else why.effects,
+        doubts=() if why is None else _in_doubt(why), least_gain=least_gain, source=table.source,
+        diagnosis=why, calibration=fit,
+    )  # fmt: skip
 
 
 def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
@@ -212,9 +203,8 @@ def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
 def _in_doubt(why: Diagnosis) -> tuple[tuple[str, str, float], ...]:
     """What may be missing beside or instead of what was found: effect, place and probability."""
     found = {(f.effect, f.where) for f in why.effects}
-    every = ((c.effect, c.where, c.probability) for c in why.candidates)
-    left = [c for c in every if c[:2] not in found and c[2] > DOUBT]
-    return tuple(sorted(left, key=lambda c: -c[2]))
+    every = ((c.effect, c.where, c.probability) for c in why.candidates if c.probability > DOUBT)
+    return tuple(sorted((c for c in every if c[:2] not in found), key=lambda c: -c[2]))
 
 
 def verdict_of(

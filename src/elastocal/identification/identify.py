@@ -80,7 +80,7 @@ from elastocal.identification.start import (
     without_copies,
 )
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
-from elastocal.measurements import NEVER_YET, Measurements, in_both, numbered, order_contradicted
+from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
 from elastocal.model.effects.catalogue import effect_of
@@ -136,11 +136,18 @@ def _doubts(
 ) -> Iterator[str]:
     """Moves out of order, where any effect follows the last one, an arm that lies, and a test of
     what was fitted."""
-    if test is not None and (twice := in_both(test, table)):
-        yield (
-            f"{twice} of {len(test)} readings of {test.source} ({option('test')}) are fitted too, "
-            "so that their error tests nothing; give readings of other poses"
+    if test is not None:
+        read = [np.asarray(t.distance if t.position is None else t.position) for t in (table, test)]
+        fitted, kept = (
+            list(map(bytes, np.column_stack([t.q, t.force, values])))
+            for t, values in zip((table, test), read, strict=True)
         )
+        there = set(fitted)
+        if twice := sum(row in there for row in kept):
+            yield (
+                f"{twice} of {len(test)} readings of {test.source} ({option('test')}) are fitted "
+                "too, so that their error tests nothing; give readings of other poses"
+            )
     moves = any(effect_of(p.effect).family == "move" for p in model.parameters)
     if moves or model.cell.model.approach == BY_ORDER:
         for text in (order_contradicted(one) for one in (table, test) if one is not None):

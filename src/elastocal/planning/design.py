@@ -450,40 +450,26 @@ class _Design:
         if done is not None and R is not None:
             gain = Gain.of(R, setup.prior, M, self.options.seed)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
+        labels = self.options.done.configuration_labels if self.options.done else ()
         return Plan(
-            model=self.model,
-            criterion=spec.criterion,
-            value=found.value,
-            reported=figure(found.value),
-            unit=setup.criterion.unit,
-            q=q,
-            forces=self.forces,
-            group=pool.group[chosen],
-            levels=self.space.levels,
+            model=self.model, criterion=spec.criterion, value=found.value,
+            reported=figure(found.value), unit=setup.criterion.unit, q=q, forces=self.forces,
+            group=pool.group[chosen], levels=self.space.levels,
             level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
-            execution=execution,
-            candidates=counts,
-            certificate=found.certificate,
+            execution=execution, candidates=counts, certificate=found.certificate,
             predicted=predicted(setup.found, left, numbers),
             reasons=reasons(
                 setup.information.names, blocks, M,
                 setup.criterion.of_information(without) / found.value,
             ),
-            targets=f"test poses: {targets}",
-            seed=self.options.seed,
+            targets=f"test poses: {targets}", seed=self.options.seed, curve=curve,
             polished=int(((chosen >= found.first) & (chosen < len(found.pool))).sum()),
-            curve=curve,
             bound_reported=None if bound is None else figure(bound),
-            warnings=tuple(self.warnings),
-            made_for="" if done is None else done.note,
-            first=next_number(self.options.done.configuration_labels if self.options.done else ()),
-            names=self._names(pool, chosen, len(found.pool)),
+            warnings=tuple(self.warnings), made_for="" if done is None else done.note,
+            first=next_number(labels), names=self._names(pool, chosen, len(found.pool)),
             chance=Chance.of(drawn, found.value, setup.criterion),
-            everywhere=setup.everywhere(M, drawn, left),
-            seen=None if seen.all() else seen,
-            readings=readings,
-            states=self.states,
-            gain=gain,
+            everywhere=setup.everywhere(M, drawn, left), seen=None if seen.all() else seen,
+            readings=readings, states=self.states, gain=gain,
         )  # fmt: skip
 
     def _names(self, pool: FeasiblePool, chosen: IntArray, own: int) -> tuple[str, ...]:
