@@ -94,11 +94,7 @@ def init(
 
 
 @command(short_help="List the effects that can be fitted", flags="plugins json")
-def effects(
-    cell: Annotated[Path | None, typer.Argument()] = None,
-    *,
-    run: Run,
-) -> None:
+def effects(cell: Annotated[Path | None, typer.Argument()] = None, *, run: Run) -> None:
     """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
 
     Example: elastocal effects cell.toml

@@ -36,13 +36,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.noise_summary import noise_of
-from elastocal.identification.options import (
-    ROBUST,
-    Course,
-    IntervalKind,
-    MethodResult,
-    Options,
-)
+from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
 from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,

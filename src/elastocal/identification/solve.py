@@ -22,12 +22,7 @@ from elastocal.identification.residuals import (
     predicts_better,
     rms_3d,
 )
-from elastocal.identification.weighted_problem import (
-    Problem,
-    RFactor,
-    Weights,
-    least_norm,
-)
+from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
