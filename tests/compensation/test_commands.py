@@ -10,15 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from support.cells import (
-    COMPENSATOR,
-    COMPLIANCE,
-    DOWN,
-    SLANTED,
-    kr270_cell,
-    kr270_chain,
-    table_of,
-)
+from support.cells import COMPENSATOR, COMPLIANCE, DOWN, SLANTED, kr270_cell, kr270_chain, table_of
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
@@ -29,11 +21,7 @@ from elastocal.compensation.compensate import (
     read_targets,
     targets_at,
 )
-from elastocal.compensation.correction_table import (
-    EXACT,
-    CorrectionGrid,
-    correction_table,
-)
+from elastocal.compensation.correction_table import EXACT, CorrectionGrid, correction_table
 from elastocal.errors import InputError
 from elastocal.model.calibrated import (
     CalibratedArm,

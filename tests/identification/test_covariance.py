@@ -13,12 +13,7 @@ import statsmodels.api as sm
 from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.least_squares import (
-    Covariance,
-    clustered,
-    drawing_root,
-    orthogonal,
-)
+from elastocal.identification.least_squares import Covariance, clustered, drawing_root, orthogonal
 
 
 def cluster_robust(B, e, cluster, kind="CR2"):
