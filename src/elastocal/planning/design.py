@@ -184,7 +184,8 @@ class _Design:
 
     def _leave_out(self) -> None:
         """Smooth functions, and effects of what a pose has only once it stands in an order."""
-        cell, done = self.model.cell, self.options.done is not None
+        cell, self.fixed = self.model.cell, self.options.fixed
+        done = self.options.done is not None
         effects = dict.fromkeys(c.name for c in cell.model.effects)
         needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
         functions = tuple(dict.fromkeys(p.effect for p in self.model.parameters if p.shrunk))
@@ -294,7 +295,7 @@ class _Design:
         if plan.gain is None or done is None or whole is None:
             return None
         self.progress("gain with the smooth functions")
-        fixed = tuple(name for name in options.fixed if whole.meant_by(name))
+        fixed = tuple(name for name in self.fixed if whole.meant_by(name))
         known = Known(fixed, options.prior, measured(whole, done, fixed))
         targets, sight = self.targets()[0], self.feasibility.seen
         setup = set_up(whole, plan.q, len(plan), targets, known, sight=sight, hold=True)
