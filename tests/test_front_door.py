@@ -261,12 +261,11 @@ def test_a_cell_without_markers_takes_those_of_the_table(folder):
         ("design", {"curve": [10, 2]}, r"^curve=2: .*cell\.toml has 5 levels"),
         ("next_poses", {"batch": 2}, r"^batch=2: .*cell\.toml has 5 levels"),
         ("design", {"poses": 3, "target": 1e-5}, "`poses` and `target`: a target"),
-        (
-            "design",
-            {"robust": "worst"},
-            "`robust` is gone: plans are made for the arm as identified",
-        ),
+        ("design", {"robust": "worst"}, "`robust` is gone: plans are made .* as identified"),
         ("design", {"doubts": {}}, "`doubts` is gone: for effects that the model may lack"),
+        ("design", {"test_poses": [0, 0, 0]}, r"^`test_poses` no\. 1 has 3 numbers"),
+        ("design", {"effort": "fast"}, "^`effort` 'fast' is unknown"),
+        ("identify", {"prior": {"joint3": 3}}, "`prior` takes mean and std by parameter"),
         ("identify", {"fixed": "joint9"}, r"fixed=\['joint9'\]: the model has no such"),
         ("identify", {"test": 5}, "`test` takes measurements"),
         ("diagnose", {"false_alarm": 0.7}, "`false_alarm` takes a number between"),
@@ -321,16 +320,19 @@ def test_what_a_user_guesses(folder):
         fit.residuals.shape == (270, 3) and fit.to_dict()["schema"] == "elastocal/identification/1"
     )
     assert fit.summary() == str(fit)
-    q = model.read_plan(folder / "plan.csv").q
-    assert fit.predict(q, [0, 0, -2600]).shape == (len(q), 3)
+    plan = model.read_plan(folder / "plan.csv")
+    assert ec.simulate(model, plan.to_dataframe()) == ec.simulate(model, plan)
+    assert "540 of 540 readings" in ec.identify(model, frame, test=frame).warnings[0]
+    assert fit.predict(plan.q, [0, 0, -2600]).shape == (len(plan), 3)
     table = fit.observations.table
     assert np.allclose(fit.predict(table), fit.observations.value.reshape(-1, 3) - fit.residuals)
     assert np.allclose(fit.predict(table.to_dataframe()), fit.predict(table), atol=1e-9)
-    assert (
-        str(fit["joint3.compliance"])
-        == "joint3.compliance = (4.167 ± 0.014)e-07 rad/(N*m) (standard deviation)"
-    )
+    told = "joint3.compliance = (4.167 ± 0.014)e-07 rad/(N*m) (standard deviation)"
+    assert str(fit["joint3.compliance"]) == told
     assert str(fit["joint1.compliance"]) == "joint1.compliance: no value"
+    for wrong in (ec.read_cell, ec.init, fit.save, fit.report):
+        with pytest.raises(ec.InputError, match="path"):
+            wrong(5)
     with pytest.raises(ec.InputError, match="DataFrame"):
         model.read(frame.drop(columns=[c for c in frame if c.startswith("q1_")]))
 

@@ -158,7 +158,7 @@ class Result(Saved):
             >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
             >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
         """
-        import_module(VIEWS).write_page(self, Path(path), inputs, command, seed)
+        import_module(VIEWS).write_page(self, path, inputs, command, seed)
 
     def plot(self, kind: str | None = None, interactive: bool = False, ax: Any = None) -> Any:
         """A figure of the result.
@@ -295,6 +295,7 @@ KINDS: dict[str, tuple[str, Check]] = {
     ),
     "Progress": ("a function", callable),
     "None": ("None", lambda v: v is None),
+    "Any": ("anything", lambda v: True),
 }  # fmt: skip
 CLASSES = {"a path", "a Mapping"}  # words for what a function tells apart itself
 ALIASES = {
@@ -332,7 +333,7 @@ def checked_arguments(function: F) -> F:
         for name in names:
             if name in given and not any(fits(given[name]) for _, fits in kinds[name]):
                 takes = " or ".join(dict.fromkeys(words for words, _ in kinds[name]))
-                raise InputError(f"{option(name)} takes {takes}; found {_shown(given[name])}")
+                raise InputError(f"{option(name)} takes {takes}; found {shown(given[name])}")
 
     # What may be one of several classes the function tells apart itself, and says it better.
     simple = [
@@ -394,7 +395,7 @@ def _kind(name: str) -> tuple[str, Check]:
     return KINDS.get(name, (f"a {name}", _is_a(name)))
 
 
-def _shown(value: Any) -> str:
+def shown(value: Any) -> str:
     if value is None or isinstance(value, str | Real | list | tuple | Mapping):
         return quoted(value)
     shape = getattr(value, "shape", ())

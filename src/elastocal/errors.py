@@ -24,6 +24,8 @@ FLAGS = {
     "fixed": "--fix", "options": "--set", "values": "--set", "presets": "--preset",
     "extra_poses": "--poses",
 }  # fmt: skip
+# Options of the command line alone, and what stands for them in Python.
+IN_PYTHON = {"cell_out": 'save("found.toml")', "plan": "extra_poses"}
 # Keyword arguments that take a list, and flags that are repeated.
 LISTS = ("fixed", "without", "options", "presets")
 
@@ -107,7 +109,7 @@ def option(keyword: str, value: object = None) -> str:
             return f"--no-{flag[2:]}"
         return flag if value is None or value is True else f"{flag} {value}"
     if value is None:
-        return f"`{keyword}`"
+        return f"`{IN_PYTHON.get(keyword, keyword)}`"
     return f"{keyword}=[{value!r}]" if keyword in LISTS else f"{keyword}={value!r}"
 
 

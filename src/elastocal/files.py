@@ -53,6 +53,8 @@ OTHERS = {
 @contextmanager
 def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
     """An existing regular file of at most `max_bytes`, opened for binary reading."""
+    told = f"the {what} is given by its path; found {type(path).__name__}"
+    require(isinstance(path, str | Path), told)
     ending = Path(path).suffix.lower()
     if ending in OTHERS.get(what, ()):  # arguments stand in each other's place
         raise InputError(

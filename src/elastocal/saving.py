@@ -35,6 +35,7 @@ LARGEST_SUMMARY = 200_000_000  # bytes
 # One verb's result should not load another verb: each function imports what it needs.
 
 
+@checked_arguments
 def save(result: Any, path: str | Path, **how: Any) -> None:
     """Write a result or a calibrated arm; class and ending decide what, `how` are its options.
 

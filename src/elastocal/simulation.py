@@ -113,10 +113,7 @@ def _sizes_shown(model: Model) -> Array:
 
 
 def expand_plan(
-    plan: Measurements,
-    marker_names: tuple[str, ...],
-    repeats: int = 1,
-    load: Array | None = None,
+    plan: Measurements, marker_names: tuple[str, ...], repeats: int = 1, load: Array | None = None
 ) -> Measurements:
     """Every pose of a plan once per load state, repeat and marker.
 

@@ -9,14 +9,15 @@ Signature and docstring are the one place where an option is declared, for the c
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
-from elastocal.above import checked_arguments, later, whole
-from elastocal.errors import InputError, option, require
+from elastocal.above import checked_arguments, later, shown, whole
+from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
@@ -177,8 +178,24 @@ def design(
     asked = {name: given for name, given in locals().items() if name not in ("model", "progress")}
     from elastocal.planning.design import design as run
 
-    cell, options = design_request(model, **asked)
-    return run(cell, options, progress=progress or _silent)
+    with options_named(asked):
+        cell, options = design_request(model, **asked)
+        return run(cell, options, progress=progress or _silent)
+
+
+@contextmanager
+def options_named(asked: Mapping[str, Any]) -> Iterator[None]:
+    """Messages on a key of [design] in whose place an option is `asked` name the option."""
+    try:
+        yield
+    except ElastocalError as error:
+        told = str(error)
+        for name in (name for name, given in asked.items() if given is not None):
+            key = rf"{name.replace('test_poses', 'test_pose')}(_um|_N|_si|_deg)?"
+            of_the_cell = r"([^:\[]*: )?(key )?(\w+ of )?\[*design\]?[ .](poses_)?"
+            where = rf"^(\w+: |{of_the_cell}){key}\]*(?= )"
+            told = re.sub(where, lambda _, name=name: option(name), told)  # type: ignore[misc]
+        raise type(error)(told) from None
 
 
 def design_request(
@@ -221,14 +238,9 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        **search,
-        fixed=_names("fixed", fixed),
-        prior=_gaussian(prior) if stated is None else stated,
-        done=done,
-        curve=tuple(sorted({*curve})),
-        notes=notes,
-        pins=pins,
-    )
+        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins,
+        prior=_gaussian(prior) if stated is None else stated, curve=tuple(sorted({*curve})),
+    )  # fmt: skip
     return cell, options
 
 
@@ -256,7 +268,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
     chosen = {key: made[key](v) if key in made else v for key, v in chosen.items()}
     if "candidates" in chosen:
-        told = f"takes {wish.CANDIDATES}; found {quoted(chosen['candidates'])}"
+        told = f"takes {wish.CANDIDATES}; found {shown(chosen['candidates'])}"
         found = wish.of_candidates(chosen["candidates"])
         require(found is not None, f"{option('candidates')} {told}")
         given, taught = found or (None, None)
@@ -273,13 +285,9 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
             told = f"{option(key)} and {option(other)} both say what the rest is worth; drop one"
             require(not (chosen[key] and chosen.get(other)), told)
             chosen.setdefault(other, None)
-    motion = {
-        key: _wish(wish.Motion, key, chosen.pop(key))
-        for key in ("load_changes", "reference_every") if key in chosen
-    }  # fmt: skip
+    motion = {k: chosen.pop(k) for k in ("load_changes", "reference_every") if k in chosen}
     if motion:
         chosen["motion"] = replace(chosen.get("motion", cell.design.motion), **motion)
-    chosen = {key: _wish(wish.DesignSpec, key, value) for key, value in chosen.items()}
     # What the cell says of the number of poses gives way to what is asked for here.
     number: dict[str, Any] = {"minutes": None} if wishes else {}
     if "poses" in chosen or "minutes" in chosen:
@@ -287,15 +295,6 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     if chosen.get("per_level"):
         number = {"poses": sum(chosen["per_level"]), "target": None, "minutes": None}
     return replace(cell.design, **(number | chosen))
-
-
-def _wish(record: Any, key: str, value: Any) -> Any:
-    """A value as a record of the cell takes it.  Raises InputError that names the option."""
-    try:
-        return getattr(record(**{key: value}), key)
-    except InputError as error:
-        named = rf"{record.__name__}: {key}|key design\.{key}(_\w+)?"
-        raise InputError(re.sub(named, lambda _: option(key), str(error))) from None
 
 
 def _plain(value: Any) -> Any:
@@ -388,7 +387,7 @@ def simulated(
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
     require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats, 1)
-    if isinstance(plan, str | Path):
+    if isinstance(plan, str | Path) or hasattr(plan, "to_csv"):
         poses = made.read_plan(plan)
     elif type(plan).__name__ == "Plan":
         poses = plan.table()
@@ -493,16 +492,11 @@ def identify(
         covariance is None or (np.ndim(covariance) == 2 and np.size(covariance) > 0),
         f"{option('covariance')} takes a square matrix in m²; found {quoted(covariance)}",
     )
+    matrix = None if covariance is None else np.asarray(covariance, dtype=float)
     options = Options(
-        method=method,
-        noise=noise,
-        weights=weights,
-        covariance=None if covariance is None else np.asarray(covariance, dtype=float),
-        intervals=intervals,
-        fixed=_names("fixed", fixed),
-        faulty=outliers,
-        seed=cast(int, seed),
-    )
+        method=method, noise=noise, weights=weights, covariance=matrix, intervals=intervals,
+        fixed=_names("fixed", fixed), faulty=outliers, seed=cast(int, seed),
+    )  # fmt: skip
     known = knowledge_of(knowledge, physical or bounded)
     tell = progress or _silent
     tell("reading")
@@ -771,7 +765,9 @@ def _gaussian(prior: Prior | None) -> GaussianPrior | None:
 
     if prior is None or isinstance(prior, GaussianPrior):
         return prior
-    require(isinstance(prior, Mapping), f"{option('prior')} takes mean and std by parameter")
+    told = 'takes mean and std by parameter, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}'
+    named = isinstance(prior, Mapping) and all(isinstance(v, Mapping) for v in prior.values())
+    require(named, f"{option('prior')} {told}; found {shown(prior)}")
     return GaussianPrior.from_dict(prior)
 
 

@@ -8,15 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.cells import (
-    COMPENSATOR,
-    COMPLIANCE,
-    DOWN,
-    SLANTED,
-    kr270_cell,
-    kr270_chain,
-    table_of,
-)
+from support.cells import COMPENSATOR, COMPLIANCE, DOWN, SLANTED, kr270_cell, kr270_chain, table_of
 
 import elastocal as ec
 from elastocal.cell.arm_description import Nominal
@@ -28,11 +20,7 @@ from elastocal.compensation.compensate import (
     read_targets,
     targets_at,
 )
-from elastocal.compensation.correction_table import (
-    EXACT,
-    CorrectionGrid,
-    correction_table,
-)
+from elastocal.compensation.correction_table import EXACT, CorrectionGrid, correction_table
 from elastocal.errors import InputError
 from elastocal.model.calibrated import (
     CalibratedArm,

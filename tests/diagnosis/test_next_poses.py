@@ -5,6 +5,7 @@ from math import inf
 from pathlib import Path
 
 import pytest
+from golden.door import curved
 from support.design_commands import elastocal
 
 from elastocal.demo.example import run_demo
@@ -13,6 +14,12 @@ from elastocal.planning.plan import Gain
 
 INPUTS = Path(__file__).parents[1] / "golden" / "inputs" / "campaign"
 FEW = ["--candidates", "60", "-q"]
+
+
+def next_of(cell: Path, data: Path) -> dict:
+    return json.loads(
+        elastocal("next", cell, data, "-o", cell.parent / "n.csv", "--json", *FEW).output
+    )
 
 
 def test_measuring_ends_where_enough_is_kept_or_nothing_is_won() -> None:
@@ -31,7 +38,33 @@ def test_enough_is_said_and_no_plan_is_written(tmp_path) -> None:
     told = " ".join(done.output.split())
     assert done.exit_code == 0 and not path.exists() and "not written" in told
     assert "no further pose is needed: the required error is kept with 95 %" in told
-    assert "(required: 1e+03 µm)" in told
+    assert "(required: 1.00 mm)" in told
+
+
+def test_what_no_pose_shows_is_held(tmp_path) -> None:
+    """Distances alone do not say how the arm stands about its first joint."""
+    (tmp_path / "arm.csv").write_bytes((INPUTS / "arm.csv").read_bytes())
+    text = "[robot]\ndh = 'arm.csv'\n[tracker]\ndistance_um = 40\nanchor_m = [1.5, 0.5, 0.2]\n"
+    text += "[tool.markers_m]\nM1 = [0.2, 0.1, 0.1]\nM2 = [-0.1, 0.2, 0.1]\n[model]\n"
+    text += "observe = 'distance'\neffects = ['distance_sensor', 'joint_offset']\n"
+    cell, data = tmp_path / "cell.toml", tmp_path / "data.csv"
+    cell.write_text(text)
+    assert elastocal("simulate", cell, INPUTS / "data.csv", "-o", data).exit_code == 0
+    answer = next_of(cell, data)
+    (told,) = answer["plan"]["warnings"]
+    assert "no poses tell joint1.offset from the rest" in told and "--fix" not in told
+    assert 0 < answer["gain"]["after"] < answer["gain"]["before"] < answer["reached"] < inf
+
+
+@pytest.mark.long
+def test_the_gain_counts_smooth_functions(tmp_path) -> None:
+    for name in ("placed.toml", "arm.urdf"):
+        (tmp_path / name).write_bytes((INPUTS / name).read_bytes())
+    curved(tmp_path)
+    cell, data, drawn = tmp_path / "curved.toml", tmp_path / "data.csv", ("--draw", 1)
+    assert elastocal("simulate", cell, tmp_path / "turns.csv", "-o", data, *drawn).exit_code == 0
+    answer = next_of(cell, data)
+    assert answer["gain"]["before"] > 0.4 * answer["reached"]
 
 
 def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:

@@ -13,13 +13,7 @@ from support.noisy_data import dense_noise, random_data, used_rows
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.diagnosis.baseline import Blocks, fit_baseline
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
-from elastocal.diagnosis.noise_floor import (
-    NoiseValues,
-    NoisyData,
-    fit_noise,
-    log_prior,
-    project,
-)
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise, log_prior, project
 from elastocal.measurements import visits
 from elastocal.model.manipulator import Model
 

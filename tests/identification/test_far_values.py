@@ -116,7 +116,7 @@ def test_what_diagnose_named_is_not_doubted_for_its_size(tmp_path):
     assert elastocal(*told).exit_code == 0
     fit = ec.identify(wider, folder / "train.csv", test=folder / "test.csv")
     assert fit["joint3.jump"].value == pytest.approx(1.5e-3, abs=3e-5)
-    assert fit.verdict.trusted
+    assert fit.verdict.trusted and "elastocal diagnose" not in steps(fit)
 
 
 def test_a_tool_is_judged_by_the_noise_and_given_with_its_interval():

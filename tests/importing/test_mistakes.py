@@ -137,10 +137,7 @@ columns = { "q#_ANG" = "A#" }
 )
 def test_units_mistaken_for_others(tmp_path, readings, length, angle, scale, turn, words):
     _, degrees, points = readings
-    files = {
-        "p.csv": delimited(points * scale, "Feature,X,Y,Z"),
-        "j.dat": krl(degrees * turn),
-    }
+    files = {"p.csv": delimited(points * scale, "Feature,X,Y,Z"), "j.dat": krl(degrees * turn)}
     found = imported(tmp_path, files, UNITS.replace("LEN", length).replace("ANG", angle))
     assert any(words in w for w in found.warnings), found.warnings
 

@@ -9,13 +9,7 @@ import pytest
 
 from elastocal.errors import InsufficientDataError
 from elastocal.planning.criteria import CRITERIA, CriterionInputs
-from elastocal.planning.relaxation import (
-    DesignProblem,
-    exact_plan,
-    exchange,
-    relax,
-    sized_plans,
-)
+from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, relax, sized_plans
 
 FIVE = ("test_pose", "D", "E", "G", "O5")
 

@@ -20,14 +20,8 @@ from elastocal.errors import InputError
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.information import (
-    Known,
-    PoseInformation,
-    measured,
-    next_number,
-    whitened,
-)
-from elastocal.planning.plan import predicted
+from elastocal.planning.information import Known, PoseInformation, measured, next_number, whitened
+from elastocal.planning.plan import predicted, reasons
 from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()
@@ -178,3 +172,16 @@ def test_a_campaign_shows_what_no_pose_to_come_would() -> None:
 )
 def test_new_poses_are_numbered_after_those_measured(labels: Any, number: int) -> None:
     assert next_number(labels) == number
+
+
+def test_a_pose_is_missed_by_what_it_alone_tells() -> None:
+    """Of two offsets that all readings before it show in sum, whatever rounding leaves of it."""
+    rng = np.random.default_rng(14)
+    before = rng.normal(size=(60, 5))
+    before[:, 3], before[:, 4] = np.sign(before[:, 3]), -np.sign(before[:, 3])
+    block = rng.normal(size=(3, 5)) * np.array([1, 1, 1, 0.01, 0.01])
+    M = before.T @ before + block.T @ block
+    (reason,) = reasons("abcde", block[None], M, np.ones(1))
+    grown = np.sqrt(np.diag(np.linalg.pinv(before.T @ before)) / np.diag(np.linalg.inv(M)))
+    assert reason.serves[:2] == (("d", np.inf), ("e", np.inf))
+    assert reason.serves[2] == ("b", pytest.approx(grown[1], rel=1e-3))

@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
-from support.design_cells import (
-    FULL,
-    any_cell,
-    as_table,
-    plan_cell,
-    scara,
-    setup_of,
-    value_of,
-)
+from support.design_cells import FULL, any_cell, as_table, plan_cell, scara, setup_of, value_of
 
 from elastocal.cell.arm_description import Nominal, PolarNoise
 from elastocal.cell.plan_wishes import TargetPose

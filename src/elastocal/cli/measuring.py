@@ -94,11 +94,7 @@ def init(
 
 
 @command(short_help="List the effects that can be fitted", flags="plugins json")
-def effects(
-    cell: Annotated[Path | None, typer.Argument()] = None,
-    *,
-    run: Run,
-) -> None:
+def effects(cell: Annotated[Path | None, typer.Argument()] = None, *, run: Run) -> None:
     """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
 
     Example: elastocal effects cell.toml
@@ -202,7 +198,7 @@ def design(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
     )  # fmt: skip
-    with run.progress() as progress:
+    with run.progress() as progress, verbs.options_named(asked):
 
         def chosen(path: Path) -> None:
             from elastocal.diagnosis.diagnose import write_extended_cell

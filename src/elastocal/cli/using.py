@@ -590,12 +590,7 @@ def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
 
 
 @command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
-def demo(
-    folder: Output = Path("demo_out"),
-    seed: Seed = 2013,
-    *,
-    run: Run,
-) -> None:
+def demo(folder: Output = Path("demo_out"), seed: Seed = 2013, *, run: Run) -> None:
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
     Example: elastocal demo -o demo_out

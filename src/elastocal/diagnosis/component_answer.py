@@ -14,12 +14,7 @@ from scipy import linalg
 from scipy.special import expit, softmax
 
 from elastocal.diagnosis.component_search import exchanged, imitators, size_of_fellows
-from elastocal.diagnosis.components import (
-    Component,
-    FittedSum,
-    drawn,
-    presence_cost,
-)
+from elastocal.diagnosis.components import Component, FittedSum, drawn, presence_cost
 from elastocal.diagnosis.diagnosis import (
     LARGE,
     ComponentShare,

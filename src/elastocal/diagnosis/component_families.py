@@ -14,23 +14,11 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, wrenches
 from elastocal.diagnosis.evidence import Grams, direct
-from elastocal.diagnosis.hypotheses import (
-    CHANGE_TIMES,
-    SCALES,
-    UNSIZED_SCALES,
-    EntryKey,
-    recorded,
-)
+from elastocal.diagnosis.hypotheses import CHANGE_TIMES, SCALES, UNSIZED_SCALES, EntryKey, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit, with_moves
-from elastocal.model.effects.base import (
-    Effect,
-    JointMotion,
-    Stage,
-    index,
-    turning_joints,
-)
+from elastocal.model.effects.base import Effect, JointMotion, Stage, index, turning_joints
 from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.effects.smooth import (

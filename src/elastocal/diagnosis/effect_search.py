@@ -14,12 +14,7 @@ from scipy.special import expit, log_ndtr, logsumexp, ndtr
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
-from elastocal.diagnosis.evidence import (
-    ANOTHER,
-    Grams,
-    Item,
-    Scan,
-)
+from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import (
     SHARED,

@@ -25,7 +25,7 @@ from elastocal.diagnosis.extra_poses import load_forces
 from elastocal.errors import InsufficientDataError, option
 from elastocal.errors import require as check
 from elastocal.identification.identify import identify
-from elastocal.identification.prediction import PredictedError, over_the_workspace, predicted_error
+from elastocal.identification.prediction import over_the_workspace, predicted_error
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
@@ -138,9 +138,8 @@ def next_poses(
         ('measure', 5)
     """
     check(batch >= 1, f"{option('batch')} takes a number of poses, found {batch}")
-    check(
-        require is None or require > 0, f"{option('require')} takes an error in m, found {require}"
-    )
+    told = f"{option('require')} takes an error in m, found {require}"
+    check(require is None or require > 0, told)
     check(0 <= least_gain < 1, f"{option('least_gain')} takes a share from 0 to below 1")
     tell: Progress = progress or (lambda message: None)
     model = model if isinstance(model, Model) else Model(model)
@@ -162,55 +161,50 @@ def next_poses(
         why = diagnose(model, table, DiagnosisOptions(seed), tell)
         model = with_effects_of(model, why)
     tell("identifying")
-    error, fit = None, None
+    fit, sure, lacking = None, math.inf, 0.0
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table)
-        error = _error_now(fit, 1.0 if why is None else why.probability_unknown)
+        sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
     cell = replace(model.cell, design=spec)
     cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
     options = DesignOptions("batch", seed, jobs, done=table, notes=notes)
     plan = design(cell, options, progress=tell)
     assert plan.gain is not None  # the criterion has test poses
-    reached = math.inf if error is None else max(plan.gain.sure, error.sure)
-    lacking = 0.0 if error is None else error.lacking or 0.0
+    own = plan.gain.sure
+    reached = max(own, sure) if sure else math.hypot(own, lacking)
     plan = replace(plan, gain=(gain := plan.gain.lacking(lacking, reached)))
     verdict = verdict_of(gain, reached, required, least_gain)
     return NextPoses(
-        verdict=verdict,
-        plan=plan if verdict == "measure" else None,
-        batch=len(plan),
-        gain=gain,
-        required=required,
-        reached=reached,
-        found=() if why is None else why.effects,
-        doubts=() if why is None else _in_doubt(why),
-        least_gain=least_gain,
-        source=table.source,
-        diagnosis=why,
-        calibration=fit,
-    )
+        verdict=verdict, plan=plan if verdict == "measure" else None, batch=len(plan), gain=gain,
+        required=required, reached=reached, found=() if why is None else why.effects,
+        doubts=() if why is None else _in_doubt(why), least_gain=least_gain, source=table.source,
+        diagnosis=why, calibration=fit,
+    )  # fmt: skip
 
 
-def _error_now(fit: Calibration, unknown: float) -> PredictedError | None:
-    """The error at new poses.
+def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
+    """The error at new poses that is kept with 95 %, and what the model lacks of it, in m; 0 and
+    that of distances, of which no position follows: the plan's own figures say it.
 
     That configurations scatter beyond their noise is lack of fit with the probability that
     something `unknown` is at work; else it is their noise.
     """
     model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
+    if observed.kind == "distance":
+        return 0.0, math.sqrt(3 * excess.squared.mean()) if excess else 0.0
     cell, table = model.cell, observed.table
     stated = cell.design.states_test_poses
     poses = test_poses(cell, model.chain) if stated else over_the_workspace(cell, model, table)
-    return predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
+    error = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
+    return (math.inf, 0.0) if error is None else (error.sure, error.lacking or 0.0)
 
 
 def _in_doubt(why: Diagnosis) -> tuple[tuple[str, str, float], ...]:
     """What may be missing beside or instead of what was found: effect, place and probability."""
     found = {(f.effect, f.where) for f in why.effects}
-    every = ((c.effect, c.where, c.probability) for c in why.candidates)
-    left = [c for c in every if c[:2] not in found and c[2] > DOUBT]
-    return tuple(sorted(left, key=lambda c: -c[2]))
+    every = ((c.effect, c.where, c.probability) for c in why.candidates if c.probability > DOUBT)
+    return tuple(sorted((c for c in every if c[:2] not in found), key=lambda c: -c[2]))
 
 
 def verdict_of(

@@ -399,7 +399,7 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
 def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     ratio = result.noise.ratio_to_stated
     if ratio is None:
-        yield _note("noise_not_compared", "" if _lacks_fit(result) else STATE_NOISE)
+        yield _note("noise_not_compared", "" if _lacks_fit(result) else _state_noise(result))
         return
     tails, size, kurtosis = result.model.cell.noise.tails, result.observations.size, 0.0
     if tails is not None:
@@ -430,11 +430,20 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     yield say(kind, doing, ratio=float(ratio), **chance, dof=result.dof)
 
 
-def _lacking(result: Calibration) -> str:
+def _named(result: Calibration) -> list[str]:
+    """Effects of the cell such as diagnose finds, which asked again would find no more."""
     effects = dict.fromkeys(p.effect for p in result.model.parameters)
-    named = [e.replace("_", " ") for e in effects
-             if e not in STATED_BY_FILE and not effect_of(e).registered]  # fmt: skip
-    if named:
+    usual = [e for e in effects if e in STATED_BY_FILE or effect_of(e).registered]
+    return [e.replace("_", " ") for e in effects if e not in usual]
+
+
+def _state_noise(result: Calibration) -> str:
+    ask = " elastocal diagnose looks for that either way."
+    return STATE_NOISE if _named(result) else STATE_NOISE + ask
+
+
+def _lacking(result: Calibration) -> str:
+    if named := _named(result):
         return (
             f"The cell has {listed(named, 3)} already. If diagnose named that, it has no name for "
             "what is left: repeat some poses, which tell noise and repeatability from what the "
@@ -481,6 +490,8 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     finds, whether the noise model has it or not.  `fits`: the residual agrees with the stated
     noise."""
     noise, stated = result.noise, result.model.cell.noise
+    ask = "Ask what the model lacks (elastocal diagnose)"
+    ask = "Repeat some poses" if _named(result) else ask
     sizes = [s for s in noise.sizes or () if s.sigma]
     scatter = stated.of_joints(result.model.chain.n_joints)
     joints = [s for s in sizes if s.joints]
@@ -519,8 +530,8 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
                 "Fit with the scatter that [noise] of the cell states: "
                 f"{option('noise', Kind.parsed(noise.kind).with_stated(stated).name)}."
                 if known
-                else "Ask what the model lacks (elastocal diagnose): residuals change from visit "
-                "to visit or in time, and noise that does so does not predict poses better."
+                else f"{ask}: residuals change from visit to visit or in time, and noise that "
+                "does so does not predict poses better."
             )
             yield _care("scatter_not_counted", remedy, part=test.part, p=test.p)
 
@@ -569,7 +580,7 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
             equations_left=left, needed=wanted,
         )  # fmt: skip
     if result.excess is None:
-        yield _care("noise_unknown")
+        yield _care("noise_unknown", _state_noise(result))
     found = result.predicted
     if found is None:
         return

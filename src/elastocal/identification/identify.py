@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from elastocal.errors import ElastocalError
+from elastocal.errors import ElastocalError, option
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged
 from elastocal.identification.knowledge import Constraints
@@ -129,7 +129,20 @@ def identify(
 def _doubts(
     model: Model, table: Measurements, test: Measurements | None, x: Array
 ) -> Iterator[str]:
-    """Moves out of order, where any effect follows the last one, and an arm that lies."""
+    """Moves out of order, where any effect follows the last one, an arm that lies, and a test of
+    what was fitted."""
+    if test is not None:
+        read = [np.asarray(t.distance if t.position is None else t.position) for t in (table, test)]
+        fitted, kept = (
+            list(map(bytes, np.column_stack([t.q, t.force, values])))
+            for t, values in zip((table, test), read, strict=True)
+        )
+        there = set(fitted)
+        if twice := sum(row in there for row in kept):
+            yield (
+                f"{twice} of {len(test)} readings of {test.source} ({option('test')}) are fitted "
+                "too, so that their error tests nothing; give readings of other poses"
+            )
     moves = any(effect_of(p.effect).family == "move" for p in model.parameters)
     if moves or model.cell.model.approach == BY_ORDER:
         for text in (order_contradicted(one) for one in (table, test) if one is not None):

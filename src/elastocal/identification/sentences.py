@@ -14,8 +14,7 @@ from elastocal.text import counted, gathered, listed
 
 STATE_NOISE = (
     "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
-    "it does the residual say whether the model lacks something. elastocal diagnose looks for "
-    "that either way."
+    "it does the residual say whether the model lacks something."
 )
 AT_BOUND = (
     "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
@@ -49,7 +48,6 @@ REMEDIES: dict[str, str | Callable[[], str]] = {
     "new_poses_not_shown": lambda: (
         f"{more_poses()} For a part of the joint ranges alone, state test poses in the cell."
     ),
-    "noise_unknown": STATE_NOISE,
     "not_converged": "Give start hints in [model.nominal], fit fewer effects, or measure more "
     "poses.",
     "residual_below_stated_noise": "State the tracker's true noise: with noise stated too large, a "
@@ -109,8 +107,7 @@ SENTENCES = {
     ),
     "residual_above_stated_noise": (
         "The residual is {ratio:.1f} times the stated noise: an effect is missing or the stated "
-        "noise is too small. Intervals use the residual, not the stated noise. Look for missing "
-        "effects (diagnose)."
+        "noise is too small. Intervals use the residual, not the stated noise. {look}."
     ),
     "lack_of_fit": (
         "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
@@ -177,6 +174,8 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
         default = "the default method, whose noise model has this scatter, or "
         words["count"] = "" if result.noise.estimated else default
+        ask = f.remedy.startswith("Ask")
+        words["look"] = "Look for missing effects (diagnose)" if ask else "Repeat some poses"
         words["remedy"] = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
         if f.kind == "copied_readings":
             words["lines"] = _runs(result.copies)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from elastocal.above import checked_arguments
 from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
@@ -41,6 +42,7 @@ MOST_SITES = 8  # listed as markers; of more most are something else
 THICKNESS = 15.0  # reach over a link's radius
 
 
+@checked_arguments
 def init(
     robot: str | Path | Robot,
     output: str | Path | None = None,

@@ -162,21 +162,14 @@ class Model(ByValue):
             >>> len(data), data.q.shape, data.marker_names
             (540, (540, 6), ('M1', 'M2', 'M3'))
         """
-        markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
-        source, text = path, None
-        if not isinstance(path, str | Path):
-            source, text = "DataFrame", path.to_csv(index=False)
-        return read_measurements(
-            source, joint_kinds=self.chain.kinds, marker_names=markers, observe=self.observe,
-            text=text,
-        )  # fmt: skip
+        return self._read(path, self.observe)
 
     @checked_arguments
-    def read_plan(self, path: str | Path) -> Measurements:
+    def read_plan(self, path: str | Path | DataFrame) -> Measurements:
         """The poses of a plan, a row each; forces (N) where it states them.
 
         Args:
-            path: The plan (CSV): configuration, q1_deg …
+            path: The plan (CSV, or a data frame): configuration, q1_deg …
 
         Raises:
             InputError: As `read` does.
@@ -185,9 +178,15 @@ class Model(ByValue):
             >>> len(ec.Model("cell.toml").read_plan("plan.csv"))
             15
         """
+        return self._read(path, "plan")
+
+    def _read(self, path: str | Path | DataFrame, observe: str) -> Measurements:
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
+        source, text = path, None
+        if not isinstance(path, str | Path):
+            source, text = "DataFrame", path.to_csv(index=False)
         return read_measurements(
-            path, joint_kinds=self.chain.kinds, marker_names=markers, observe="plan"
+            source, joint_kinds=self.chain.kinds, marker_names=markers, observe=observe, text=text
         )
 
     @checked_arguments

@@ -13,7 +13,7 @@ import numpy as np
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, check_known, option, require
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.planning.feasibility import Feasibility, Struck
@@ -342,7 +342,7 @@ def read_pins(
         if text is None:
             continue
         path, named = plan_and_names(text)
-        table = model.read_plan(path)
+        table = poses_of(model, path)
         own = {name: table.q[row] for name, row in _poses(table).items()}
         for name in named:
             check_known(name, own, f"{table.source}: there is no pose {quoted(name)}")
@@ -359,6 +359,11 @@ def read_pins(
     n, q = model.chain.n_joints, list(kept.values())
     at, away = (np.array(lot).reshape(-1, n) for lot in (q, struck))
     return cell, Pins(tuple(kept), at, away, tuple(taken))
+
+
+def poses_of(model: Model, path: Path) -> Measurements:
+    """The poses of a table, whichever markers its rows are of."""
+    return read_measurements(path, joint_kinds=model.chain.kinds, observe="plan")
 
 
 def plan_and_names(text: str | Path) -> tuple[Path, tuple[str, ...]]:

@@ -146,11 +146,10 @@ class Choice:
             places=dict(zip(boxes.names, places, strict=True)),
             loads=None if freedom.loads is None else found.cell.design.loads,
             before=None if before is None else criterion.figure(before.relaxed.value),
-            after=criterion.figure(after.relaxed.value),
-            unit=criterion.unit,
-            candidates=len(after.pool),
+            after=criterion.figure(after.relaxed.value), unit=criterion.unit,
             share=(None if before is None else before.share, after.share),
-        )
+            candidates=len(after.pool),
+        )  # fmt: skip
 
     def _loads(self, most: int | None) -> RelaxedPoint | None:
         cell, given = self.work.cell, self.work.cell.design.loads

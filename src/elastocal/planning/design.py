@@ -29,6 +29,7 @@ from elastocal.planning.candidates import (
     check_available,
     draw,
     joint_space,
+    poses_of,
     shares_of,
 )
 from elastocal.planning.choices import Choice, applied, chosen_states, within
@@ -93,13 +94,15 @@ class DesignOptions:
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
-        check_known(self.effort, efforts, f"effort '{self.effort}' is unknown")
+        told = f"{option('effort')} {quoted(self.effort)} is unknown"
+        check_known(self.effort, efforts, told)
         require(
             self.jobs == -1 or self.jobs >= 1,
-            f"jobs takes a number of processes, or -1 for all cores; found {self.jobs}",
+            f"{option('jobs')} takes a number of processes, or -1 for all cores; found {self.jobs}",
         )
         require(
-            all(n >= 1 for n in self.curve), f"a curve takes numbers of poses, found {self.curve}"
+            all(n >= 1 for n in self.curve),
+            f"{option('curve')} takes numbers of poses, found {self.curve}",
         )
 
 
@@ -181,18 +184,20 @@ class _Design:
 
     def _leave_out(self) -> None:
         """Smooth functions, and effects of what a pose has only once it stands in an order."""
+        cell, self.fixed = self.model.cell, self.options.fixed
+        done = self.options.done is not None
+        effects = dict.fromkeys(c.name for c in cell.model.effects)
+        needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
         functions = tuple(dict.fromkeys(p.effect for p in self.model.parameters if p.shrunk))
+        lasting = tuple(c for c in cell.model.effects if not needs[c.name])
+        self.whole = self.model.with_effects(lasting) if done and functions else None
         self._drop(
             functions,
             f"the plan holds the smooth functions ({listed(functions)}) at zero: it is made for "
             "the other parameters; to show functions too, measure many poses all over the joints' "
             "ranges",
         )
-        cell = self.model.cell
-        effects = dict.fromkeys(c.name for c in cell.model.effects)
-        needs = {name: OPEN & set(effect_of(name).needed(cell)) for name in effects}
-        open_ = tuple(name for name in effects if needs[name])
-        done = self.options.done is not None
+        open_ = tuple(name for name in effects if needs[name] and name not in functions)
         unknown = tuple(name for name in open_ if done or "temperature" in needs[name])
         self._drop(
             unknown,
@@ -224,6 +229,12 @@ class _Design:
 
     def run(self) -> Plan:
         plan = self._chosen()
+        if (gain := self._gain(plan)) is not None:
+            told = (
+                "with the smooth functions, which stay uncertain, the error at the test poses is "
+            )
+            told += f"{gain.after * 1e6:.3g} µm rms"
+            plan = replace(plan, gain=gain, warnings=(*plan.warnings, told))
         if self.conditions is None:
             return plan
         whole, fixed = self.conditions
@@ -247,7 +258,7 @@ class _Design:
         progress("information of the candidates")
         setup = set_up(
             self.model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen, self.work,
+            region, self.feasibility.seen, self.work, options.effort == "batch",
         )  # fmt: skip
         self.warnings += setup.warnings
         if pins is not None and len(pins.q):
@@ -277,6 +288,20 @@ class _Design:
         progress("random plans beside it")
         drawn = setup.problem(pool, found.shares).random_information(options.seed)
         return self._plan(setup, found, counts, targets.source, curve, drawn)
+
+    def _gain(self, plan: Plan) -> Gain | None:
+        """The plan's gain where smooth functions count, which the readings show in part."""
+        options, done, whole = self.options, self.options.done, self.whole
+        if plan.gain is None or done is None or whole is None:
+            return None
+        self.progress("gain with the smooth functions")
+        fixed = tuple(name for name in self.fixed if whole.meant_by(name))
+        known = Known(fixed, options.prior, measured(whole, done, fixed))
+        targets, sight = self.targets()[0], self.feasibility.seen
+        setup = set_up(whole, plan.q, len(plan), targets, known, sight=sight, hold=True)
+        assert setup.target_rows is not None  # a plan with a gain has test poses
+        M = setup.gathered(setup.information.blocks(plan.q, plan.readings))
+        return Gain.of(setup.target_rows, setup.prior, M, options.seed)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -322,7 +347,7 @@ class _Design:
         lots, names, told, options = list[Candidates](), list[str](), "", self.options
         if spec.taught is not None:
             self.progress(f"checking the poses of {spec.taught}")
-            table = self.model.read_plan(spec.taught)
+            table = poses_of(self.model, spec.taught)
             own, names, told = brought(*asked, table, options.pins)
             lots.append(own)
         if spec.taught is None or spec.candidates is not None:
@@ -426,40 +451,26 @@ class _Design:
         if done is not None and R is not None:
             gain = Gain.of(R, setup.prior, M, self.options.seed)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
+        labels = self.options.done.configuration_labels if self.options.done else ()
         return Plan(
-            model=self.model,
-            criterion=spec.criterion,
-            value=found.value,
-            reported=figure(found.value),
-            unit=setup.criterion.unit,
-            q=q,
-            forces=self.forces,
-            group=pool.group[chosen],
-            levels=self.space.levels,
+            model=self.model, criterion=spec.criterion, value=found.value,
+            reported=figure(found.value), unit=setup.criterion.unit, q=q, forces=self.forces,
+            group=pool.group[chosen], levels=self.space.levels,
             level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
-            execution=execution,
-            candidates=counts,
-            certificate=found.certificate,
+            execution=execution, candidates=counts, certificate=found.certificate,
             predicted=predicted(setup.found, left, numbers),
             reasons=reasons(
                 setup.information.names, blocks, M,
                 setup.criterion.of_information(without) / found.value,
             ),
-            targets=f"test poses: {targets}",
-            seed=self.options.seed,
+            targets=f"test poses: {targets}", seed=self.options.seed, curve=curve,
             polished=int(((chosen >= found.first) & (chosen < len(found.pool))).sum()),
-            curve=curve,
             bound_reported=None if bound is None else figure(bound),
-            warnings=tuple(self.warnings),
-            made_for="" if done is None else done.note,
-            first=next_number(self.options.done.configuration_labels if self.options.done else ()),
-            names=self._names(pool, chosen, len(found.pool)),
+            warnings=tuple(self.warnings), made_for="" if done is None else done.note,
+            first=next_number(labels), names=self._names(pool, chosen, len(found.pool)),
             chance=Chance.of(drawn, found.value, setup.criterion),
-            everywhere=setup.everywhere(M, drawn, left),
-            seen=None if seen.all() else seen,
-            readings=readings,
-            states=self.states,
-            gain=gain,
+            everywhere=setup.everywhere(M, drawn, left), seen=None if seen.all() else seen,
+            readings=readings, states=self.states, gain=gain,
         )  # fmt: skip
 
     def _names(self, pool: FeasiblePool, chosen: IntArray, own: int) -> tuple[str, ...]:

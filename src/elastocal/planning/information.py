@@ -331,11 +331,10 @@ class Estimable:
         if not wanted:
             return None
         a = np.array([wanted.get(name, 0.0) for name in model.names])
-        lost = self.unpredictable(a[None, None])
-        if lost is not None:
+        if lost := self.unpredictable(a[None, None]):
             raise InsufficientDataError(
                 f"{model.cell.source}: [design] combination depends on "
-                f"{model.names[lost[1]]}; {self.why(lost[1])}"
+                f"{model.names[lost[0]]}; {self.why(lost[0])}"
             )
         return np.asarray((a * self.sizes)[self.columns])
 
@@ -362,31 +361,33 @@ class Estimable:
             )
         return f"{name} is held; drop it from {option('fixed')}"
 
-    def on_kept(self, A: Array) -> Array:
+    def on_kept(self, A: Array, hold: bool = False) -> Array:
         """A (T, r, kept) on the kept parameters, scaled by their sizes.  A test point is
         predictable where its motion by the dropped parameters is that by the kept ones they
         combine with, A_D = A_K · mixing; where it is not, no number of poses would make that
-        position certain."""
-        cell, lost = self.model.cell, self.unpredictable(A)
-        if lost is not None:
+        position certain, unless one is to `hold` those parameters."""
+        cell, lost = self.model.cell, () if hold else self.unpredictable(A)
+        if lost:
+            off = np.abs(self._unexplained(A, self.structure)).max(axis=1)
+            t = int(off[:, list(self.structure.dropped).index(lost[0])].argmax())
             raise InsufficientDataError(
-                f"{cell.source}: the position at test pose {lost[0] + 1} depends on "
-                f"{self.model.names[lost[1]]}; {self.why(lost[1])}; or ask for parameters instead "
+                f"{cell.source}: the position at test pose {t + 1} depends on "
+                f"{self.model.names[lost[0]]}; {self.why(lost[0])}; or ask for parameters instead "
                 'of test poses: design with criterion = "D"'
             )
         return np.asarray(A[..., self.columns] * self.sizes[self.columns])
 
-    def unpredictable(self, A: Array) -> tuple[int, int] | None:
-        """A row of A (T, r, parameters) and a parameter by which no plan can predict it, if any."""
-        off = np.abs(self._unexplained(A, self.structure)).max(axis=1)
-        if off.max(initial=0.0) <= OUTSIDE * float(np.abs(A * self.sizes).max()):
-            return None
-        dropped = int(off.max(axis=0).argmax())
-        return int(off[:, dropped].argmax()), int(self.structure.dropped[dropped])
+    def unpredictable(self, A: Array) -> tuple[int, ...]:
+        """The parameters by which no plan can predict rows of A (T, r, parameters), the worst
+        first."""
+        off = np.abs(self._unexplained(A, self.structure)).max(axis=(0, 1), initial=0.0)
+        order = np.argsort(-off, kind="stable")
+        least = OUTSIDE * float(np.abs(A * self.sizes).max(initial=0.0))
+        return tuple(int(self.structure.dropped[d]) for d in order if off[d] > least)
 
     def remaining_bias(self, A: Array, weight: Array) -> float:
-        """Rms in m of what typical deviations of held parameters, which the poses show below their
-        noise, move the test points by, A (T, r, parameters) with `weight` (T,)."""
+        """Rms in m of what typical deviations of held parameters move the test points by, A (T, r,
+        parameters) with `weight` (T,)."""
         off = self._unexplained(A, self.reduction)
         return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
 
@@ -404,6 +405,7 @@ def estimable(
     asked = model.cell.design.prior == "typical"
     stated = np.array([asked and p.typical is not None for p in model.parameters], dtype=bool)
     prior = np.diag(stated.astype(float))
+    stated |= model.shrunk
     if known.prior is not None:
         P = known.prior.rows(model.names)[0] * sizes
         prior += P.T @ P
@@ -442,6 +444,7 @@ def evenly(group: IntArray, each: int) -> IntArray:
 
 IDENTIFIED = "the arm as identified from the measurements done"
 COMPUTED = 1e-9  # m: readings that scatter by less were not read
+LEAST = 1e-3  # share of its size as stated by which a function that was left out still counts
 
 
 def lacks_noise(cell: Cell) -> bool:
@@ -476,16 +479,20 @@ def with_noise_of(cell: Cell, done: Calibration) -> tuple[Cell, tuple[str, ...]]
 
 def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies, or at the
-    nominal arm where it does not suffice; the noise is the stated one, as for the poses to come."""
+    nominal arm where it does not suffice; the noise is the stated one, as for the poses to come.
+    Of smooth functions that of their prior, of the size found, is in it."""
     if table.sigma is None:
         table = marker_sigmas(model.cell, table)
+    sizes = np.array([p.typical if p.shrunk and p.typical else np.inf for p in model.parameters])
     try:
-        x = identify(model, table, Options(method="wls", fixed=fixed)).x
-        note = IDENTIFIED
+        found = identify(model, table, Options(method="wls", fixed=fixed))
+        x, note = found.x, IDENTIFIED
+        for part in found.smooth:
+            sizes[part.group.columns] *= max(np.sqrt(part.scale), LEAST)
     except InsufficientDataError as error:
         x, note = model.nominal, f"the nominal arm, as the measurements do not suffice ({error})"
     B, _ = whitened(model, table, x)
-    return Done(x, B.T @ B, len(B), note)
+    return Done(x, B.T @ B + np.diag(sizes**-2.0), len(B), note)
 
 
 def whitened(model: Model, table: Measurements, x: Array) -> tuple[Array, Array]:

@@ -32,6 +32,7 @@ from elastocal.units import Array, BoolArray, IntArray, to_si
 
 TOLD = 3  # parameters named per pose
 COMBINED = 0.01  # share of a typical deviation that counts as being part of a combination
+ALONE, ROUNDING = 1e-9, 1e-6  # share of a direction that no other pose shows; of a variance
 
 
 @dataclass(frozen=True)
@@ -79,15 +80,15 @@ def reasons(names: Sequence[str], blocks: Array, M: Array, losses: Array) -> tup
     `names`, and what the criterion loses without it, as a factor `losses` (N,)."""
     V, told = inverse(M), []
     for B, loss in zip(blocks, losses, strict=True):
-        # V₋ = V + V Bᵀ (1 − B V Bᵀ)⁻¹ B V; a pose that carries a direction alone leaves 1 − BVBᵀ
-        # singular.
+        # V₋ = V + V Bᵀ (1 − B V Bᵀ)⁻¹ B V.  A direction that a pose carries alone leaves 1 − BVBᵀ
+        # singular: a parameter is lost where that has a share of its variance.
         share, turn = linalg.eigh(B @ V @ B.T)
-        moved = turn.T @ B @ V
-        with np.errstate(divide="ignore", invalid="ignore"):
-            rest = np.where(1 - share > 1e-9, 1 - share, 0.0)
-            more = (np.where(np.abs(moved) > 1e-12, moved**2, 0.0) / rest[:, None]).sum(axis=0)
-            growth = np.sqrt(1 + np.nan_to_num(more, nan=0.0, posinf=np.inf) / np.diag(V))
-        first = np.argsort(-growth, kind="stable")[:TOLD]
+        part = (turn.T @ B @ V) ** 2 / np.diag(V)
+        alone = 1 - share < ALONE
+        growth = np.sqrt(1 + (part[~alone] / (1 - share[~alone, None])).sum(axis=0))
+        lost = part[alone].sum(axis=0)
+        growth[lost > ROUNDING] = np.inf
+        first = np.lexsort((-lost, -growth))[:TOLD]
         serves = tuple((names[k], float(growth[k])) for k in first if growth[k] > 1.005)
         told.append(Reason(float(loss), serves))
     return tuple(told)

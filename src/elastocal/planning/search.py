@@ -595,12 +595,8 @@ class _Ordering:
         M = setup.gathered(blocks)
         alias = Alias.of(setup.information, q, blocks, M, setup.target_rows, readings)
         execution = schedule(
-            q, at_stops(rules.cell), rules,
-            loads=setup.information.forces,
-            read=readings > 0,
-            limits=joint_limits(rules.cell, rules.chain),
-            via=self.hub,
-            alias=alias,
+            q, at_stops(rules.cell), rules, loads=setup.information.forces, read=readings > 0,
+            limits=joint_limits(rules.cell, rules.chain), via=self.hub, alias=alias,
             paired=rules.cell.model.observe == "deflection",
             seed=search.seed, progress=search.progress,
         )  # fmt: skip

@@ -136,11 +136,13 @@ class Setup:
 def set_up(
     model: Model, q: Array, n_poses: int, targets: TargetPoses, known: Known,
     region: TargetPoses | None = None, sight: Sight | None = None, work: Model | None = None,
+    hold: bool = False,
 ) -> Setup:  # fmt: skip
     """The parameters that the candidates q (N, n) show, and the criterion on them.
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
     `[design] elsewhere`.  `work`: the model at the test poses, where its tool is another one.
+    `hold`: parameters by which no plan can predict the test poses are held, not refused.
     """
     spec = model.cell.design
     x = model.nominal if known.done is None else known.done.x
@@ -165,14 +167,16 @@ def set_up(
             combination=found.combination, unit=units.pop() if len(units) == 1 else "",
             n_poses=n_poses, names=information.names, sizes=information.sizes,
         ),
-        None, prior, found.unseen, information.everything,
+        None, prior, () if hold else found.unseen, information.everything,
     )  # fmt: skip
     if "test_poses" not in criterion_named(spec.criterion).needs:
         return setup
-    return _aimed(setup, model if work is None else work, targets, region)
+    return _aimed(setup, model if work is None else work, targets, region, hold)
 
 
-def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPoses | None) -> Setup:
+def _aimed(
+    setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPoses | None, hold: bool
+) -> Setup:
     information, found = setup.information, setup.found
     model, T = information.model, len(targets.q)
     share = model.cell.design.elsewhere or 0.0
@@ -182,19 +186,22 @@ def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPos
         weight = np.concatenate([(1 - share) * weight, share * region.weight])
     x = information.x + (at_work.nominal - model.nominal)
     rows, told = known_rows(at_work, both, x, found)
-    held = [model.names[c] for c in found.structure.kept if c not in found.columns]
-    if held and (bias := found.remaining_bias(rows, weight)) >= WORTH_TELLING:
+    weak = [model.names[c] for c in found.structure.kept if c not in found.columns]
+    lost = [model.names[c] for c in found.unpredictable(rows)] if hold else []
+    why = [f"so many poses show less of {listed(weak)} than their noise"] * bool(weak)
+    why += [f"no poses tell {listed(lost)} from the rest, or show them"] * bool(lost)
+    if why and (bias := found.remaining_bias(rows, weight)) >= WORTH_TELLING:
         told += (
-            f"so many poses show less of {listed(held)} than their noise; identification holds "
-            f"what it cannot see, and typical deviations of that move the test points by "
-            f"{bias * 1e6:.3g} µm rms, which the criterion does not count",
+            f"{'; '.join(why)}; identification holds what it cannot see, and typical deviations "
+            f"of that move the test points by {bias * 1e6:.3g} µm rms, which the criterion does "
+            "not count",
         )
-    inputs = replace(setup.inputs, A=found.on_kept(rows[:T]), weights=targets.weight)
+    inputs = replace(setup.inputs, A=found.on_kept(rows[:T], hold), weights=targets.weight)
     beyond = None
     if region is not None:
         # None where no plan could make the position at all of them certain.
         with suppress(InsufficientDataError):
-            beyond = found.on_kept(rows[T:]), region.weight
+            beyond = found.on_kept(rows[T:], hold), region.weight
     if share and beyond is None:
         raise InsufficientDataError(
             f"{model.cell.source}: [design] elsewhere asks for poses all over the joint ranges, "

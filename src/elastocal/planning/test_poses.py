@@ -478,7 +478,7 @@ def known_rows(
             )
     rows = prediction_rows(at_work, targets, x)
     stated = rows[targets.stated]
-    if not len(stated) or not fitted_markers(found.model) or found.unpredictable(stated) is None:
+    if not len(stated) or not fitted_markers(found.model) or not found.unpredictable(stated):
         return rows, ()
     fixed = (
         "point_m of the test poses is taken to be fixed to the markers as they stand in the cell: "

@@ -505,11 +505,7 @@ def _p(p: float) -> str:
 
 
 FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
-PLACE = {
-    "block": "Block of lines {}",
-    "marker": "Marker {}",
-    "configuration": "Configuration {}",
-}
+PLACE = {"block": "Block of lines {}", "marker": "Marker {}", "configuration": "Configuration {}"}
 
 
 def fault_lines(result: Calibration, most: int | None = None) -> list[str]:

@@ -77,20 +77,26 @@ def next_blocks(found: NextPoses) -> Iterator[say.Block]:
         yield from plan_blocks(found.plan)
 
 
+def microns(metres: float) -> str:
+    """A position error in µm, as plans have it, and where that is beyond all reading in mm or m."""
+    return f"{metres * 1e6:.3g} µm" if metres < 0.9995e-3 else say.length(metres)
+
+
 def _key(plan: Plan) -> say.KeyFigures:
     n, minutes = say.counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = "criterion", f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     if plan.of_test_poses:
-        worth = "error at the test poses", f"{_rho(plan):.3g} µm"
+        worth = "error at the test poses", microns(_rho(plan) * 1e-6)
     figures = [("poses", str(len(plan.q))), worth]
     if (e := plan.everywhere) is not None:
-        figures.append(("error over the joint ranges", f"{e.elsewhere * 1e6:.3g} µm"))
+        figures.append(("error over the joint ranges", microns(e.elsewhere)))
     figures.append(("time", minutes))
     figures += [("load states", str(len(plan.forces)))][: 4 - len(figures)]
     return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
 
 
 TOLD = 2  # parameters that a pose serves, in the table
+MANIFOLD = 3.0  # from which a growth reads better as a factor
 SERVES = "most affected if dropped (standard deviation)"
 
 
@@ -112,10 +118,13 @@ def pose_table(plan: Plan, decimals: int = 2) -> say.ShownTable:
 
 def served(reason: Reason) -> str:
     """The parameters that a pose serves most: "joint3.compliance +38 %"."""
-    parts = [
-        f"{printable(name)} {'lost' if math.isinf(growth) else f'+{100 * (growth - 1):.0f} %'}"
-        for name, growth in reason.serves[:TOLD]
-    ]
+
+    def grown(factor: float) -> str:
+        if math.isinf(factor):
+            return "undetermined"
+        return f"×{factor:.3g}" if factor >= MANIFOLD else f"+{100 * (factor - 1):.0f} %"
+
+    parts = [f"{printable(name)} {grown(factor)}" for name, factor in reason.serves[:TOLD]]
     return ", ".join(parts) or "all slightly"
 
 
@@ -143,7 +152,8 @@ def stop_table(plan: Plan) -> say.ShownTable:
 def plan_headline(plan: Plan) -> str:
     text = f"{say.counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
-        text += f"position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
+        error = microns(_rho(plan) * 1e-6)
+        text += f"position error ρ₀ = {error} rms at the test poses after compensation"
     else:
         text += f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     better = plan.certificate.better_pool
@@ -359,7 +369,7 @@ def _execution_lines(plan: Plan) -> Told:
     e, space = plan.execution, plan.model.cell.workspace
     again = sum(stop.again > 0 for stop in e.stops)
     visits = f", {again} of them at reference poses" if again else ""
-    text = f"{len(e.stops)} stops{visits}, {e.travel:.0f} s of travel"
+    text = f"{say.counted(len(e.stops), 'stop')}{visits}, {e.travel:.0f} s of travel"
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
         are = f"{say.counted(parts, 'pose')} {'is' if parts == 1 else 'are'}"
@@ -395,7 +405,7 @@ def _execution_lines(plan: Plan) -> Told:
 
 def next_lines(found: NextPoses) -> Told:
     g, n = found.gain, say.counted(found.batch, "pose")
-    limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
+    limit = "" if found.required is None else f" (required: {microns(found.required)})"
     verdicts = {
         "measure": f"measure {n} more; then run it again with all readings in one table",
         "enough": "no further pose is needed: the required error is kept with 95 %",
@@ -405,11 +415,11 @@ def next_lines(found: NextPoses) -> Told:
     }
     now = "not known yet, as some parameters are undetermined"
     if math.isfinite(found.reached):
-        now = f"≤ {found.reached * 1e6:.3g} µm rms at new poses (95 %){limit}"
+        now = f"≤ {microns(found.reached)} rms at new poses (95 %){limit}"
 
     def both(before: float, after: float) -> str:
-        begun = f"{before * 1e6:.3g} µm" if math.isfinite(before) else "an unknown error"
-        return f"{begun} to {after * 1e6:.3g} µm"
+        begun = microns(before) if math.isfinite(before) else "an unknown error"
+        return f"{begun} to {microns(after)}"
 
     yield "Next", f"{verdicts[found.verdict]}."
     yield "Error now", f"{now}."

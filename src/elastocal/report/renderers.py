@@ -172,7 +172,7 @@ Inputs = Mapping[str, str] | Iterable[str | Path] | None
 
 
 def write_page(
-    result: object, path: Path, inputs: Inputs = None, command: str | None = None,
+    result: Any, path: str | Path, inputs: Any = None, command: str | None = None,
     seed: int | None = None, **told: Any,
 ) -> None:  # fmt: skip
     """Write the result's page, whole or not at all; arguments as for `page_of`.  A certificate
@@ -181,11 +181,13 @@ def write_page(
     Where no `inputs` are named, they are the files that the result came from.  Raises InputError
     where an input cannot be read or `path` cannot be written, or names no page.
     """
+    found = type(path).__name__
+    require(isinstance(path, str | Path), f"{option('path')} takes a path; found {found}")
+    path = Path(path)
     if told.get("certificate") and path.suffix.lower() == ".xml":
         from elastocal.report.smaller_views import dcc_text
 
-        fit: Any = result
-        return atomic_write(path, dcc_text(fit))
+        return atomic_write(path, dcc_text(result))
     check_output(path, (".html", ".htm"))
     inputs = sources(result) if inputs is None else inputs
     atomic_write(path, page_of(result, inputs, command, seed, **told))
