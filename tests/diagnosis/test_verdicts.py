@@ -52,8 +52,7 @@ def test_a_gap_of_twelve_times_the_noise_is_not_nothing() -> None:
 
 
 def test_readings_of_a_loaded_arm_that_lies_are_told() -> None:
-    """A camera whose y points down: weights act along −z of its frame, and the base says that −y is
-    up."""
+    """A camera whose y points down: weights act along −z of its frame, the base says −y is up."""
     cell = CASES / "without_ignored" / "cell.toml"
     table = ec.Model(cell).read(cell.with_name("train.csv"))
     loads = np.tile([0, 0, -50.0], (len(table), 1))

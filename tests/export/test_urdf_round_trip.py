@@ -1,5 +1,4 @@
-"""Pinocchio reads an exported URDF as the calibrated arm, and what was not meant to change is as it
-was, to the byte."""
+"""Pinocchio reads an exported URDF as the calibrated arm; all else is as it was, to the byte."""
 
 from __future__ import annotations
 

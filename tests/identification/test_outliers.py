@@ -56,8 +56,7 @@ def test_dropping_equals_never_having_had_them():
 
 
 def test_stated_sigmas_count():
-    """A reading of sigma 2 mm that is off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm
-    is."""
+    """A reading of sigma 2 mm off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm is."""
     model, exact, _ = campaign(seed=9, sigma=0.0)
     rng, sigma = np.random.default_rng(1), np.full((30, 3), 2e-5)
     sigma[:10] = 2e-3

@@ -74,8 +74,7 @@ def test_predicted_error_is_that_at_new_poses(fits):
 
 @pytest.mark.parametrize("sideways", [0.0, 300.0])
 def test_a_pose_that_alone_shows_a_parameter_counts_by_its_share_of_the_error(sideways):
-    """Only in one pose the load pulls aside, which shows joint 1; under a weight joint 1 matters
-    nothing."""
+    """Only one pose's load pulls aside, which shows joint 1; under a weight it does not matter."""
     cell = cell_of(("joint_compliance",), observe="deflection", tracker=TRACKER)
     model = Model.assembled(planar_chain(), cell)
     q = random_poses(model.chain, 30, 3)

@@ -126,8 +126,7 @@ OPTIONS = dict.fromkeys({name.partition("-")[0] for name in suites.SUITES}, 1)
 
 
 def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypatch):
-    """However many worlds the study has: a part of it draws the same ones.  The first and the last
-    of every suite."""
+    """A part of a study draws the same worlds.  The first and the last of every suite."""
     drawn = []
 
     def one(task, origin):

@@ -190,8 +190,7 @@ def test_a_small_effect_is_found_before_a_large_one_that_hides_it(world, tmp_pat
 
 
 def test_the_reduction_told_is_that_at_new_poses(tmp_path):
-    """Of a small effect: the fit's own error at new poses is most of what there is before and
-    after."""
+    """Of a small effect the fit's own error is most of that at new poses, before and after."""
     drawn = named("catalogue", 20271310, "gear_second_harmonic-60-000").recipe.draw()
     seen, sealed = tmp_path / "seen", tmp_path / "sealed"
     write_world(drawn, seen, sealed)
