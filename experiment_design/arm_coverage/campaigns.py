@@ -66,15 +66,15 @@ def arm() -> Model:
     return Model.assembled(chain, Cell("arm", None, Robot(), tool, tracker, spec))
 
 
-def true_arm(rng: np.random.Generator) -> np.ndarray:
-    """Values (parameters,) of an arm at random."""
+def true_arm(rng: np.random.Generator, errors: float = 1.0) -> np.ndarray:
+    """Values (parameters,) of an arm at random, its geometry off by so many typical sizes."""
     model = arm()
     x = model.nominal.copy()
     for i, p in enumerate(model.parameters):
         if p.effect == "joint_compliance":
             x[i] *= 1 + SPRINGS * np.clip(rng.normal(), -2, 2)
         elif p.effect != "base_frame":
-            x[i] += GEOMETRY * rng.normal()
+            x[i] += errors * GEOMETRY * rng.normal()
     base = [model.names.index(f"base.{k}") for k in ("x", "y", "z", "rx", "ry", "rz")]
     x[base[:3]] = rng.uniform(-3, 3, 3)
     x[base[3:]] = Rotation.random(random_state=rng).as_rotvec()
@@ -94,11 +94,11 @@ def rows_at(poses: int, rng: np.random.Generator) -> Measurements:
 class Campaign:
     """One campaign: a `true` arm, its exact and noisy readings, and which of these are clean."""
 
-    def __init__(self, scenario: str, number: int) -> None:
+    def __init__(self, scenario: str, number: int, errors: float = 1.0) -> None:
         self.scenario = scenario
         marks = [sum(scenario.encode()), number]
         self.rng = rng = np.random.default_rng(np.random.SeedSequence(marks))
-        self.true = true_arm(rng)
+        self.true = true_arm(rng, errors)
         self.exact = simulate(
             arm(), rows_at(FEW if scenario == "few" else POSES, rng), self.true, rng, False
         )

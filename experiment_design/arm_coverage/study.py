@@ -27,12 +27,12 @@ def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
     chosen = [s for s in SCENARIOS if options["only"] in ("", s)]
     for number in range(options["first"], options["first"] + options["replicates"]):
         for scenario in chosen:
-            yield {"scenario": scenario, "number": number}
+            yield {"scenario": scenario, "number": number, "errors": options["errors"]}
 
 
 def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     """A row of study.toml's columns; the campaign's seed follows from scenario and number."""
-    campaign = Campaign(task["scenario"], task["number"])
+    campaign = Campaign(task["scenario"], task["number"], task["errors"])
     model, true = arm(), campaign.true
     result = identify(model, campaign.table)
     determined = np.array([model.names.index(name) for name in result.determined])
