@@ -124,19 +124,21 @@ def reduce(
         least = np.maximum(threshold, STRUCTURAL * length[own])
         chosen = np.append(chosen, own[far > least])
         basis = linalg.qr(R[:, chosen], mode="economic")[0]
-    while True:
-        kept = np.sort(chosen)
-        dropped = np.setdiff1d(np.arange(R.shape[1]), kept)
-        if not len(kept) or not len(dropped):
-            mixing = np.zeros((len(kept), len(dropped)))
-            break
-        mixing = least_norm(R[:, kept], R[:, dropped])
+    kept = np.sort(chosen)
+    dropped, mixing = _stood_for(R, kept)
+    while by_effect and np.abs(mixing).max(initial=0.0) > FAR:
         k, d = np.unravel_index(np.abs(mixing).argmax(), mixing.shape)
-        if not by_effect or np.abs(mixing[k, d]) <= FAR:
-            mixing *= sizes[kept][:, None] / sizes[dropped]
-            break
-        chosen = np.append(np.delete(kept, k), dropped[d])
+        kept = np.sort(np.append(np.delete(kept, k), dropped[d]))
+        dropped, mixing = _stood_for(R, kept)
+    mixing = mixing * sizes[kept][:, None] / sizes[dropped]
     return Reduction(kept, dropped, mixing, dropped[~visible[dropped]], threshold=threshold)
+
+
+def _stood_for(R: Array, kept: IntArray) -> tuple[IntArray, Array]:
+    """The columns of R that are not kept, and the kept ones' shares (kept, dropped) in each."""
+    dropped = np.setdiff1d(np.arange(R.shape[1]), kept)
+    mixing = np.zeros((len(kept), len(dropped)))
+    return dropped, least_norm(R[:, kept], R[:, dropped]) if mixing.size else mixing
 
 
 # Which parameters are fitted: a minimal complete set, a wider one.

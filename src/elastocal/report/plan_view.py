@@ -77,7 +77,7 @@ def next_blocks(found: NextPoses) -> Iterator[say.Block]:
         yield from plan_blocks(found.plan)
 
 
-def microns(metres: float) -> str:
+def position_error(metres: float) -> str:
     """A position error in µm, as plans have it, and where that is beyond all reading in mm or m."""
     return f"{metres * 1e6:.3g} µm" if metres < 0.9995e-3 else say.length(metres)
 
@@ -86,10 +86,10 @@ def _key(plan: Plan) -> say.KeyFigures:
     n, minutes = say.counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = "criterion", f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     if plan.of_test_poses:
-        worth = "error at the test poses", microns(_rho(plan) * 1e-6)
+        worth = "error at the test poses", position_error(_rho(plan) * 1e-6)
     figures = [("poses", str(len(plan.q))), worth]
     if (e := plan.everywhere) is not None:
-        figures.append(("error over the joint ranges", microns(e.elsewhere)))
+        figures.append(("error over the joint ranges", position_error(e.elsewhere)))
     figures.append(("time", minutes))
     figures += [("load states", str(len(plan.forces)))][: 4 - len(figures)]
     return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
@@ -152,7 +152,7 @@ def stop_table(plan: Plan) -> say.ShownTable:
 def plan_headline(plan: Plan) -> str:
     text = f"{say.counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
-        error = microns(_rho(plan) * 1e-6)
+        error = position_error(_rho(plan) * 1e-6)
         text += f"position error ρ₀ = {error} rms at the test poses after compensation"
     else:
         text += f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
@@ -405,7 +405,7 @@ def _execution_lines(plan: Plan) -> Told:
 
 def next_lines(found: NextPoses) -> Told:
     g, n = found.gain, say.counted(found.batch, "pose")
-    limit = "" if found.required is None else f" (required: {microns(found.required)})"
+    limit = "" if found.required is None else f" (required: {position_error(found.required)})"
     verdicts = {
         "measure": f"measure {n} more; then run it again with all readings in one table",
         "enough": "no further pose is needed: the required error is kept with 95 %",
@@ -415,11 +415,11 @@ def next_lines(found: NextPoses) -> Told:
     }
     now = "not known yet, as some parameters are undetermined"
     if math.isfinite(found.reached):
-        now = f"≤ {microns(found.reached)} rms at new poses (95 %){limit}"
+        now = f"≤ {position_error(found.reached)} rms at new poses (95 %){limit}"
 
     def both(before: float, after: float) -> str:
-        begun = microns(before) if math.isfinite(before) else "an unknown error"
-        return f"{begun} to {microns(after)}"
+        begun = position_error(before) if math.isfinite(before) else "an unknown error"
+        return f"{begun} to {position_error(after)}"
 
     yield "Next", f"{verdicts[found.verdict]}."
     yield "Error now", f"{now}."
