@@ -36,8 +36,8 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     model, true = arm(), campaign.true
     result = identify(model, campaign.table)
     determined = np.array([model.names.index(name) for name in result.determined])
-    error, std = estimates(result, true)
-    held = {name: holds(error, std, result.spread.dof, level) for name, level in LEVELS.items()}
+    error, std, dof = estimates(result, true)
+    held = {name: holds(error, std, dof, level) for name, level in LEVELS.items()}
     springs = np.array([name.endswith("compliance") for name in result.determined])
     row = {"estimates": len(error), "springs": int(springs.sum())}
     for name, inside in held.items():
@@ -65,8 +65,9 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     return [row | {"trusted": int(trust is not None and trust.severity == "good")}]
 
 
-def estimates(result: Calibration, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Error and standard deviation of each determined parameter or combination."""
+def estimates(result: Calibration, true: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Error, standard deviation and its degrees of freedom of each determined parameter or
+    combination."""
     truths = dict(zip(result.model.names, true, strict=True))
     found = []
     for name in result.determined:
@@ -74,7 +75,7 @@ def estimates(result: Calibration, true: np.ndarray) -> tuple[np.ndarray, np.nda
         if not e.identifiable:
             e = result.combination(name)
             truth = sum(f * (truths[part] - e.held.get(part, 0.0)) for part, f in e.terms.items())
-        found.append([e.value - truth, e.std])
+        found.append([e.value - truth, e.std, e.dof])
     return tuple(np.array(found).T)
 
 

@@ -257,8 +257,9 @@ def summarise(
     sigma = residual_sigma(final, spent)
     noise, parts = noise_of(found, sigma)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
-    sized = replace(found, solution=of_this_arm(solution, found.spread.std))
-    estimates, combinations = _estimates(sized, left_out)
+    own_sizes, unsure = of_this_arm(solution, found.spread.std)
+    sized = replace(found, solution=own_sizes)
+    estimates, combinations = _estimates(sized, left_out, unsure)
     determined = tuple(model.names[c] for c in kept)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage = solution.crossed
@@ -282,7 +283,7 @@ def summarise(
             weights.apply(heldout), absolute=weights.absolute,
         ),
         faulty_report=report, active=found.active, prior_share=found.prior_share,
-        smooth=found.smooth, left=left_open(sized.solution, found.limits), copies=copies,
+        smooth=found.smooth, left=left_open(own_sizes, found.limits), copies=copies,
         shown=_shown(solution, covariance),
     )  # fmt: skip
     predicted = predicted_error(
@@ -340,11 +341,11 @@ def _shown(solution: Solution, covariance: Array) -> ShownPoses | None:
 
 
 def _estimates(
-    method: MethodResult, left_out: set[int]
+    method: MethodResult, left_out: set[int], unsure: float
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     solution, model = method.solution, method.solution.problem.model
-    reduction, x, dof = solution.reduction, solution.fit.x, method.spread.dof
-    bends = bent(solution, method.spread.matrix)
+    reduction, x = solution.reduction, solution.fit.x
+    bends = zip(*bent(solution, method.spread.matrix, unsure), strict=True)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
@@ -353,20 +354,20 @@ def _estimates(
         p = model.parameters[i]
         return Estimate(p.name, p.unit, p.nominal, float(x[i]), **known)
 
-    for k, c in enumerate(reduction.kept):
+    for k, (c, bend) in enumerate(zip(reduction.kept, bends, strict=True)):
         parameter = model.parameters[c]
-        value, (terms, spread, ci) = float(x[c]), method.told(k, bends[k])
+        value, (terms, spread, dof, ci) = float(x[c]), method.told(k, *bend)
         for d in terms:
             partners[d].append(parameter.name)
         if terms:
             shares = {parameter.name: 1.0} | {model.names[d]: f for d, f in terms.items()}
             absorbed = {model.names[d]: float(x[d]) for d in terms}
-            combination = Combination(shares, parameter.unit, value, spread, ci, absorbed)
+            combination = Combination(shares, parameter.unit, value, spread, ci, absorbed, dof)
             combinations.append(combination)
             note = f"only as {combination.expression}"
             found[int(c)] = estimate(c, combined_with=tuple(absorbed), note=note)
         else:
-            found[int(c)] = estimate(c, value=value, std=spread, ci95=ci, dof=float(dof[k]))
+            found[int(c)] = estimate(c, value=value, std=spread, ci95=ci, dof=dof)
     invisible = set(reduction.invisible.tolist())
     for d in reduction.dropped:
         note = "held: no reading depends on it enough to determine it"
@@ -609,7 +610,7 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
     while True:
         held, fit = {}, found.solution.fit
         for k, c in enumerate(found.solution.reduction.kept.tolist()):
-            p, (terms, _, (low, high)) = fit.problem.model.parameters[c], found.told(k)
+            p, (terms, *_, (low, high)) = fit.problem.model.parameters[c], found.told(k)
             beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
             if beyond and not p.shrunk and not terms:
                 limits.setdefault(c, (low, high))

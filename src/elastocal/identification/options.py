@@ -130,6 +130,9 @@ class SmoothPart:
 # What a method ends with.
 
 
+NO_MATTER = 1e-4  # one over degrees of freedom that make no difference to an interval
+
+
 @dataclass(frozen=True)
 class MethodResult:
     """The final fit, its `spread`, and the noise where it was estimated.
@@ -163,15 +166,16 @@ class MethodResult:
         return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
 
     def told(
-        self, k: int, bent: float = 0.0
-    ) -> tuple[dict[int, float], float, tuple[float, float]]:
+        self, k: int, bent: float = 0.0, unsure: float = 0.0
+    ) -> tuple[dict[int, float], float, float, tuple[float, float]]:
         """Of kept parameter number k the parameters combined with it and their factors, its
-        standard deviation and its interval.
+        standard deviation with degrees of freedom, and its interval.
 
         A dropped parameter d is combined with it where its typical deviation s_d would shift the
         estimate by more than its standard deviation σ.  The others widen it to
         √(σ² + Σ_d (m_kd s_d)²), their typical deviations being a prior N(0, s_d²), as does what a
-        combination leaves out by being linear (`bent`); bounds cut the interval off.
+        combination leaves out by being linear (`bent`, its square known with the relative variance
+        `unsure`: degrees of freedom by Welch and Satterthwaite); bounds cut the interval off.
         """
         chosen, std = self.solution.reduction, float(self.spread.std[k])
         shift = np.abs(chosen.mixing[k]) * self.solution.problem.sizes[chosen.dropped]
@@ -179,11 +183,16 @@ class MethodResult:
                  for j in np.flatnonzero(shift > std)}  # fmt: skip
         left = np.append(shift[shift <= std], bent)
         wide = float(np.sqrt(1 + ((left / std) ** 2).sum())) if std > 0 else 1.0
+        dof, share = float(self.spread.dof[k]), (bent / (wide * std)) ** 2 if std > 0 else 0.0
         value, system = self.solution.fit.x[chosen.kept[k]], self.solution.fit.known.system
         ends = value + wide * (self.ci95[k] - value)
+        if (unknown := share**2 * unsure / 2) > NO_MATTER:
+            own = 1 / ((1 - share) ** 2 / dof + unknown)
+            wider, usual = t_quantile(LEVEL, np.array([own, dof]))
+            ends, dof = value + wider / usual * (ends - value), own
         if system is not None:
             ends = np.clip(ends, system.lower[k], system.upper[k])
-        return terms, wide * std, (float(ends[0]), float(ends[1]))
+        return terms, wide * std, dof, (float(ends[0]), float(ends[1]))
 
 
 # How to identify: method, noise, what is held, what becomes of faulty readings, where it starts.

@@ -111,7 +111,7 @@ class Combination:
 
     `terms` maps parameter names to factors (SI units); deviations of all members but the first
     are counted from their `held` value, 0 where none is stated.  `value`, `std`, `ci95` in the
-    first member's unit.
+    first member's unit, `dof` as of an estimate.
     """
 
     terms: dict[str, float]
@@ -120,6 +120,7 @@ class Combination:
     std: float
     ci95: tuple[float, float]
     held: dict[str, float] = field(default_factory=dict)
+    dof: float = math.inf
 
     def __str__(self) -> str:
         return (

@@ -351,29 +351,40 @@ def deviates(model: Model) -> BoolArray:
 
 
 CERTAIN = 0.99  # of typical errors, that chance does not make them look larger
+# What counts of a square at most, in typical ones; its mean among normal errors of size one, its
+# variance, and the variance of the logarithm of the size that solves for this mean, times n.
+CLIP = 1.5
+_BEYOND, _EDGE = 2 * special.ndtr(-CLIP), CLIP * np.exp(-(CLIP**2) / 2) * np.sqrt(2 / np.pi)
+_WITHIN = 1 - _BEYOND - _EDGE
+MEAN = _WITHIN + CLIP**2 * _BEYOND
+VARIANCE = 3 * _WITHIN - CLIP**2 * _EDGE + CLIP**4 * _BEYOND - MEAN**2
+UNSURE = VARIANCE / (2 * _WITHIN) ** 2
+SIZE_STEPS = 100
 
 
-def of_this_arm(solution: Solution, std: Array) -> Solution:
+def of_this_arm(solution: Solution, std: Array) -> tuple[Solution, float]:
     """The same with the sizes of what is held as large as the errors of this arm, where those are
-    larger than typical; `std` (kept,) of the estimates.
+    larger than typical; `std` (kept,) of the estimates.  And the variance of that size's logarithm.
 
     Of every kept parameter that `deviates`, |X − nominal| over the deviation that typical errors,
-    its own and of those it stands for, and the noise give it.  Their median resists a joint that
-    lost its zero; that of k normal ones follows from the Beta distribution of order statistics.
+    its own and of those it stands for, and the noise give it.  Their size resists a joint that lost
+    its zero: squares count up to CLIP² of it (Huber 1964, Ann. Math. Statist. 35, proposal 2).
     """
     fit, problem, chosen = solution.fit, solution.problem, solution.reduction
     kept, sizes, known = chosen.kept, problem.sizes, deviates(problem.model)
     shares = chosen.mixing * sizes[chosen.dropped]
-    spread = np.sqrt(sizes[kept] ** 2 + (shares**2).sum(axis=1) + std**2)
-    off = np.abs(fit.x - problem.model.nominal)[kept] / spread
-    off = np.sort(off[known[kept] & ~np.isin(kept, chosen.with_prior)])
-    if not (k := len(off)):
-        return solution
-    m = (k + 1) // 2
-    if off[m - 1] <= special.ndtri((1 + special.betaincinv(m, k - m + 1, CERTAIN)) / 2):
-        return solution
-    sizes = sizes * np.where(known, off[m - 1] / special.ndtri(0.75), 1.0)
-    return replace(solution, fit=replace(fit, problem=replace(problem, sizes=sizes)))
+    variance = sizes[kept] ** 2 + (shares**2).sum(axis=1) + std**2
+    square = (fit.x - problem.model.nominal)[kept] ** 2 / variance
+    square = square[known[kept] & ~np.isin(kept, chosen.with_prior)]
+    most = MEAN + special.ndtri(CERTAIN) * np.sqrt(VARIANCE / max(len(square), 1))
+    if np.minimum(square, CLIP**2).sum() <= most * len(square):
+        return solution, 0.0
+    own = square.max()
+    for _ in range(SIZE_STEPS):
+        own = np.minimum(square, CLIP**2 * own).mean() / MEAN
+    sizes = np.where(known, np.sqrt(own), 1.0) * sizes
+    sized = replace(fit, problem=replace(problem, sizes=sizes))
+    return replace(solution, fit=sized), UNSURE / len(square)
 
 
 def posed(
@@ -410,8 +421,10 @@ BENDS = 24
 BENT_SAMPLE = 1000  # observations it is found from: what readings at random poses have in common
 
 
-def bent(solution: Solution, covariance: Array) -> Array:
-    """Root mean square (kept,) of what estimates and combinations leave out by being linear.
+def bent(solution: Solution, covariance: Array, unsure: float = 0.0) -> tuple[Array, Array]:
+    """Root mean square (kept,) of what estimates and combinations leave out by being linear, and
+    the relative variance of its square, by the draws and where the logarithm of the size of what is
+    held has the variance `unsure`.
 
     The readings determine a nonlinear function of the parameters.  Typical deviations δ of those
     dropped, with −mixing · δ of those kept, leave them where they are in the first order, and so do
@@ -424,7 +437,7 @@ def bent(solution: Solution, covariance: Array) -> Array:
     kept, dropped = chosen.kept, chosen.dropped
     none = np.zeros(len(kept))
     if problem.large or not np.isfinite(covariance).all():
-        return none
+        return none, none
     size = problem.sizes[kept]
     typical = np.where(is_placed(problem.model), 0.0, problem.sizes)[dropped]
     root = drawing_root(covariance)
@@ -439,14 +452,17 @@ def bent(solution: Solution, covariance: Array) -> Array:
     )
     moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
-        return none  # so far out the arm has no equilibrium
+        return none, none  # so far out the arm has no equilibrium
     target, known, free = looked.weights.apply(moved.T / 2), found.known, np.eye(len(kept))
     ties = known.P * size * np.sqrt(len(residual) / len(found.residual))  # as among all readings
     if known.system is not None:
         free = linalg.null_space(known.system.A * size)
     rows = np.vstack([looked.weights.apply(B), ties]) @ free
-    step = free @ least_norm(rows, np.pad(target, ((0, len(ties)), (0, 0))))
-    return np.asarray(size * np.sqrt((step**2).mean(axis=1)))
+    square = (free @ least_norm(rows, np.pad(target, ((0, len(ties)), (0, 0))))) ** 2
+    mean = square.mean(axis=1)
+    spread = (square / np.maximum(mean, 1e-300)[:, None]).var(axis=1) / (BENDS - 1)
+    # A product of two of what is held grows with the square of its size.
+    return size * np.sqrt(mean), spread + 16 * unsure
 
 
 def tied_fit(problem: Problem, tolerance: float) -> Fit:
