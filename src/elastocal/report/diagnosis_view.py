@@ -376,7 +376,8 @@ def added_parameter_table(d: Diagnosis) -> say.ShownTable:
     unknown = any(math.isinf(p.std) for f in d.effects for p in f.parameters)
     note = "–: undetermined; the data show only what these parameters do together." * unknown
     heads = ("parameter", "value", "± 95 %", "unit")
-    return say.ShownTable(heads, rows, (0, 3), title=title, note=note)
+    table = say.ShownTable(heads, rows, (0, 3), title=title, note=note)
+    return table if any(value for _, value, *_ in rows) else table.without(1, 2, 3)
 
 
 def structure_table(d: Diagnosis) -> say.ShownTable:

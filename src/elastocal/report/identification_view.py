@@ -367,7 +367,7 @@ REDUNDANT = "redundant"
 HELD = {
     findings.INVISIBLE: " (not visible in these data)",
     findings.ABSORBED: ", absorbed in a combination",
-    REDUNDANT: ", not identifiable with these loads (expected)",
+    REDUNDANT: ", not identifiable at any pose under these loads (expected)",
 }
 WITHOUT = {
     findings.UNREAD: "held: no reading of this marker",

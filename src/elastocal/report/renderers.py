@@ -270,13 +270,15 @@ style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
 
 # Blocks as HTML
 
+OPTION = re.compile(r"(?<!\S)\(?--[a-z][a-z-]+[.,:;)]*")
 VIEW = '<script type="application/json" class="view-data">'
 
 
 def text_of(text: str, minus: bool = True) -> str:
-    """A text as HTML, as it can be read; `minus`: with proper minus signs before numbers."""
+    """A text as HTML, as it can be read; `minus`: with proper minus signs before numbers, and
+    options of the command line in one piece."""
     found = escape(shown(text))
-    return say.typeset(found) if minus else found
+    return OPTION.sub(r'<span class="whole">\g<0></span>', say.typeset(found)) if minus else found
 
 
 def html_of(
