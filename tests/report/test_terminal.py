@@ -62,7 +62,7 @@ def test_every_key_figure_of_a_plan_is_told_within_the_width(plan: Any, width: i
         f"certified on the pool: efficiency {c.efficiency_pool:.4f}",
         f"estimated on the continuum: efficiency {c.efficiency_continuum:.4f}",
         f"{plan.candidates.feasible} feasible of {plan.candidates.tried} tried",
-        "no feasible pose shows joint1.compliance",
+        "No feasible pose shows joint1.compliance",
         f"{len(plan.execution.stops)} stops",
         *(p.name for p in plan.predicted),
     ):

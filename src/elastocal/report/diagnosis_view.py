@@ -61,7 +61,9 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     lines = [(label, say.capital(text)) for label, text in diagnosis_lines(d)]
     lines += [("Not separable", say.capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
-    yield say.Lines([*lines, *((say.WARNING, say.capital(printable(text))) for text in d.warnings)])
+    yield say.Lines(
+        [*lines, *((say.WARNING, say.sentence(printable(text))) for text in d.warnings)]
+    )
     yield say.Fold("", lambda: _figures(d), figures=("budget", "curves"))
     shapes = "" if len(d.effects) <= FEW else "Found effects over the joints they act at"
     yield say.Fold(shapes, lambda: effects_over_joints(d), figures=("effects",))
@@ -314,9 +316,9 @@ def diagnosis_steps(d: Diagnosis) -> list[str]:
             for group in extra.inseparable:
                 names = say.together([say.name_of(name) for name in group])
                 steps.append(f"{say.capital(names)} count as one.")
-        steps += [say.capital(printable(text)) for text in extra.advice]
+        steps += [say.sentence(printable(text)) for text in extra.advice]
     # One piece of advice serves many effects.
-    return steps + list(dict.fromkeys(say.capital(printable(u.advice)) for u in d.untested))
+    return steps + list(dict.fromkeys(say.sentence(printable(u.advice)) for u in d.untested))
 
 
 def alike(d: Diagnosis) -> list[str]:

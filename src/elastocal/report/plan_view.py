@@ -31,7 +31,7 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     yield say.Fold("", lambda: [_key(plan)])
     # A gap to the bound is no fault of the plan's: with few poses much of it is the bound's.
     yield say.ShownVerdict("warn" if plan.warnings else "good", plan_headline(plan))
-    yield say.Lines([(say.WARNING, printable(text)) for text in plan.warnings])
+    yield say.Lines([(say.WARNING, say.sentence(printable(text))) for text in plan.warnings])
     yield say.Fold("", arm, figures=("poses",))
     # Less digits where there is no room.
     two, one, none = (pose_table(plan, decimals) for decimals in (2, 1, 0))

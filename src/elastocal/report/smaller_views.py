@@ -191,7 +191,7 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
             f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
             f"targets in the {commands['frame']} frame."
         )
-        yield say.Lines([(say.WARNING, text) for text in commands["warnings"]])
+        yield say.Lines([(say.WARNING, say.sentence(text)) for text in commands["warnings"]])
     if table is not None:
         rows = {"without the table": table["error_without_um"]}
         rows["with it, interpolated"] = table["error_with_um"]
@@ -207,7 +207,7 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
                 f"Standard uncertainty of the tool at them: {say.length(std * 1e-6)} rms; within, "
                 f"at 95 %: {say.length(table['within95_um']['rms'] * 1e-6)}."
             )
-        yield say.Lines([(say.WARNING, text) for text in table["warnings"]])
+        yield say.Lines([(say.WARNING, say.sentence(text)) for text in table["warnings"]])
 
 
 def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
@@ -370,7 +370,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
     yield say.Lines([
         *_counts(found),
         *(("Left out", text) for text in left_out(found)),
-        *((say.WARNING, text) for text in found.warnings),
+        *((say.WARNING, say.sentence(text)) for text in found.warnings),
     ])  # fmt: skip
 
 
