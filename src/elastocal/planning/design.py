@@ -80,7 +80,8 @@ class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
     `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
     sentences on how these came about, for the plan's warnings; `pins`: poses that stay or are
-    struck out."""
+    struck out; `hold`: parameters by which no plan can predict the test poses are held, as
+    identification holds them, and told."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -91,6 +92,7 @@ class DesignOptions:
     curve: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
     pins: Pins | None = None
+    hold: bool = False
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
@@ -258,7 +260,7 @@ class _Design:
         progress("information of the candidates")
         setup = set_up(
             self.model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen, self.work, options.effort == "batch",
+            region, self.feasibility.seen, self.work, options.hold,
         )  # fmt: skip
         self.warnings += setup.warnings
         if pins is not None and len(pins.q):
