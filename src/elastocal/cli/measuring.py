@@ -268,9 +268,10 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
         hung = f"with the loads of its note_load ({names}), "
         carried = f" --load {' '.join(f'{value:g}' for value in loads[0])}"
     added = "" if augment is None else f" (add them to {augment})"
+    read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
     return (
-        f"Next: measure {output} in its order, {hung}a row with x_mm, y_mm, z_mm for each "
-        f"marker{added}; then\n"
+        f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
+        "then\n"
         f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
         f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
         f"{carried}"

@@ -81,9 +81,11 @@ def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
 
 
 def _no_noise(cell: Cell) -> str:
+    keys = "sigma_um, range_um and transverse_um, or distance_um"
     return (
-        f"{cell.source}: a plan needs the noise of a reading; state [tracker] sigma_um, range_um "
-        "and transverse_um, or distance_um, as the instrument's data sheet says"
+        f"{cell.source}: a plan needs the noise of a reading; state [tracker] "
+        f"{'distance_um' if cell.model.observe == 'distance' else keys}, as the instrument's data "
+        "sheet says"
     )
 
 
@@ -94,10 +96,9 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
     """
     cell = model.cell
     kind = available_noise(observed.table, cell.tracker)
-    require(
-        kind != "none" or (observed.kind == "distance" and cell.tracker.distance_sigma is not None),
-        _no_noise(cell),
-    )
+    if observed.kind == "distance":
+        kind = "none" if cell.tracker.distance_sigma is None else "axis"
+    require(kind != "none", _no_noise(cell))
     single, spec = stated_covariance(observed, cell.tracker, kind)[0], cell.design
     if (dof := cell.noise.tails) is None:
         return single

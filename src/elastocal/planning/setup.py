@@ -142,9 +142,10 @@ def set_up(
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
     `[design] elsewhere`.  `work`: the model at the test poses, where its tool is another one.
-    `hold`: parameters by which no plan can predict the test poses are held, not refused.
+    `hold`: parameters by which no plan can predict the test poses are held, not refused; so they
+    are of distances, which never show where the arm stands as a whole.
     """
-    spec = model.cell.design
+    spec, hold = model.cell.design, hold or model.observe == "distance"
     x = model.nominal if known.done is None else known.done.x
     free, every = fixed_and_free(model, known.fixed), np.arange(len(model.parameters))
     raw = PoseInformation(model, x, every, np.ones(len(every)), sight)
