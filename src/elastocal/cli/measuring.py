@@ -315,7 +315,6 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     short_help="Simulate the measurements of a plan",
     verb=verbs.simulate,
     offers="draw load repeats seed",
-    flags="plugins json",
 )
 def simulate(
     cell: CellFile,
