@@ -44,7 +44,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import PydanticCustomError
 
 from elastocal.above import ByValue
-from elastocal.errors import GONE, InputError, require
+from elastocal.errors import GONE, InputError, require, said_of
 from elastocal.files import DEEPEST, check_exists, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array, rotation_from_rpy, to_si
@@ -369,10 +369,8 @@ def from_table(cls: type[Record], table: Mapping[str, Any], spot: Spot, **values
     for name, keys in fields_of(known).items():
         if name not in values and (given := stated(table, spot, keys)):
             values[name] = given[0]
-    try:
+    with said_of(spot.path):
         return cls(**values)
-    except InputError as error:
-        raise InputError(f"{spot.path}: {error}") from None
 
 
 def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:

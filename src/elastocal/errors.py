@@ -198,6 +198,15 @@ def _of_plugin(error: Exception) -> str:
     return ""
 
 
+@contextmanager
+def said_of(where: object) -> Iterator[None]:
+    """Within it an InputError says first what it is said of: a file, or an option."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
 def require(condition: bool, message: str) -> None:
     if not condition:
         raise InputError(message)

@@ -130,8 +130,8 @@ def design(
         knowledge: Knowledge file (TOML) as for identify, whose priors count.  Or a `Knowledge`.
         prior: "typical" takes every parameter's typical size as its prior, "none" none; or what
             is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
-        effort: How hard to search: "quick", "normal", "thorough"; "batch" takes the candidates as
-            drawn, as `next` does.
+        effort: How hard to search: "quick", "normal", "thorough"; "batch" chooses among the
+            candidates as they were drawn.
         candidates: Feasible candidates to draw, over all levels; or a table of poses to choose
             from, or both, as in "taught.csv",500.  In Python ["taught.csv", 500].
         repeats: Readings per pose and load state.

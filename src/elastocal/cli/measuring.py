@@ -26,7 +26,7 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, require, said_of
 from elastocal.screen import interrupts, say
 from elastocal.text import listed
 
@@ -296,15 +296,13 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
 
     written, chain = dict[Path, str](), load_chain(cell)
     for path in paths:
-        try:
+        with said_of(f"--program {path}"):
             check_six_axes(chain, LANGUAGES[path.suffix.lower()][0])
             if plan is not None:
                 written[path] = robot_program(
                     path.suffix, plan.execution, chain, plan.configurations, plan.forces,
                     joint_limits(cell, chain), path.stem,
                 )  # fmt: skip
-        except InputError as error:
-            raise InputError(f"--program {path}: {error}") from None
     return written
 
 

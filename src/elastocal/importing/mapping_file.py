@@ -28,7 +28,7 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError, check_known, option
+from elastocal.errors import InputError, check_known, option, said_of
 from elastocal.measurements import families
 from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
@@ -204,10 +204,8 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
     name = source.get("preset")
     if name is None:
         return source
-    try:
+    with said_of(where):
         base = tomllib.loads(preset_text(name))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
     # x_mm of the user replaces the preset's x_auto, whichever table either stands in.
     own = source.get("columns", {}) | source.get("optional", {})
     taken = {_UNIT.sub("", column) for column in own} | set(own)
