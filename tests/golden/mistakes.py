@@ -100,8 +100,8 @@ CELL = (
     Mistake("a wrong length", FIT, "placed.toml", "[0.2, 0.05, 0.1]", "[0.2, 0.05]"),
     Mistake("an unknown way to observe", FIT, "placed.toml", '"position"', '"postion"'),
     Mistake("no robot's file", FIT, "placed.toml", '"arm.urdf"', '"leg.urdf"'),
-    Mistake("a flange that is no link", FIT, "placed.toml", 'base = "base_link"',
-            'flange = "flnge"'),
+    Mistake("distances from nowhere", DEFLECT, "deflecting.toml", '"deflection"', '"distance"'),
+    Mistake("a flange is no link", FIT, "placed.toml", 'base = "base_link"', 'flange = "flnge"'),
     Mistake("a URDF that does not parse", FIT, "arm.urdf", "</robot>", ""),
     Mistake("a URDF with a loop", FIT, "arm.urdf", "</robot>",
             '<joint name="again" type="fixed"><parent link="link_5"/><child link="link_2"/></joint>'
