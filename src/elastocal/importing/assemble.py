@@ -369,6 +369,7 @@ def import_files(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
             'export, or set role = "points" in its [[source]]'
         )
+    doubts_of_files = [told for own in by_role.values() for r in own for told in r.doubts]
     by_role, warnings = with_loads_of_names(by_role, table.loads)
     points = joining.pooled(by_role["points"])
     log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
@@ -403,6 +404,7 @@ def import_files(
         refused = beyond_limits(cell, chain, measured, columns)
         fit = nominal_fit(chain, cell, measured, spherical)
     warnings += [
+        *doubts_of_files,
         *(() if joined is None else joined.warnings),
         *doubts,
         *plausibility(columns, measured, None if cell is None else cell.model.observe),
