@@ -381,7 +381,7 @@ def simulated(
     from elastocal.identification.start import check_limits
     from elastocal.measurements import Measurements
     from elastocal.model.arm import given_force
-    from elastocal.simulation import draw_errors, expand_plan, values_from
+    from elastocal.simulation import NOMINAL, draw_errors, expand_plan, values_from
     from elastocal.simulation import simulate as run
 
     force = given_force(load)
@@ -407,7 +407,11 @@ def simulated(
             f"{option('values')} takes {len(made.parameters)} finite numbers, one per parameter, "
             f"or some of them by name; found an array of shape {x.shape}",
         )
-    read = run(made, rows, x, rng, noise=noise)
+    of_the_draw = (
+        f"those of {option('draw')} are of an arm for the loads that the cell plans ([design] "
+        f"loads_N): simulate a load like these, state larger ones there, or give {option('values')}"
+    )
+    read = run(made, rows, x, rng, noise, of_the_draw if drawn else NOMINAL)
     # Up to here rows are lines of the plan, which messages name.
     return replace(read, row=np.arange(len(read)) + 2), x
 

@@ -156,6 +156,7 @@ OPTIONS = (
     Mistake("an empty argument", f"{FIT} --report ''"),
     Mistake("no file of knowledge", f"{DEFLECT} --knowledge none.toml"),
     Mistake("a method without constraints", f"{DEFLECT} --physical --method huber"),
+    Mistake("a draw for smaller loads", "simulate placed.toml placed.csv -o o.csv --draw 1e6"),
     Mistake("no file of a covariance", f"{DEFLECT} --covariance noise.csv"),
     Mistake("a folder as a covariance", f"{DEFLECT} --covariance study"),
     Mistake("a covariance of two rows", f"{DEFLECT} --weights covariance --covariance links.csv",

@@ -519,7 +519,7 @@ class Cell:
         )
         found = {"distance_sensor", "base_frame"} & {each.name for each in self.model.effects}
         base = self.model.nominal.base_position
-        placed = self.tracker.anchor is not None or (base is not None and base.any())
+        placed = self.tracker.anchor is not None or (base is not None and bool(base.any()))
         require(
             self.model.observe != "distance" or placed or bool(found),
             f'{where}: key model.observe = "distance" needs the place that distances are from; '

@@ -460,13 +460,15 @@ class Model(ByValue):
         return self._symbolic.frames(*inputs, x, self._symbolic.equilibrium(inputs, x)[0])
 
 
-def check_equilibrium(table: Measurements, predicted: Array) -> None:
+NOMINAL = "check force_*_N and [model.nominal] joint_compliance, which is in rad/(N m)"
+
+
+def check_equilibrium(table: Measurements, predicted: Array, remedy: str = NOMINAL) -> None:
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
     if len(bad):
         raise InputError(
             f"{table.source}, line {table.row[bad[0]]}: no static equilibrium under this load "
-            f"({len(bad)} rows); the compliances are too large for the force: check force_*_N "
-            "and [model.nominal] joint_compliance, which is in rad/(N m)"
+            f"({len(bad)} rows); the compliances are too large for the force: {remedy}"
         )
 
 
