@@ -469,8 +469,10 @@ class Knowledge:
 
     @classmethod
     def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, Any]:
-        tables = (tuple(table.get(name, ())) for name in ("bounds", "equality", "semidefinite"))
-        return {"constraints": Constraints(*tables), "source": str(spot.path)}
+        kinds = ("bounds", "equality", "semidefinite")
+        bounds, equalities, matrices = (tuple(table.get(kind, ())) for kind in kinds)
+        constraints = Constraints(bounds, equalities, matrices)
+        return {"constraints": constraints, "source": str(spot.path)}
 
     def of(self, model: Model) -> tuple[Constraints, GaussianPrior | None]:
         """Constraints and prior on the model's parameters.

@@ -539,7 +539,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         for marker in mapping_file.markers_of_row(name, asked, table.header) or [""]
     }
     no_unit = {c.header: c for own in columns.values() for c in own if c.unit == mapping_file.AUTO}
-    columns = {m: [c for c in own if c.header not in no_unit] for m, own in columns.items()}
+    columns = {m: tuple(c for c in own if c.header not in no_unit) for m, own in columns.items()}
     every = [c for own in columns.values() for c in own]
     cells = NumberCells(
         settings.decimal, settings.thousands, settings.missing,
