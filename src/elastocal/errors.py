@@ -124,6 +124,27 @@ def options_as_flags() -> Iterator[None]:
         _flags = before
 
 
+_given: frozenset[str] = frozenset()
+
+
+@contextmanager
+def options_given(keywords: Iterable[str]) -> Iterator[None]:
+    """Within it messages on a key of the cell in whose place one of these options is given name the
+    option, where they name the key by `wish`."""
+    global _given
+    before, _given = _given, frozenset(keywords)
+    try:
+        yield
+    finally:
+        _given = before
+
+
+def wish(keyword: str, key: str) -> str:
+    """What the user asks for as messages name it: the option where one is given in the place of a
+    key of the cell, else the `key`."""
+    return option(keyword) if keyword in _given else key
+
+
 # Set, the command line shows the traceback of what no message foresees.
 TRACEBACK = "ELASTOCAL_TRACEBACK"
 INTERNAL = 70  # what sysexits.h calls a fault of the software

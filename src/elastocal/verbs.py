@@ -8,16 +8,14 @@ Signature and docstring are the one place where an option is declared, for the c
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 from elastocal.above import checked_arguments, later, shown, whole
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import InputError, option, options_given, require
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
@@ -179,24 +177,7 @@ def design(
     asked = {name: given for name, given in locals().items() if name not in ("model", "progress")}
     from elastocal.planning.design import design as run
 
-    with options_named(asked):
-        cell, options = design_request(model, **asked)
-        return run(cell, options, progress=progress or _silent)
-
-
-@contextmanager
-def options_named(asked: Mapping[str, Any]) -> Iterator[None]:
-    """Messages on a key of [design] in whose place an option is `asked` name the option."""
-    try:
-        yield
-    except ElastocalError as error:
-        told = str(error)
-        for name in (name for name, given in asked.items() if given is not None):
-            key = rf"{name.replace('test_poses', 'test_pose')}(_um|_N|_si|_deg)?"
-            of_the_cell = r"([^:\[]*: )?(key )?(\w+ of )?\[*design\]?[ .](poses_)?"
-            where = rf"^(\w+: |{of_the_cell}){key}\]*(?= )"
-            told = re.sub(where, lambda _, name=name: option(name), told)  # type: ignore[misc]
-        raise type(error)(told) from None
+    return run(*design_request(model, **asked), progress=progress or _silent)
 
 
 def design_request(
@@ -217,8 +198,10 @@ def design_request(
     search = {name: asked.pop(name) for name in of_the_search if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
-    cell = replace(cell, design=_design_of(cell, asked))
-    cell.check()
+    named = tuple(name for name, given in asked.items() if given is not None)
+    with options_given(named):
+        cell = replace(cell, design=_design_of(cell, asked))
+        cell.check()
     for number in curve:
         check_levels(cell, "curve", whole("curve", number))
     if asked.get("poses") is not None:
@@ -239,7 +222,7 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins,
+        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins, asked=named,
         prior=_gaussian(prior) if stated is None else stated, curve=tuple(sorted({*curve})),
     )  # fmt: skip
     return cell, options

@@ -198,7 +198,7 @@ def design(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
     )  # fmt: skip
-    with run.progress() as progress, verbs.options_named(asked):
+    with run.progress() as progress:
 
         def chosen(path: Path) -> None:
             from elastocal.diagnosis.diagnose import write_extended_cell

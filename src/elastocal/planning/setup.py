@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy import optimize
 
-from elastocal.errors import InsufficientDataError
+from elastocal.errors import InsufficientDataError, wish
 from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
 from elastocal.model.chain import joint_index
@@ -205,8 +205,9 @@ def _aimed(
             beyond = found.on_kept(rows[T:], hold), region.weight
     if share and beyond is None:
         raise InsufficientDataError(
-            f"{model.cell.source}: [design] elsewhere asks for poses all over the joint ranges, "
-            "but the rules allow none, or no plan can make all of them certain; leave it out"
+            f"{wish('elsewhere', f'{model.cell.source}: [design] elsewhere')} asks for poses all "
+            "over the joint ranges, but the rules allow none, or no plan can make all of them "
+            "certain; leave it out"
         )
     warnings = setup.warnings + told
     return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)
