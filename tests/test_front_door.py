@@ -428,7 +428,7 @@ def test_type_hints_of_all_that_is_public_are_resolved(door):
 
 def test_whatever_a_verb_returns_is_a_result():
     """Its `save`, `report`, `plot` and `to_dataframe` find what they need by the class's name."""
-    verbs = "design simulate identify diagnose compensate compare next_poses".split()
+    verbs = ["design", "simulate", "identify", "diagnose", "compensate", "compare", "next_poses"]
     returned = {inspect.signature(getattr(ec, name)).return_annotation for name in verbs}
     assert returned == set(FRAMES) == set(WRITERS) - {"CalibratedArm"}
 
