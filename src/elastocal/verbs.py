@@ -262,12 +262,9 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     told = "a target or a time asks for the number of poses; drop one"
     require(len(wishes) < 2, f"{' and '.join(map(option, wishes))}: {told}")
     if "levels" in chosen:
-        require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen.setdefault("per_level", ())
     for key, other in (("elsewhere", "elsewhere_cap"), ("elsewhere_cap", "elsewhere")):
         if key in chosen:
-            told = f"{option(key)} and {option(other)} both say what the rest is worth; drop one"
-            require(not (chosen[key] and chosen.get(other)), told)
             chosen.setdefault(other, None)
     motion = {k: chosen.pop(k) for k in ("load_changes", "reference_every") if k in chosen}
     if motion:

@@ -310,7 +310,8 @@ class DesignSpec:
         )
         require(
             not (self.elsewhere and self.elsewhere_cap),
-            "keys design.elsewhere and design.elsewhere_cap both say what the joint ranges are "
+            f"{wish('elsewhere', 'keys design.elsewhere')} and "
+            f"{wish('elsewhere_cap', 'design.elsewhere_cap')} both say what the joint ranges are "
             "worth beside the test poses; drop one",
         )
 
