@@ -519,15 +519,6 @@ class Cell:
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
             "for capsules along the links instead",
         )
-        found = {"distance_sensor", "base_frame"} & {each.name for each in self.model.effects}
-        base = self.model.nominal.base_position
-        placed = self.tracker.anchor is not None or (base is not None and bool(base.any()))
-        require(
-            self.model.observe != "distance" or placed or bool(found),
-            f'{where}: key model.observe = "distance" needs the place that distances are from; '
-            'add "distance_sensor" to [model] effects, which finds it, or state [tracker] '
-            "anchor_m = [x, y, z] in the data's frame",
-        )
         if known_effects is not None:
             for i, choice in enumerate(self.model.effects):
                 told = f"{where}: key model.effects[{i}] names the unknown effect"
