@@ -264,6 +264,7 @@ def test_a_cell_without_markers_takes_those_of_the_table(folder):
         ("design", {"robust": "worst"}, "`robust` is gone: plans are made .* as identified"),
         ("design", {"doubts": {}}, "`doubts` is gone: for effects that the model may lack"),
         ("design", {"test_poses": [0, 0, 0]}, r"^`test_poses` no\. 1 has 3 numbers"),
+        ("design", {"criterion": "D", "elsewhere_cap": 0.1}, "^`elsewhere_cap` goes with"),
         ("design", {"effort": "fast"}, "^`effort` 'fast' is unknown"),
         ("identify", {"prior": {"joint3": 3}}, "`prior` takes mean and std by parameter"),
         ("identify", {"fixed": "joint9"}, r"fixed=\['joint9'\]: the model has no such"),
@@ -277,8 +278,8 @@ def test_a_cell_without_markers_takes_those_of_the_table(folder):
 def test_a_wrong_option_is_named_by_its_keyword(verb, options, named, model, fit):
     first = {
         "design": (model,), "identify": (model, "data.csv"), "diagnose": (model, "data.csv"),
-        "next_poses": (model, "data.csv"),
-        "simulate": (model, "plan.csv"), "compensate": (fit, TARGETS),
+        "next_poses": (model, "data.csv"), "simulate": (model, "plan.csv"),
+        "compensate": (fit, TARGETS),
     }[verb]  # fmt: skip
     with pytest.raises(ec.InputError, match=named) as caught:
         getattr(ec, verb)(*first, **options)
@@ -427,9 +428,8 @@ def test_type_hints_of_all_that_is_public_are_resolved(door):
 
 def test_whatever_a_verb_returns_is_a_result():
     """Its `save`, `report`, `plot` and `to_dataframe` find what they need by the class's name."""
-    returned = {inspect.signature(getattr(ec, name)).return_annotation
-                for name in ("design", "simulate", "identify", "diagnose", "compensate", "compare",
-                             "next_poses")}  # fmt: skip
+    verbs = ["design", "simulate", "identify", "diagnose", "compensate", "compare", "next_poses"]
+    returned = {inspect.signature(getattr(ec, name)).return_annotation for name in verbs}
     assert returned == set(FRAMES) == set(WRITERS) - {"CalibratedArm"}
 
 
@@ -437,11 +437,12 @@ def test_whatever_a_verb_returns_is_a_result():
     ("verb", "kind", "renamed"),
     [
         ("identify", Options, {"faulty": "outliers"}),
-        ("design", DesignOptions, {"done": "augment", "notes": "knowledge", "pins": "keep"}),
+        ("design", DesignOptions, {"done": "augment", "notes": "knowledge", "pins": "keep",
+                                   "asked": "model", "hold": "effort"}),
         ("design", DesignSpec, {"taught": "candidates"}),
         ("diagnose", DiagnosisOptions, {}),
     ],
-)
+)  # fmt: skip
 def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
     keywords = set(inspect.signature(getattr(ec, verb)).parameters)
     assert {renamed.get(f.name, f.name) for f in fields(kind)} <= keywords

@@ -44,7 +44,7 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import PydanticCustomError
 
 from elastocal.above import ByValue
-from elastocal.errors import GONE, InputError, require
+from elastocal.errors import GONE, InputError, require, said_of, wish
 from elastocal.files import DEEPEST, check_exists, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array, rotation_from_rpy, to_si
@@ -173,7 +173,8 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
             told = known.takes.replace(*UNITS.get(known.unit, ("", "")))
     words = re.findall(r'"(\w+)"', told) if kind == "literal_error" else ()
     hint = did_you_mean(str(first["input"]), words)
-    return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
+    key = wish(str(name), f"{own}: {name}")
+    return f"{key} takes {told}; found {shown(first['input'])}{hint}"
 
 
 def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
@@ -369,10 +370,8 @@ def from_table(cls: type[Record], table: Mapping[str, Any], spot: Spot, **values
     for name, keys in fields_of(known).items():
         if name not in values and (given := stated(table, spot, keys)):
             values[name] = given[0]
-    try:
+    with said_of(spot.path):
         return cls(**values)
-    except InputError as error:
-        raise InputError(f"{spot.path}: {error}") from None
 
 
 def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:

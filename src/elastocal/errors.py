@@ -124,6 +124,27 @@ def options_as_flags() -> Iterator[None]:
         _flags = before
 
 
+_given: frozenset[str] = frozenset()
+
+
+@contextmanager
+def options_given(keywords: Iterable[str]) -> Iterator[None]:
+    """Within it messages on a key of the cell in whose place one of these options is given name the
+    option, where they name the key by `wish`."""
+    global _given
+    before, _given = _given, frozenset(keywords)
+    try:
+        yield
+    finally:
+        _given = before
+
+
+def wish(keyword: str, key: str) -> str:
+    """What the user asks for as messages name it: the option where one is given in the place of a
+    key of the cell, else the `key`."""
+    return option(keyword) if keyword in _given else key
+
+
 # Set, the command line shows the traceback of what no message foresees.
 TRACEBACK = "ELASTOCAL_TRACEBACK"
 INTERNAL = 70  # what sysexits.h calls a fault of the software
@@ -196,6 +217,15 @@ def _of_plugin(error: Exception) -> str:
         if file in ran:
             return f"{file}, line {line}: {what}; correct the plug-in"
     return ""
+
+
+@contextmanager
+def said_of(where: object) -> Iterator[None]:
+    """Within it an InputError says first what it is said of: a file, or an option."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def require(condition: bool, message: str) -> None:

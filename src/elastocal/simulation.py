@@ -20,7 +20,7 @@ from elastocal.model.effects.compliances import (
     usual_over_stated_mass,
     weight_torque,
 )
-from elastocal.model.manipulator import Model, check_equilibrium
+from elastocal.model.manipulator import NOMINAL, Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
 from elastocal.text import did_you_mean, listed
@@ -146,8 +146,9 @@ def expand_plan(
 
 
 def simulate(
-    model: Model, rows: Measurements, x: Array, rng: np.random.Generator | int, noise: bool = True
-) -> Measurements:
+    model: Model, rows: Measurements, x: Array, rng: np.random.Generator | int, noise: bool = True,
+    remedy: str = NOMINAL,
+) -> Measurements:  # fmt: skip
     """Readings of the model at parameter values x for every row, with the cell's noise.
 
     Per-row sigmas of `rows` win over the cell's tracker noise, as when identifying; without
@@ -155,17 +156,17 @@ def simulate(
     positions drift, as the cell's [noise] states.  Positions in m in the tracker frame; rotations
     and distances where the model observes them.
 
-    Raises ElastocalError where a pose has no static equilibrium.
+    Raises ElastocalError, with the `remedy`, where a pose has no static equilibrium.
     """
     rng = np.random.default_rng(rng)
     if not noise:
-        return _read(model, rows, x, rng, False)
+        return _read(model, rows, x, rng, False, remedy)
     cell, n_joints, visit = model.cell, model.chain.n_joints, visits(rows)
     settled, scatter = rows, cell.noise.of_joints(n_joints)
     if scatter.any():
         shift = rng.normal(size=(visit.max(initial=-1) + 1, n_joints)) * scatter
         settled = replace(rows, q=rows.q + shift[visit])
-    found = replace(_read(model, settled, x, rng, True), q=rows.q)
+    found = replace(_read(model, settled, x, rng, True, remedy), q=rows.q)
     if cell.noise.configuration and found.position is not None:
         off = rng.normal(size=(rows.configuration.max(initial=-1) + 1, 3))[rows.configuration]
         found = replace(found, position=found.position + cell.noise.configuration * off)
@@ -183,17 +184,17 @@ def simulate(
 
 
 def _read(
-    model: Model, rows: Measurements, x: Array, rng: np.random.Generator, noise: bool
+    model: Model, rows: Measurements, x: Array, rng: np.random.Generator, noise: bool, remedy: str
 ) -> Measurements:
     n = len(rows)
     if model.observe == "distance":
         length = model.predict(replace(rows, distance=np.ones(n)), x)
-        check_equilibrium(rows, length[:, None])
+        check_equilibrium(rows, length[:, None], remedy)
         sigma = (model.cell.tracker.distance_sigma or 0.0) if noise else 0.0
         return replace(rows, distance=length + sigma * _standard(model, rng, (n,)))
     # A pose model asks each row for the measured rotation it is compared with; any will do here.
     rotation, position = model.target_poses(replace(rows, rotation=np.zeros((n, 3))), x)
-    check_equilibrium(rows, position)
+    check_equilibrium(rows, position, remedy)
     exact = replace(rows, position=position)
     if model.observe == "pose":
         turn = rotation

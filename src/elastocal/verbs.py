@@ -8,16 +8,14 @@ Signature and docstring are the one place where an option is declared, for the c
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 from elastocal.above import checked_arguments, later, shown, whole
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import InputError, option, options_given, require
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
@@ -130,7 +128,8 @@ def design(
         knowledge: Knowledge file (TOML) as for identify, whose priors count.  Or a `Knowledge`.
         prior: "typical" takes every parameter's typical size as its prior, "none" none; or what
             is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
-        effort: How hard to search: "quick", "normal" or "thorough".
+        effort: How hard to search: "quick", "normal", "thorough"; "batch" chooses among the
+            candidates as they were drawn.
         candidates: Feasible candidates to draw, over all levels; or a table of poses to choose
             from, or both, as in "taught.csv",500.  In Python ["taught.csv", 500].
         repeats: Readings per pose and load state.
@@ -178,24 +177,7 @@ def design(
     asked = {name: given for name, given in locals().items() if name not in ("model", "progress")}
     from elastocal.planning.design import design as run
 
-    with options_named(asked):
-        cell, options = design_request(model, **asked)
-        return run(cell, options, progress=progress or _silent)
-
-
-@contextmanager
-def options_named(asked: Mapping[str, Any]) -> Iterator[None]:
-    """Messages on a key of [design] in whose place an option is `asked` name the option."""
-    try:
-        yield
-    except ElastocalError as error:
-        told = str(error)
-        for name in (name for name, given in asked.items() if given is not None):
-            key = rf"{name.replace('test_poses', 'test_pose')}(_um|_N|_si|_deg)?"
-            of_the_cell = r"([^:\[]*: )?(key )?(\w+ of )?\[*design\]?[ .](poses_)?"
-            where = rf"^(\w+: |{of_the_cell}){key}\]*(?= )"
-            told = re.sub(where, lambda _, name=name: option(name), told)  # type: ignore[misc]
-        raise type(error)(told) from None
+    return run(*design_request(model, **asked), progress=progress or _silent)
 
 
 def design_request(
@@ -216,8 +198,10 @@ def design_request(
     search = {name: asked.pop(name) for name in of_the_search if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
-    cell = replace(cell, design=_design_of(cell, asked))
-    cell.check()
+    named = tuple(name for name, given in asked.items() if given is not None)
+    with options_given(named):
+        cell = replace(cell, design=_design_of(cell, asked))
+        cell.check()
     for number in curve:
         check_levels(cell, "curve", whole("curve", number))
     if asked.get("poses") is not None:
@@ -238,7 +222,7 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins,
+        **search, fixed=_names("fixed", fixed), done=done, notes=notes, pins=pins, asked=named,
         prior=_gaussian(prior) if stated is None else stated, curve=tuple(sorted({*curve})),
     )  # fmt: skip
     return cell, options
@@ -278,12 +262,9 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     told = "a target or a time asks for the number of poses; drop one"
     require(len(wishes) < 2, f"{' and '.join(map(option, wishes))}: {told}")
     if "levels" in chosen:
-        require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen.setdefault("per_level", ())
     for key, other in (("elsewhere", "elsewhere_cap"), ("elsewhere_cap", "elsewhere")):
         if key in chosen:
-            told = f"{option(key)} and {option(other)} both say what the rest is worth; drop one"
-            require(not (chosen[key] and chosen.get(other)), told)
             chosen.setdefault(other, None)
     motion = {k: chosen.pop(k) for k in ("load_changes", "reference_every") if k in chosen}
     if motion:
@@ -380,7 +361,7 @@ def simulated(
     from elastocal.identification.start import check_limits
     from elastocal.measurements import Measurements
     from elastocal.model.arm import given_force
-    from elastocal.simulation import draw_errors, expand_plan, values_from
+    from elastocal.simulation import NOMINAL, draw_errors, expand_plan, values_from
     from elastocal.simulation import simulate as run
 
     force = given_force(load)
@@ -406,7 +387,11 @@ def simulated(
             f"{option('values')} takes {len(made.parameters)} finite numbers, one per parameter, "
             f"or some of them by name; found an array of shape {x.shape}",
         )
-    read = run(made, rows, x, rng, noise=noise)
+    of_the_draw = (
+        f"those of {option('draw')} are of an arm for the loads that the cell plans ([design] "
+        f"loads_N): simulate a load like these, state larger ones there, or give {option('values')}"
+    )
+    read = run(made, rows, x, rng, noise, of_the_draw if drawn else NOMINAL)
     # Up to here rows are lines of the plan, which messages name.
     return replace(read, row=np.arange(len(read)) + 2), x
 

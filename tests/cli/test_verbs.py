@@ -46,7 +46,7 @@ def test_the_backend_is_what_models_use_and_what_results_state(
     "words",
     [
         "identify data.csv cell.toml", "diagnose data.parquet cell.toml", "design plan.csv -o p",
-        "simulate plan.csv cell.toml -o d.csv", "next data.csv cell.toml -o n.csv",
+        "simulate plan.csv cell.toml -o d.csv -q", "next data.csv cell.toml -o n.csv",
         "compensate result.json cell.toml --target 1,2,3", "export result.json cell.toml -o a.urdf",
         "compare old.json new.json cell.toml", "effects data.csv",
     ],

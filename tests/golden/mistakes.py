@@ -100,8 +100,8 @@ CELL = (
     Mistake("a wrong length", FIT, "placed.toml", "[0.2, 0.05, 0.1]", "[0.2, 0.05]"),
     Mistake("an unknown way to observe", FIT, "placed.toml", '"position"', '"postion"'),
     Mistake("no robot's file", FIT, "placed.toml", '"arm.urdf"', '"leg.urdf"'),
-    Mistake("a flange that is no link", FIT, "placed.toml", 'base = "base_link"',
-            'flange = "flnge"'),
+    Mistake("distances from nowhere", DEFLECT, "deflecting.toml", '"deflection"', '"distance"'),
+    Mistake("a flange is no link", FIT, "placed.toml", 'base = "base_link"', 'flange = "flnge"'),
     Mistake("a URDF that does not parse", FIT, "arm.urdf", "</robot>", ""),
     Mistake("a URDF with a loop", FIT, "arm.urdf", "</robot>",
             '<joint name="again" type="fixed"><parent link="link_5"/><child link="link_2"/></joint>'
@@ -156,6 +156,7 @@ OPTIONS = (
     Mistake("an empty argument", f"{FIT} --report ''"),
     Mistake("no file of knowledge", f"{DEFLECT} --knowledge none.toml"),
     Mistake("a method without constraints", f"{DEFLECT} --physical --method huber"),
+    Mistake("a draw for smaller loads", "simulate placed.toml placed.csv -o o.csv --draw 1e6"),
     Mistake("no file of a covariance", f"{DEFLECT} --covariance noise.csv"),
     Mistake("a folder as a covariance", f"{DEFLECT} --covariance study"),
     Mistake("a covariance of two rows", f"{DEFLECT} --weights covariance --covariance links.csv",

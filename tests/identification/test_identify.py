@@ -25,6 +25,7 @@ from support.robots import packaged_urdf
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.identify import identify
+from elastocal.identification.mistakes import nominal_fit
 from elastocal.identification.solve import reduce
 from elastocal.model.manipulator import Model
 from elastocal.model.urdf import read_urdf
@@ -83,7 +84,9 @@ def test_pose_observation(stated):
     assert_one_arm_is_covered(result, truth)
     assert len(result.residual) == 180
     with pytest.raises(InsufficientDataError, match=r"rotations are .*check the order of qw"):
-        identify(model, replace(table, rotation=-table.rotation))  # the other way round
+        identify(model, turned := replace(table, rotation=-table.rotation))  # the other way round
+    at_import = (nominal_fit(chain, model.cell, one) for one in (table, turned))
+    assert [fit is not None and "of qw" in fit.warning for fit in at_import] == [False, True]
 
 
 def test_distance_observation():

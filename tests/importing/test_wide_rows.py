@@ -98,10 +98,10 @@ def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path, 
 
 
 def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_path):
-    rows = ["q1_deg,q2_deg,payload_kg,M1_x_mm,M1_y_mm,M1_z_mm", "1,2,0,3,4,5", "6,7,2.5,8,9,10"]
-    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    head = "q1_deg,q2_deg,payload_kg,time,M1_x_mm,M1_y_mm,M1_z_mm"
+    (tmp_path / "log.csv").write_text(f"{head}\n1,2,0,0,3,4,5\n6,7,2.5,9,8,9,10\n")
     done = run(tmp_path / "log.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == 0 and "column 'time' states no unit" in done.output, done.output
     forces = [float(row["force_z_N"]) for row in table(tmp_path / "data.csv")]
     assert forces == pytest.approx([0.0, -2.5 * 9.80665])
     mapping, out = tmp_path / "map.toml", tmp_path / "data.csv"

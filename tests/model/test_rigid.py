@@ -26,9 +26,9 @@ def test_slides_alone_reach_as_far_as_all_of_them_go() -> None:
     place = np.eye(4)
     place[:3, 3] = 0.0, 0.0, 0.1
     joints = [Joint(f"joint{i}", "prismatic", place, np.eye(3)[0], 0.0, 2.0) for i in range(4)]
-    slides = reach_of(Chain("gantry", tuple(joints), np.eye(4)))
-    assert 6.2 < slides < np.hypot(8.0, 0.3)
+    assert 6.2 < reach_of(Chain("gantry", tuple(joints), np.eye(4))) < np.hypot(8.0, 0.3)
     turning = replace(joints[1], kind="revolute", axis=np.array([0.0, 0.0, 1.0]))
+    assert reach_of(Chain("with a wrist", (*joints[:3], turning), np.eye(4))) > 4.5
     assert reach_of(Chain("rail", (joints[0], turning, *joints[2:]), np.eye(4))) < 4.1
 
 

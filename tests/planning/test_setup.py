@@ -137,7 +137,7 @@ def test_a_vertical_load_does_not_show_the_compliance_of_a_vertical_joint() -> N
     ("chain", "cell"),
     [
         (CHAIN, plan_cell((*FULL, "marker_orientation"), "pose", loads=BOTH)),
-        (CHAIN, plan_cell(("distance_sensor", *FULL), "distance", loads=BOTH, criterion="D")),
+        (CHAIN, plan_cell(("distance_sensor", *FULL), "distance", loads=BOTH)),
         (scara(), any_cell(scara(), FULL, loads=BOTH / 20)),
     ],
     ids=["full poses", "distances", "scara"],

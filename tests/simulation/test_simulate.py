@@ -68,8 +68,7 @@ def test_drawn_errors_have_the_typical_sizes():
         size = 0.2 * p.nominal if p.effect == "joint_compliance" else p.typical
         z = np.array([d[p.name] - p.nominal for d in draws]) / (2.0 * size)
         assert low < (z**2).sum() < high, p.name
-    again = draw_errors(model, 2.0, np.random.default_rng(0))
-    assert again == draws[0]
+    assert draw_errors(model, 2.0, np.random.default_rng(0)) == draws[0]
     assert draw_errors(model, 0.0, rng) == dict(zip(model.names, model.nominal, strict=True))
 
 

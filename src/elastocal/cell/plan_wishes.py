@@ -26,7 +26,6 @@ from elastocal.config import (
     existing_file,
     fields_of,
     file_key,
-    header,
     joint_values,
     key,
     keyed,
@@ -36,7 +35,7 @@ from elastocal.config import (
     stated,
     turn_key,
 )
-from elastocal.errors import require
+from elastocal.errors import require, wish
 from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]
@@ -119,8 +118,8 @@ class TargetBox:
         k = int(np.argmin(self.lower < self.upper))
         require(
             bool(self.lower[k] < self.upper[k]),
-            f"{header(('design', 'test_box'))} takes lower_m < upper_m in x, y and z; found "
-            f"{self.lower[k]:g} and {self.upper[k]:g} in {'xyz'[k]}; swap or correct them",
+            f"{wish('test_box', '[design.test_box]')} takes lower_m < upper_m in x, y and z; "
+            f"found {self.lower[k]:g} and {self.upper[k]:g} in {'xyz'[k]}; swap or correct them",
         )
 
 
@@ -190,7 +189,7 @@ class Freedom:
         for name, box in (*boxes, ("load_point_m", self.load_point), ("tracker_m", self.tracker)):
             require(
                 box is None or bool((box[0] <= box[1]).all()),
-                f"{header(('design', 'choose'))} {name} takes the lower corner and then the upper; "
+                f"[design.choose] {name} takes the lower corner and then the upper; "
                 "swap or correct them",
             )
 
@@ -284,21 +283,21 @@ class DesignSpec:
     choose: Freedom | None = keyed("a table headed [design.choose]", default=None)
 
     def __post_init__(self) -> None:
-        joints = " and ".join(self.levels)
+        joints, levels = " and ".join(self.levels), wish("levels", "[design.levels]")
         require(
             len(self.levels) < 2,
-            f"[design.levels] has levels of {joints}; only one joint can have levels: keep one, "
-            "and narrow the others in [limits]",
+            f"{levels} has levels of {joints}; only one joint can have levels: keep one, and "
+            "narrow the others in [limits]",
         )
         for joint, values in self.levels.items():
             require(
                 len(set(values)) == len(values),
-                f"[design.levels] repeats a level of {joint}; give each once",
+                f"{levels} repeats a level of {joint}; give each once",
             )
         require(
             self.loads is None or len(np.unique(self.loads, axis=0)) == len(self.loads),
-            "key design.loads_N repeats a load; give each once ([design] repeats says how often "
-            "each is read)",
+            f"{wish('loads', 'key design.loads_N')} repeats a load; give each once ([design] "
+            "repeats says how often each is read)",
         )
         require(
             self.minutes is None or self.target is None,
@@ -306,12 +305,13 @@ class DesignSpec:
         )
         require(
             not self.combination or any(self.combination.values()),
-            "key design.combination has no factor other than zero; give the combination of "
-            "parameters that is to be known well",
+            f"{wish('combination', 'key design.combination')} has no factor other than zero; "
+            "give the combination of parameters that is to be known well",
         )
         require(
             not (self.elsewhere and self.elsewhere_cap),
-            "keys design.elsewhere and design.elsewhere_cap both say what the joint ranges are "
+            f"{wish('elsewhere', 'keys design.elsewhere')} and "
+            f"{wish('elsewhere_cap', 'design.elsewhere_cap')} both say what the joint ranges are "
             "worth beside the test poses; drop one",
         )
 

@@ -38,7 +38,6 @@ from elastocal.config import (
     fields_of,
     file_key,
     from_table,
-    header,
     joint_values,
     key,
     keyed,
@@ -48,7 +47,7 @@ from elastocal.config import (
     record,
     stated,
 )
-from elastocal.errors import check_known, require
+from elastocal.errors import check_known, require, wish
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import is_label, listed, quoted
@@ -502,16 +501,19 @@ class Cell:
                 there is none of.
         """
         where, sight = self.source, self.workspace.visibility
-        self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
+        normals = f"{where}: [workspace.visibility.normals]"
+        self._check_markers(normals, sight.normals if sight else ())
         least = None if sight is None else sight.min_markers
         require(
             least is None or least <= len(self.tool.markers),
             f"{where}: key workspace.visibility.min_markers is {least}, but [tool.markers_m] has "
             f"{listed(self.tool.markers) or 'none'}; ask for fewer",
         )
-        self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
+        sigmas = wish("marker_sigma", f"{where}: [design.marker_sigma_um]")
+        self._check_markers(sigmas, self.design.marker_sigma)
         freedom = self.design.choose
-        self._check_markers(("design", "choose", "markers_m"), freedom.markers if freedom else ())
+        chosen = f"{where}: [design.choose.markers_m]"
+        self._check_markers(chosen, freedom.markers if freedom else ())
         require(
             not self.workspace.urdf_geometry or self.robot.urdf is not None,
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '
@@ -523,11 +525,11 @@ class Cell:
                 told = f"{told} {quoted(choice.name)}"
                 check_known(choice.name, tuple(known_effects), told, "known effects:")
 
-    def _check_markers(self, table: tuple[str, ...], names: Iterable[str]) -> None:
+    def _check_markers(self, table: str, names: Iterable[str]) -> None:
         markers = tuple(self.tool.markers)
         for name in names:
-            told = f"{self.source}: {header(table)} names {quoted(name)}, which is no marker of the"
-            check_known(name, markers, f"{told} cell", "[tool.markers_m] has")
+            told = f"{table} names {quoted(name)}, which is no marker of the cell"
+            check_known(name, markers, told, "[tool.markers_m] has")
 
 
 read_cell = Cell.read

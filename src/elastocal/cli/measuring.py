@@ -26,7 +26,7 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, require, said_of
 from elastocal.screen import interrupts, say
 from elastocal.text import listed
 
@@ -198,7 +198,7 @@ def design(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
     )  # fmt: skip
-    with run.progress() as progress, verbs.options_named(asked):
+    with run.progress() as progress:
 
         def chosen(path: Path) -> None:
             from elastocal.diagnosis.diagnose import write_extended_cell
@@ -268,9 +268,10 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
         hung = f"with the loads of its note_load ({names}), "
         carried = f" --load {' '.join(f'{value:g}' for value in loads[0])}"
     added = "" if augment is None else f" (add them to {augment})"
+    read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
     return (
-        f"Next: measure {output} in its order, {hung}a row with x_mm, y_mm, z_mm for each "
-        f"marker{added}; then\n"
+        f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
+        "then\n"
         f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
         f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
         f"{carried}"
@@ -295,15 +296,13 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
 
     written, chain = dict[Path, str](), load_chain(cell)
     for path in paths:
-        try:
+        with said_of(f"--program {path}"):
             check_six_axes(chain, LANGUAGES[path.suffix.lower()][0])
             if plan is not None:
                 written[path] = robot_program(
                     path.suffix, plan.execution, chain, plan.configurations, plan.forces,
                     joint_limits(cell, chain), path.stem,
                 )  # fmt: skip
-        except InputError as error:
-            raise InputError(f"--program {path}: {error}") from None
     return written
 
 
@@ -314,7 +313,6 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     short_help="Simulate the measurements of a plan",
     verb=verbs.simulate,
     offers="draw load repeats seed",
-    flags="plugins json",
 )
 def simulate(
     cell: CellFile,

@@ -167,7 +167,7 @@ def next_poses(
         sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
     cell = replace(model.cell, design=spec)
     cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
-    options = DesignOptions("batch", seed, jobs, done=table, notes=notes)
+    options = DesignOptions("batch", seed, jobs, done=table, notes=notes, hold=True)
     plan = design(cell, options, progress=tell)
     assert plan.gain is not None  # the criterion has test poses
     own = plan.gain.sure

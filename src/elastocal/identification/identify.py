@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from elastocal.errors import ElastocalError, option
+from elastocal.errors import ElastocalError, option, said_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged
 from elastocal.identification.knowledge import Constraints
@@ -562,7 +562,8 @@ def run_method(course: Course) -> MethodResult:
     if options.knows:
         from elastocal.identification.knowledge_fit import fit_with_knowledge  # few state any
 
-        return fit_with_knowledge(found, options, course.progress)
+        with said_of(options.constraints.source if options.constraints else option("prior")):
+            return fit_with_knowledge(found, options, course.progress)
     return found if smooth else with_limits(course.every, found, options)
 
 

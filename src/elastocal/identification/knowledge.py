@@ -28,7 +28,7 @@ from elastocal.config import (
     read_toml,
     record,
 )
-from elastocal.errors import InputError, option, require
+from elastocal.errors import InputError, option, require, said_of
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array
@@ -225,16 +225,17 @@ class SemidefiniteMatrix:
 
 @dataclass(frozen=True)
 class Constraints:
-    """Any number of each kind; `a + b` holds both."""
+    """Any number of each kind, and for messages where they were stated; `a + b` holds both."""
 
     bounds: tuple[Bounds, ...] = ()
     equalities: tuple[LinearEquality, ...] = ()
     matrices: tuple[SemidefiniteMatrix, ...] = ()
+    source: str = field(default="constraints", compare=False)
 
     def __add__(self, other: Constraints) -> Constraints:
         return Constraints(
             self.bounds + other.bounds, self.equalities + other.equalities,
-            self.matrices + other.matrices,
+            self.matrices + other.matrices, self.source,
         )  # fmt: skip
 
     def resolve(self, names: Sequence[str]) -> System:
@@ -431,10 +432,8 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
 
 def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> GaussianPrior | None:
     means, std = ([getattr(p, key) for p in tables.values()] for key in ("mean", "std"))
-    try:
+    with said_of(spot.path):
         return GaussianPrior.independent(tuple(tables), means, std) if tables else None
-    except InputError as error:
-        raise InputError(f"{spot.path}: {error}") from None
 
 
 @record
@@ -470,8 +469,10 @@ class Knowledge:
 
     @classmethod
     def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, Any]:
-        tables = (tuple(table.get(name, ())) for name in ("bounds", "equality", "semidefinite"))
-        return {"constraints": Constraints(*tables), "source": str(spot.path)}
+        kinds = ("bounds", "equality", "semidefinite")
+        bounds, equalities, matrices = (tuple(table.get(kind, ())) for kind in kinds)
+        constraints = Constraints(bounds, equalities, matrices)
+        return {"constraints": constraints, "source": str(spot.path)}
 
     def of(self, model: Model) -> tuple[Constraints, GaussianPrior | None]:
         """Constraints and prior on the model's parameters.
@@ -486,13 +487,11 @@ class Knowledge:
             finite = (p for p in model.parameters if np.isfinite([p.lower, p.upper]).any())
             own = tuple(Bounds(p.name, p.lower, p.upper) for p in finite)
             constraints = Constraints(own) + constraints
-        try:
+        with said_of(self.source):
             constraints.resolve(model.names)
             if self.prior is not None:
                 self.prior.rows(model.names)
-        except InputError as error:
-            raise InputError(f"{self.source}: {error}") from None
-        return constraints, self.prior
+        return replace(constraints, source=self.source), self.prior
 
 
 def read_knowledge(path: str | Path) -> Knowledge:

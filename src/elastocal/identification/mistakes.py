@@ -15,6 +15,7 @@ from itertools import combinations, product
 
 import numpy as np
 from scipy import special
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
@@ -75,7 +76,7 @@ def nominal_fit(
         if mixed is not None:
             return NominalFit(error, mixed.words.removesuffix("."), True)
     if far <= POOR:
-        return NominalFit(error, "")
+        return NominalFit(error, rotations_off(_turns(rigid, table), "the nominal arm"))
     near, best = far, ""
     # The simplest that mends it, else what does most.
     of_columns = _of_columns(chain, _some(table), spherical)
@@ -111,6 +112,32 @@ def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     place = found.places(model.rigid.flange_poses(table), table.marker)
     distance = np.linalg.norm(np.asarray(table.position) - place, axis=1)
     return found.error, float(np.percentile(distance, MOST))
+
+
+def _turns(model: Model, table: Measurements) -> Array:
+    """Angles (n,) in rad of the rotations from the nominal arm's, each target mounted as it is on
+    average; none where there are no rotations."""
+    if table.rotation is None:
+        return np.zeros(0)
+    table = _some(table)
+    found, flange = Registration.of(model, table), model.rigid.flange_poses(table)
+    arm = Rotation.from_matrix(found.rotation @ flange[:, :3, :3])
+    mounted = arm.inv() * Rotation.from_rotvec(np.asarray(table.rotation))
+    of = [mounted[table.marker == m] for m in np.unique(table.marker)]
+    return np.concatenate([(turn.mean().inv() * turn).magnitude() for turn in of])
+
+
+def rotations_off(angles: Array, of: str) -> str:
+    """What rotations that are these angles in rad from those `of` an arm let suspect; "" where they
+    are its own."""
+    angle = float(np.median(angles)) if len(angles) else 0.0
+    if angle <= POOREST:
+        return ""
+    return (
+        f"the rotations are {np.degrees(angle):.3g}° (median) from {of}; check the order of qw, "
+        "qx, qy, qz (rx, ry, rz are a rotation vector, not Euler angles), and that they turn the "
+        "target's axes into the tracker's"
+    )
 
 
 # Joint values as a controller may count them.  Its c become the model's q by signs, offsets, an
@@ -404,12 +431,11 @@ def refuse_nonsense(
     beyond = [(p.name, v) for p, v in zip(model.parameters, x, strict=True)
               if p.unit == "m" and not abs(v) <= LARGEST * (length + reach)]  # fmt: skip
     sane = max(fitted) <= POOREST * length and share <= FEW and not beyond
-    if (angle := float(np.median(turned))) > POOREST and (sane or _placed(model, every)):
+    wrong = rotations_off(turned, "the model")
+    if wrong and (sane or _placed(model, every)):
         raise InsufficientDataError(
-            f"{table.source}: after the fit the rotations are {np.degrees(angle):.3g}° (median) "
-            "from the model; check the order of qw, qx, qy, qz (rx, ry, rz are a rotation vector, "
-            "not Euler angles), and that they turn the target's axes into the tracker's; for a "
-            "target mounted at an angle fit marker_orientation"
+            f"{table.source}: after the fit {wrong}; for a target mounted at an angle fit "
+            "marker_orientation"
         )
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return

@@ -9,8 +9,10 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -349,9 +351,55 @@ def import_files(
     where, table = mapping
     chain = None if cell is None else load_chain(cell)
     names = () if chain is None else tuple(joint.name for joint in chain.joints)
+    by_role, understood, spherical = _by_role(where, files, table, names)
+    told = [doubt for own in by_role.values() for records in own for doubt in records.doubts]
+    by_role, warnings = with_loads_of_names(by_role, table.loads)
+    points = joining.pooled(by_role["points"])
+    log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
+    joined = None
+    if log is not None:
+        if not log.q.shape[1]:
+            raise InputError(
+                f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
+            )
+        joined = joining.join(points, log, table.join)
+        points = _with_joint_values(points, log, joined)
+    columns, kinds, doubts = assemble(where, points, table)
+    # Numbers with the digits that read back exactly.
+    cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
+             for values in columns.values()]  # fmt: skip
+    text = csv_text(columns, zip(*cells, strict=True))
+    read = partial(read_measurements, f"{name} (not written)", text=text)
+    with _placed(points):  # as the reader of `identify` reads it, and as the cell asks for it
+        if cell is None or chain is None:
+            observe = "position" if any(c.startswith("x_") for c in columns) else "distance"
+            measured = read(joint_kinds=kinds, marker_names=(), observe=observe)
+        else:
+            markers, observe = tuple(cell.tool.markers), cell.model.observe
+            measured = read(joint_kinds=chain.kinds, marker_names=markers, observe=observe)
+    fit, refused = None, ""
+    if cell is not None and chain is not None:
+        refused = beyond_limits(cell, chain, measured, columns)
+        fit = nominal_fit(chain, cell, measured, spherical)
+    warnings += [
+        *told,
+        *(() if joined is None else joined.warnings),
+        *doubts,
+        *plausibility(columns, measured, None if cell is None else cell.model.observe),
+    ]
+    warnings += [fit.warning] if fit is not None and fit.warning else []
+    return Imported(
+        tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
+    )
+
+
+def _by_role(
+    where: str, files: Sequence[Path], table: MappingTable, names: tuple[str, ...]
+) -> tuple[dict[str, list[Records]], list[dict[str, Any]], bool]:
+    """The records of each file among "points" or "joints", what is to be told of each file, and
+    whether any states angles in the place of positions; `names` of the cell's joints."""
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
-    understood = []
-    spherical = False
+    understood, spherical = [], False
     for path, source in _assigned(where, files, table.source or ()):
         found = joining.with_labels(
             where, read_records(where, path, source, table.units), source.names
@@ -369,48 +417,18 @@ def import_files(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
             'export, or set role = "points" in its [[source]]'
         )
-    by_role, warnings = with_loads_of_names(by_role, table.loads)
-    points = joining.pooled(by_role["points"])
-    log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
-    joined = None
-    if log is not None:
-        if not log.q.shape[1]:
-            raise InputError(
-                f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
-            )
-        joined = joining.join(points, log, table.join)
-        points = _with_joint_values(points, log, joined)
-    columns, kinds, doubts = assemble(where, points, table)
-    # Numbers with the digits that read back exactly.
-    cells = [[repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
-             for values in columns.values()]  # fmt: skip
-    text = csv_text(columns, zip(*cells, strict=True))
-    observe = "position" if any(c.startswith("x_") for c in columns) else "distance"
-    try:  # as the reader of `identify` reads it, and as the cell asks for it
-        measured = read_measurements(
-            f"{name} (not written)",
-            joint_kinds=kinds if chain is None else chain.kinds,
-            marker_names=() if cell is None else tuple(cell.tool.markers),
-            observe=observe if cell is None else cell.model.observe,
-            text=text,
-        )
-    except InputError as error:  # of a line of the table, and where that came from
+    return by_role, understood, spherical
+
+
+@contextmanager
+def _placed(points: Records) -> Iterator[None]:
+    """Within it an error in a line of the table says where that line came from."""
+    try:
+        yield
+    except InputError as error:
         row = int(line[1]) - 2 if (line := re.search(r"line (\d+)", str(error))) else -1
         told = f" (from {points.where(row)})" if 0 <= row < len(points) else ""
         raise InputError(f"{error}{told}") from None
-    fit, refused = None, ""
-    if cell is not None and chain is not None:
-        refused = beyond_limits(cell, chain, measured, columns)
-        fit = nominal_fit(chain, cell, measured, spherical)
-    warnings += [
-        *(() if joined is None else joined.warnings),
-        *doubts,
-        *plausibility(columns, measured, None if cell is None else cell.model.observe),
-    ]
-    warnings += [fit.warning] if fit is not None and fit.warning else []
-    return Imported(
-        tuple(understood), columns, joined, text, measured, tuple(warnings), fit, refused
-    )
 
 
 def _with_joint_values(points: Records, log: Records, joined: Joined) -> Records:

@@ -424,7 +424,8 @@ class Records:
     configuration, marker, repeat, load) → n texts; `load` of all rows, where one is stated.
     `understood` says for people what was made of the file, by the keys of the command's JSON:
     `columns` are (its name in the file, column of the measurement table, unit), `unused` names of
-    the file's other columns, `ignored` (line, reason) of everything passed over.
+    the file's other columns, `ignored` (line, reason) of everything passed over; `doubts`: what to
+    warn of.
     """
 
     file: list[str]
@@ -434,6 +435,7 @@ class Records:
     texts: dict[str, list[str]]
     understood: dict[str, Any]
     load: str | None = None
+    doubts: Sequence[str] = ()
 
     def __len__(self) -> int:
         return len(self.line)
@@ -536,6 +538,8 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         )
         for marker in mapping_file.markers_of_row(name, asked, table.header) or [""]
     }
+    no_unit = {c.header: c for own in columns.values() for c in own if c.unit == mapping_file.AUTO}
+    columns = {m: tuple(c for c in own if c.header not in no_unit) for m, own in columns.items()}
     every = [c for own in columns.values() for c in own]
     cells = NumberCells(
         settings.decimal, settings.thousands, settings.missing,
@@ -569,7 +573,9 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
                         if i - 1 not in used),
         "rows": len(kept), "ignored": tuple(sorted({*table.ignored, *ignored})),
     }  # fmt: skip
-    return Records([name] * len(line), line, numbers, of, texts, understood, source.load)
+    told = f"{name}: column %r states no unit and is not read; name it with one, as %s [%s]"
+    doubts = [told % (n, c.stem, next(iter(FACTORS[c.quantities[0]]))) for n, c in no_unit.items()]
+    return Records([name] * len(line), line, numbers, of, texts, understood, source.load, doubts)
 
 
 def _rows(

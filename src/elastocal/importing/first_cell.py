@@ -272,7 +272,7 @@ REST = """\
 sigma_um = 15                          # guess; or range_um, range_ppm, transverse_um, …
 
 [model]
-observe = "position"                   # or deflection, pose, distance
+observe = "position"                   # or deflection, pose, distance (with "distance_sensor")
 # What is fitted; elastocal effects lists all that can be.
 effects = [
     {effects}

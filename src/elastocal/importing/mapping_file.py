@@ -28,7 +28,7 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError, check_known, option
+from elastocal.errors import InputError, check_known, option, said_of
 from elastocal.measurements import families
 from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
@@ -204,10 +204,8 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
     name = source.get("preset")
     if name is None:
         return source
-    try:
+    with said_of(where):
         base = tomllib.loads(preset_text(name))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
     # x_mm of the user replaces the preset's x_auto, whichever table either stands in.
     own = source.get("columns", {}) | source.get("optional", {})
     taken = {_UNIT.sub("", column) for column in own} | set(own)
@@ -268,6 +266,11 @@ class ColumnKey:
     def of_each_marker(self) -> bool:
         """Whether one row has such a column for each marker."""
         return EACH in str(self.at[0])
+
+    @property
+    def spare(self) -> bool:
+        """Whether readings can do without it: optional, and neither place, joint nor load."""
+        return not self.required and self.quantities[0] in ("time", "temperature")
 
     def of_marker(self, name: str) -> ColumnKey:
         if not self.of_each_marker:
@@ -407,14 +410,15 @@ def resolve(
 
     `header`: names of the columns, () without a header; `width`: cells of the first row;
     `units`: for columns whose key ends in _auto where neither the header nor `hint`, the unit
-    that a comment of the file states, says one.
+    that a comment of the file states, says one.  Times and temperatures that are optional have
+    the unit AUTO where nothing says it.
     """
     columns: list[ColumnKey] = []
     for target in asked:
         if (found := _column(source, target, header, width)) is not None:
             columns.append(_with_unit(source, found, units, hint))
     unstated = {c: column(c.stem, next(iter(FACTORS[c.quantities[0]]))) for c in columns
-                if c.unit == AUTO}  # fmt: skip
+                if c.unit == AUTO and not c.spare}  # fmt: skip
     if not unstated:
         return tuple(columns)
     needed = [*dict.fromkeys(option(f"{q}_unit", unit) for c in unstated

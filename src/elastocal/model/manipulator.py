@@ -21,6 +21,7 @@ from elastocal.model.arm import Parameter, given_force, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
 from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
+from elastocal.model.effects.placements import DistanceSensor
 from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
@@ -96,6 +97,7 @@ class Model(ByValue):
         self._markers_stated = bool(cell.tool.markers)
         if not self._markers_stated:
             cell = _with_markers(cell, tuple(markers) or (DEFAULT_MARKER,))
+        _check_distances(cell)
         chain = load_chain(cell)
         self._assemble(chain, numbered(cell, chain), (), backend)
 
@@ -460,19 +462,37 @@ class Model(ByValue):
         return self._symbolic.frames(*inputs, x, self._symbolic.equilibrium(inputs, x)[0])
 
 
-def check_equilibrium(table: Measurements, predicted: Array) -> None:
+NOMINAL = "check force_*_N and [model.nominal] joint_compliance, which is in rad/(N m)"
+
+
+def check_equilibrium(table: Measurements, predicted: Array, remedy: str = NOMINAL) -> None:
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
     if len(bad):
         raise InputError(
             f"{table.source}, line {table.row[bad[0]]}: no static equilibrium under this load "
-            f"({len(bad)} rows); the compliances are too large for the force: check force_*_N "
-            "and [model.nominal] joint_compliance, which is in rad/(N m)"
+            f"({len(bad)} rows); the compliances are too large for the force: {remedy}"
         )
 
 
 def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
     # All nominally at the flange's origin.
     return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
+
+
+def _check_distances(cell: Cell) -> None:
+    """Distances are from somewhere: a place that is stated, or that a fitted effect finds."""
+    base, effects = (
+        cell.model.nominal.base_position,
+        (effect_of(c.name) for c in cell.model.effects),
+    )
+    placed = cell.tracker.anchor is not None or (base is not None and bool(base.any()))
+    found = placed or any(each.registered and each.at != "markers" for each in effects)
+    require(
+        cell.model.observe != "distance" or found,
+        f'{cell.source}: key model.observe = "distance" needs the place that distances are from; '
+        f'add "{DistanceSensor.name}" to [model] effects, which finds it, or state [tracker] '
+        "anchor_m = [x, y, z] in the data's frame",
+    )
 
 
 def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.model.chain import Chain, finite_ranges
+from elastocal.model.chain import MIN_JOINTS, Chain, finite_ranges
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array, IntArray
 
@@ -118,12 +118,15 @@ def nominal_flanges(chain: Chain, q: Array) -> Array:
 
 def reach_of(chain: Chain) -> float:
     """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
-    poses.  Slides before it, as a rail, stand still."""
+    poses.  What carries an arm, as a rail, stands still: a slide before it, or several before as
+    many joints as an arm has; a gantry's slides move."""
     limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
     low, high = finite_ranges(chain, *limits)
     q = np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
     turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
     first = turning[0] if turning else 0
+    if first > 1 and chain.n_joints - first < MIN_JOINTS:
+        first = 0
     q[:, :first] = (low + high)[:first] / 2
     symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
     frames = [base, *nominal_frames(chain, symbol, base)]

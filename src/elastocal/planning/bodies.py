@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.errors import InputError, check_known, require
+from elastocal.errors import InputError, check_known, require, said_of
 from elastocal.files import check_regular
 from elastocal.model.chain import Chain
 from elastocal.units import Array, pose_at
@@ -113,10 +113,8 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
     import coal
     from scipy.spatial import QhullError
 
-    try:
+    with said_of(f"mesh of body '{name}'"):
         check_regular(path, "mesh", MESH_BYTES)
-    except InputError as error:
-        raise InputError(f"mesh of body '{name}': {error}") from None
     try:
         return outward(np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices()))
     except QhullError:

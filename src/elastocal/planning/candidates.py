@@ -12,7 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, check_known, option, require
+from elastocal.errors import (
+    InputError,
+    InsufficientDataError,
+    check_known,
+    option,
+    require,
+    wish,
+)
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
@@ -247,7 +254,8 @@ def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
         each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
         require(
             len(each) == levels,
-            f"{where} poses_per_level has {len(each)} numbers, but there are {levels} levels",
+            f"{wish('per_level', f'{where} poses_per_level')} has {len(each)} numbers, but there "
+            f"are {levels} levels",
         )
         return np.array(each, dtype=np.int64)
     total = n_poses or spec.poses or DEFAULT

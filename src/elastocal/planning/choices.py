@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError, require, wish
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
@@ -113,15 +113,16 @@ class Choice:
     def best(self) -> Chosen:
         cell = self.work.cell
         where, freedom = cell.source, cell.design.choose
+        named = wish("choose", f"{where}: [design.choose]")
         assert freedom is not None
         require(
             CRITERIA[cell.design.criterion].certifiable,
-            f"{where}: [design.choose] compares relaxed optima, which criterion "
+            f"{named} compares relaxed optima, which criterion "
             f"{cell.design.criterion} has none of; choose another criterion",
         )
         require(
             self.known.done is None,
-            f"{where}: [design.choose] moves what measurements were made with; leave it out where "
+            f"{named} moves what measurements were made with; leave it out where "
             "a plan adds to some",
         )
         boxes = Boxes.of(cell)

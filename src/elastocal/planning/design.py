@@ -15,7 +15,15 @@ from threadpoolctl import threadpool_limits
 
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, check_known, option, require
+from elastocal.errors import (
+    InputError,
+    InsufficientDataError,
+    check_known,
+    option,
+    options_given,
+    require,
+    wish,
+)
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.options import Options
@@ -80,7 +88,8 @@ class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
     `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
     sentences on how these came about, for the plan's warnings; `pins`: poses that stay or are
-    struck out."""
+    struck out; `asked`: options in the place of keys of [design]; `hold`: parameters by which no
+    plan can predict the test poses are held, as identification holds them, and told."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -91,6 +100,8 @@ class DesignOptions:
     curve: tuple[int, ...] = ()
     notes: tuple[str, ...] = ()
     pins: Pins | None = None
+    asked: tuple[str, ...] = ()
+    hold: bool = False
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
@@ -121,6 +132,13 @@ def design(
     on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
+    with options_given(options.asked):
+        return _planned(cell, options, checkpoint, progress)
+
+
+def _planned(
+    cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
+) -> Plan:
     read = options.done.marker_names if options.done else ()
     if options.done is not None and lacks_noise(cell):
         progress("noise of the measurements done")
@@ -176,10 +194,11 @@ class _Design:
         self.feasibility = Feasibility(self.cell, self.chain, None if pins is None else pins.struck)
         if (home := self.cell.design.motion.home) is not None:
             met = self.feasibility.blockers(home, home, False)
+            motion = wish("motion", f"{cell.source}: [design.motion]")
             require(
                 not met,
-                f"{cell.source}: [design.motion] home brings {listed(met)} too close to each "
-                "other; state another home, or correct the bodies and clearances of [workspace]",
+                f"{motion} home brings {listed(met)} too close to each other; state another home, "
+                "or correct the bodies and clearances of [workspace]",
             )
 
     def _leave_out(self) -> None:
@@ -258,7 +277,7 @@ class _Design:
         progress("information of the candidates")
         setup = set_up(
             self.model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen, self.work, options.effort == "batch",
+            region, self.feasibility.seen, self.work, options.hold,
         )  # fmt: skip
         self.warnings += setup.warnings
         if pins is not None and len(pins.q):
@@ -500,19 +519,19 @@ class _Design:
 def _check_criterion(model: Model) -> None:
     cell = model.cell
     where, asked = cell.source, cell.design.criterion
-    needs = criterion_named(asked, f"{where}: key design.criterion").needs
+    needs = criterion_named(asked, wish("criterion", f"{where}: key design.criterion")).needs
+    cap = wish("elsewhere_cap", f"{where}: key design.elsewhere_cap")
     require(
         not cell.design.elsewhere_cap or asked == TEST_POSE,
-        f'{where}: key design.elsewhere_cap goes with criterion = "{TEST_POSE}", not with '
-        f'"{asked}"; drop it',
+        f'{cap} goes with criterion = "{TEST_POSE}", not with "{asked}"; drop it',
     )
     names = cell.design.combination
+    missing = wish("combination", f"{where}: key design.combination")
     require(
         bool(names) or "combination" not in needs,
-        f'{where}: key design.combination is missing; beside criterion = "{asked}" it takes '
-        "factors by parameter, as in "
+        f'{missing} is missing; beside criterion = "{asked}" it takes factors by parameter, as in '
         f'combination = {{ "{next(iter(model.names), "joint2.compliance")}" = 1.0 }}',
     )
     for name in names:
-        told = f"{where}: [design] combination names {quoted(name)}, which is no parameter of the"
-        check_known(name, model.names, f"{told} model")
+        told = f"{wish('combination', f'{where}: [design] combination')} names {quoted(name)}"
+        check_known(name, model.names, f"{told}, which is no parameter of the model")

@@ -16,7 +16,7 @@ from scipy import linalg
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import require
+from elastocal.errors import require, wish
 from elastocal.identification.noise_structure import course_waves
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
@@ -122,11 +122,11 @@ def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> l
     heavy = [state for state in used if loaded[state]]
     if not heavy:
         return free[:1]
-    least = len(heavy) + 1
+    least, key = len(heavy) + 1, wish("load_changes", "[design.motion] load_changes")
     require(
         changes is None or changes >= least,
-        f"[design.motion] load_changes is {changes}, but the loads are hung, exchanged and taken "
-        f"off {least} times at least; allow {least}, or plan fewer loads",
+        f"{key} is {changes}, but the loads are hung, exchanged and taken off {least} times at "
+        f"least; allow {least}, or plan fewer loads",
     )
     changes = changes or least
     if len(heavy) == 1:

@@ -13,7 +13,7 @@ from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import CartesianNoise
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, check_known, option, require
+from elastocal.errors import InsufficientDataError, check_known, option, require, wish
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.noise_structure import (
@@ -71,19 +71,22 @@ def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
     if not stated:
         return table
     missing = [name for name in table.marker_names if name not in stated]
+    sigmas = wish("marker_sigma", f"{cell.source}: [design] marker_sigma_um")
     require(
         not missing,
-        f"{cell.source}: [design] marker_sigma_um states no σ for marker "
-        f"{quoted(missing[0]) if missing else ''}; state one for every marker",
+        f"{sigmas} states no σ for marker {quoted(missing[0]) if missing else ''}; state one for "
+        "every marker",
     )
     sigma = np.array([stated[name] for name in table.marker_names])[table.marker]
     return replace(table, sigma=np.repeat(sigma[:, None], 3, axis=1), sigma_frame="cartesian")
 
 
 def _no_noise(cell: Cell) -> str:
+    keys = "sigma_um, range_um and transverse_um, or distance_um"
     return (
-        f"{cell.source}: a plan needs the noise of a reading; state [tracker] sigma_um, range_um "
-        "and transverse_um, or distance_um, as the instrument's data sheet says"
+        f"{cell.source}: a plan needs the noise of a reading; state [tracker] "
+        f"{'distance_um' if cell.model.observe == 'distance' else keys}, as the instrument's data "
+        "sheet says"
     )
 
 
@@ -94,10 +97,9 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
     """
     cell = model.cell
     kind = available_noise(observed.table, cell.tracker)
-    require(
-        kind != "none" or (observed.kind == "distance" and cell.tracker.distance_sigma is not None),
-        _no_noise(cell),
-    )
+    if observed.kind == "distance":
+        kind = "none" if cell.tracker.distance_sigma is None else "axis"
+    require(kind != "none", _no_noise(cell))
     single, spec = stated_covariance(observed, cell.tracker, kind)[0], cell.design
     if (dof := cell.noise.tails) is None:
         return single
@@ -292,7 +294,7 @@ class Estimable:
         interest`, by default all but base and markers."""
         model, wanted = self.model, self.model.cell.design.interest
         kept = [model.parameters[c] for c in self.columns]
-        where = f"{model.cell.source}: [design] interest"
+        where = wish("interest", f"{model.cell.source}: [design] interest")
         if not wanted:
             own = [k for k, p in enumerate(kept) if not effect_of(p.effect).registered]
             return np.array(own or range(len(kept)), dtype=np.int64)
@@ -333,7 +335,7 @@ class Estimable:
         a = np.array([wanted.get(name, 0.0) for name in model.names])
         if lost := self.unpredictable(a[None, None]):
             raise InsufficientDataError(
-                f"{model.cell.source}: [design] combination depends on "
+                f"{wish('combination', f'{model.cell.source}: [design] combination')} depends on "
                 f"{model.names[lost[0]]}; {self.why(lost[0])}"
             )
         return np.asarray((a * self.sizes)[self.columns])

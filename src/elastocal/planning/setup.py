@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy import optimize
 
-from elastocal.errors import InsufficientDataError
+from elastocal.errors import InsufficientDataError, wish
 from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
 from elastocal.model.chain import joint_index
@@ -142,9 +142,10 @@ def set_up(
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
     `[design] elsewhere`.  `work`: the model at the test poses, where its tool is another one.
-    `hold`: parameters by which no plan can predict the test poses are held, not refused.
+    `hold`: parameters by which no plan can predict the test poses are held, not refused; so they
+    are of distances, which never show where the arm stands as a whole.
     """
-    spec = model.cell.design
+    spec, hold = model.cell.design, hold or model.observe == "distance"
     x = model.nominal if known.done is None else known.done.x
     free, every = fixed_and_free(model, known.fixed), np.arange(len(model.parameters))
     raw = PoseInformation(model, x, every, np.ones(len(every)), sight)
@@ -204,8 +205,9 @@ def _aimed(
             beyond = found.on_kept(rows[T:], hold), region.weight
     if share and beyond is None:
         raise InsufficientDataError(
-            f"{model.cell.source}: [design] elsewhere asks for poses all over the joint ranges, "
-            "but the rules allow none, or no plan can make all of them certain; leave it out"
+            f"{wish('elsewhere', f'{model.cell.source}: [design] elsewhere')} asks for poses all "
+            "over the joint ranges, but the rules allow none, or no plan can make all of them "
+            "certain; leave it out"
         )
     warnings = setup.warnings + told
     return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.plan_wishes import TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.config import place
-from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.errors import InputError, InsufficientDataError, require, wish
 from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
@@ -41,7 +40,8 @@ def check_cell(cell: Cell, chain: Chain) -> None:
     for joint, values in cell.design.levels.items():
         i, split = joint_index(joint), cell.model.compliance_levels.get(joint)
         for value in values:
-            found = f"{where}: [design.levels] has {joint} at {told(chain, i, value)}"
+            levels = wish("levels", f"{where}: [design.levels]")
+            found = f"{levels} has {joint} at {told(chain, i, value)}"
             require(
                 lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
                 f"{found}, beyond its limits, {told(chain, i, lower[i])} to "
@@ -53,19 +53,17 @@ def check_cell(cell: Cell, chain: Chain) -> None:
                 "the same levels",
             )
     if motion.speed is not None:
-        key = "design.motion.speed_" + ("deg_per_s" if motion.degrees else "si")
-        _check_numbers(cell, chain, key, motion.speed, motion.degrees, one=motion.degrees)
+        key = f"{where}: key design.motion.speed_" + ("deg_per_s" if motion.degrees else "si")
+        _check_numbers(chain, key, motion.speed, motion.degrees, one=motion.degrees)
     if motion.home is not None:
-        key = f"design.motion.home_{'deg' if motion.degrees else 'si'}"
+        key = f"{where}: key design.motion.home_{'deg' if motion.degrees else 'si'}"
         _check_posture(cell, chain, key, motion.home, motion.degrees)
 
 
 def _check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
-    _check_numbers(cell, chain, key, q, degrees)
+    _check_numbers(chain, key, q, degrees)
     if (beyond := beyond_limits(cell, chain, q)) is not None:
-        raise InputError(
-            f"{cell.source}: key {key}: {beyond[1]}; correct the posture or the limits"
-        )
+        raise InputError(f"{key}: {beyond[1]}; correct the posture or the limits")
 
 
 def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
@@ -80,20 +78,18 @@ def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
     return j, f"{name} at {at} is beyond its limits, {low} to {high}"
 
 
-def _check_numbers(
-    cell: Cell, chain: Chain, key: str, found: Sized, degrees: bool, one: bool = False
-) -> None:
-    n, where = chain.n_joints, cell.source
+def _check_numbers(chain: Chain, key: str, found: Sized, degrees: bool, one: bool = False) -> None:
+    n, own = chain.n_joints, key.rpartition(": key ")[2]
     require(
         len(found) == n or (one and len(found) == 1),
-        f"{where}: key {key} has {len(found)} numbers, but robot '{chain.name}' has {n} joints; "
+        f"{key} has {len(found)} numbers, but robot '{chain.name}' has {n} joints; "
         f"give {n} numbers{' or one for all' if one else ''}",
     )
     for k, kind in enumerate(chain.kinds if degrees else ()):
         require(
             kind != "prismatic",
-            f"{where}: key {key} gives degrees, but joint{k + 1} ({chain.joints[k].name}) is "
-            f"prismatic; use {key.replace('deg_per_s', 'si').replace('_deg', '_si')}, in rad and m",
+            f"{key} gives degrees, but joint{k + 1} ({chain.joints[k].name}) is prismatic; use "
+            f"{own.replace('deg_per_s', 'si').replace('_deg', '_si')}, in rad and m",
         )
 
 
@@ -168,8 +164,9 @@ def test_poses(
     spec, of = cell.design, _Sources(cell, chain, feasibility, seed)
     groups = []
     for k, pose in enumerate(spec.test_poses):
-        key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
-        _check_posture(cell, chain, key, pose.q, pose.degrees)
+        unit = "deg" if pose.degrees else "si"
+        key = wish("test_poses", f"{cell.source}: key q_{unit} of [[design.test_pose]]")
+        _check_posture(cell, chain, f"{key} no. {k + 1}", pose.q, pose.degrees)
         groups.append(of.poses(pose.q[None], "", pose, weight=np.array([pose.weight])))
     sources = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
     groups += [] if spec.test_path is None else [of.path(spec.test_path)]
