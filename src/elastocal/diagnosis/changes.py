@@ -233,17 +233,22 @@ def _compared(
     old: CalibratedArm, new: CalibratedArm, forces: Array, whose: str, level: float, poses: int,
     seed: int,
 ) -> Comparison:  # fmt: skip
+    # The parameters of the arm itself; base and markers are set up anew in each campaign.
+    own, theirs = (
+        {p.name for p in arm.model.parameters if not CATALOGUE[p.effect].registered}
+        for arm in (old, new)
+    )
+    other = listed(sorted(own ^ theirs), NAMED)
     require(
-        old.model.names == new.model.names,
-        f"{old.source} and {new.source} are of two models: their parameters differ; identify both "
-        "with the same cell",
+        not other,
+        f"{old.source} and {new.source} are of two models: one alone has {other}; identify both "
+        "with the same effects",
     )
     conditions = Conditions()
     unstated = unstated_needs(old, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
     before, after = (arm_with(arm, stated) for arm in (old, new))
-    # The parameters of the arm itself; base and markers are set up anew in each campaign.
-    own = {p.name for p in before.model.parameters if not CATALOGUE[p.effect].registered}
+    own &= {*before.model.names}
     left = [f"{name.replace('_', ' ')} (follows {listed(needs)})"
             for name, needs in unstated.items() if needs]  # fmt: skip
     functions: dict[str, str] = {}  # parameter → the smooth function that it is part of
@@ -266,8 +271,8 @@ def _compared(
     load = cell.tool.load_point
     at = load if load.any() else next(iter(cell.tool.markers.values()), load)
     # The set-up of the old campaign for both.
-    pairs = zip(before.model.names, before.x, after.x, strict=True)
-    moved = np.array([b if name in own else a for name, a, b in pairs])
+    values = before.values | {name: after.values[name] for name in own}
+    moved = np.array([values[name] for name in before.model.names])
     tool, tool_moved = (
         CalibratedTool(replace(old, model=before.model, x=x), ToolPoint(at, None, "tool"))
         for x in (before.x, moved)
@@ -311,6 +316,12 @@ def _difference(
     if set(first) == set(second) and all(np.isclose(a[n], b[n], rtol=1e-9) for n in held):
         z = np.array([b[n] - a[n] for n in first])
         return first, z, _covariance(old, first) + _covariance(new, first), False
+    require(
+        old.model.names == new.model.names,
+        f"{old.source} and {new.source} determine other parameters, and have other markers: "
+        "identify both with the same cell, or with the same parameters held "
+        f"({option('fixed')})",
+    )
     # All that both fitted, set-up included, which the new campaign's choice may have moved.
     names, marked = before.model.names, tuple(before.model.cell.tool.markers)
     # Smooth functions that are not compared are no one's to tell others by.
