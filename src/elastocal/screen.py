@@ -195,6 +195,9 @@ def safe_console(**how: Any) -> Console:
     from rich.segment import Segment
 
     class SafeConsole(Console):
+        def on_broken_pipe(self) -> None:
+            self.quiet = True  # a reader that went away (… | head) is no error: rich would exit
+
         def render(
             self, renderable: RenderableType, options: ConsoleOptions | None = None
         ) -> Iterable[Segment]:

@@ -62,13 +62,13 @@ def test_everything_missing_at_once(campaign, tmp_path):
 
 @pytest.mark.parametrize(
     ("shell", "code"),
-    [('"$@" | head -n 1 > /dev/null', 0), ('"$@" >&-', 0), ('"$@" > /dev/full', 2)],
+    [('"$@" | true', 0), ('"$@" >&-', 0), ('"$@" > /dev/full', 2)],
 )
 def test_streams_that_are_closed_or_full(campaign, tmp_path, shell, code):
     if "full" in shell and not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full")
     result = tmp_path / "result.json"
-    done = identified(campaign, "-q", "-o", str(result), "--json", shell=shell)
+    done = identified(campaign, "-q", "-o", str(result), shell=shell)
     assert done.returncode == code, done.stderr.decode()
     assert b"Traceback" not in done.stderr and b"Exception" not in done.stderr
     assert result.stat().st_size > 1000  # written before anything is told

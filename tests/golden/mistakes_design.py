@@ -6,6 +6,8 @@ from golden.mistakes import DESIGN, Mistake
 
 QUICK = "design wished.toml -o plan.csv --candidates 60 --poses 4 --effort quick -q"
 POINT = "[[design.test_pose]]\nq_deg = [0, 20, -20, 0, 40, 0]\n"
+BLOCK = """[workspace]\nlink_radius_mm = 50\n[[workspace.obstacle]]\nname = "block"\nshape = "box"
+position_m = [0.7, 0, 0]\nsize_m = """
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 
 
@@ -31,13 +33,11 @@ TABLE = (
     added("limits beyond the robot's", "[limits]\njoint2_deg = [200, 300]"),
     added("a test pose beyond the limits", f"[limits]\njoint2_deg = [-50, -40]\n{POINT}"),
     added("a test box out of reach", "[design.test_box]\nlower_m = [5, 5, 5]\nupper_m = [6, 6, 6]"),
-    added("an obstacle that swallows the robot",
-           "[workspace]\nlink_radius_mm = [200, 200, 150, 150, 100, 100]\n"
-           '[[workspace.obstacle]]\nname = "block"\nshape = "box"\nsize_m = [9, 9, 9]\n'
-           "position_m = [0, 0, 0]"),
+    added("an obstacle that swallows the robot", f"{BLOCK}[9, 9, 9]"),
+    added("a home behind a wall",
+          f"[design.motion]\nhome_deg = [0, 90, -90, 0, 0, 0]\n{BLOCK}[0.1, 3, 3]"),
     added("a tracker that sees no pose", "[workspace.visibility]\nrange_m = [0.1, 0.2]"),
-    asked("a parameter that no pose shows",
-           'criterion = "D"\ninterest = ["joint1.compliance"]'),
+    asked("a parameter that no pose shows", 'criterion = "D"\ninterest = ["joint1.compliance"]'),
     asked("a parameter of interest that is none",
            'criterion = "D"\ninterest = ["joint1.complaince"]'),
     asked("a criterion that is none", 'criterion = "test_poses"'),

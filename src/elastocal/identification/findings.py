@@ -266,9 +266,9 @@ STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
 
 
 def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
-    """Values whose interval leaves nominal out, and which lie more than FAR typical deviations off,
-    of a combination all that it may hold; doubted unless the noise explains the residual, and
-    held-out poses agree (`explained`)."""
+    """Values whose whole interval lies more than FAR typical deviations from nominal, of a
+    combination all that it may hold; doubted unless the noise explains the residual, and held-out
+    poses agree (`explained`)."""
     ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
     typical = {p.name: p.typical or 0.0 for p in result.model.parameters}
     for c in result.combinations:
@@ -280,7 +280,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
         (p, float(x) - p.nominal)
         for p, x in zip(result.model.parameters, result.x, strict=True)
         if p.effect in STATED_BY_FILE and p.typical and p.name in half
-        and abs(float(x) - p.nominal) > max(FAR * typical[p.name], half[p.name])
+        and abs(float(x) - p.nominal) - half[p.name] > FAR * typical[p.name]
     ]  # fmt: skip
     zeros = [(p, off) for p, off in far if p.effect == JointOffset.name]
     if zeros:

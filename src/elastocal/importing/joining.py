@@ -127,10 +127,11 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
     groups = [match.groupdict() if match else {} for match in matches]
     bad = [i for i, match in enumerate(matches) if match is None]
     if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
+        more = {1: "", 2: ", nor does 1 other"}.get(len(bad), f", nor do {len(bad) - 1} others")
         raise InputError(
             f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
-            f"({listed(map(quoted, patterns), 3)}), nor do {len(bad) - 1} others; {NAMED}, or "
-            'unmatched = "ignore" to leave such points out'
+            f'({listed(map(quoted, patterns), 3)}){more}; {NAMED}, or unmatched = "ignore" to '
+            "leave such points out"
         )
     found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}
     present = {stem: texts for stem, texts in found.items() if any(texts)}

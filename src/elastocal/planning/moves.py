@@ -124,9 +124,9 @@ MOST_NAMED = 3
 class Unreachable(InsufficientDataError):
     """Some poses of a plan cannot be reached: `poses` are their indices."""
 
-    def __init__(self, message: str, poses: IntArray) -> None:
+    def __init__(self, message: str, *poses: int) -> None:
         super().__init__(message)
-        self.poses = poses
+        self.poses = np.array(poses, dtype=int)
 
 
 @dataclass(frozen=True)
@@ -288,7 +288,7 @@ class Moves:
                     f"{self._in_the_way(roadmap, below, pose)} nor from above"
                     f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
                     "[design.motion], or raise clearance_mm in [workspace]",
-                    self.pose[[v]],
+                    self.pose[v],
                 )
             here |= not roadmap.loaded
             needed = [int(point) for point in dict.fromkeys(self.leave[here])]
@@ -314,7 +314,7 @@ class Moves:
             f"{named}{more} cannot be reached{roadmap.carrying} by collision-free joint moves, "
             f"neither directly nor through home and other poses{by}; give another home in "
             "[design.motion], free the way, or narrow [limits] to exclude such poses",
-            np.unique(self.pose[np.isin(self.leave, lost)]),
+            *np.unique(self.pose[np.isin(self.leave, lost)]),
         )
 
     def _name(self, point: int) -> str:
