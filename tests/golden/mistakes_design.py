@@ -55,8 +55,8 @@ TABLE = (
     Mistake("nothing to fit", QUICK, "wished.toml", '["joint_compliance"]', "[]"),
     asked("a combination that no pose shows",
           'criterion = "c"\ncombination = { "joint1.compliance" = 1.0 }'),
-    asked("a test pose that hangs on it",
-          "[[design.test_pose]]\nq_deg = [0, 20, -20, 0, 40, 0]\nload_N = [50, 50, 0]"),
+    Mistake("a test pose that hangs on it", QUICK.replace("wished", "planned"),
+            "planned.toml", '["joint_compliance"]', '["joint_compliance", "base_frame"]'),
     Mistake("fewer equations than parameters", "design placed.toml -o p.csv --poses 1 "
             "--candidates 60 --effort quick -q --criterion D"),
     optioned("a picture over a folder", "--picture study"),

@@ -416,7 +416,9 @@ def compensate(
     )  # fmt: skip
     told = [*_of_loads(arm, result), *_of_places(arm, result)]
     if targets.path or targets.q is None:  # not of a grid of joints
-        told = [*_of_joints(result, limits, jumps(task, q, reached)), *told]
+        # Joints alone say themselves how far to move.
+        turned = jumps(task, q, reached & (targets.position is not None))
+        told = [*_of_joints(result, limits, turned), *told]
     if of_one_campaign:
         told.append(
             f"The {listed(of_one_campaign, 4)} {'is' if len(of_one_campaign) == 1 else 'are'} of "
@@ -579,10 +581,11 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     unknown, std = sure.unknown[reached], sure.std[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
     if len(unknown) and rms > max(WORTH_TELLING, float(np.sqrt(np.mean(std**2)))):
+        size = f"{rms * 1e6:.0f} µm" if rms < 0.9995e-3 else f"{rms * 1e3:.4g} mm"
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
-            f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
-            "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
+            f"this point depends: typical deviations of them would move it by {size} rms, which "
+            "within95_um counts and std_um leaves out; choose a marker that was fitted "
             f"({option('point')}), or measure what is missing"
         )
     known = np.isin(arm.model.names, arm.determined)

@@ -372,9 +372,11 @@ class Estimable:
         if lost:
             off = np.abs(self._unexplained(A, self.structure)).max(axis=1)
             t = int(off[:, list(self.structure.dropped).index(lost[0])].argmax())
+            first, *others = (self.model.names[i] for i in lost)
+            likewise = f"; so it is with {listed(others, 6)}" if others else ""
             raise InsufficientDataError(
-                f"{cell.source}: the position at test pose {t + 1} depends on "
-                f"{self.model.names[lost[0]]}; {self.why(lost[0])}; or ask for parameters instead "
+                f"{cell.source}: the position at test pose {t + 1} depends on {first}; "
+                f"{self.why(lost[0])}{likewise}; or ask for parameters instead "
                 'of test poses: design with criterion = "D"'
             )
         return np.asarray(A[..., self.columns] * self.sizes[self.columns])
