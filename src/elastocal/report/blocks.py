@@ -45,10 +45,8 @@ class ShownVerdict:
 
 @dataclass(frozen=True)
 class KeyFigures:
-    """What came out in one line of numbers, and the four that count (what it is, number); a
-    terminal has both in sentences."""
+    """The four numbers that count (what it is, number); a terminal has them in sentences."""
 
-    headline: str
     figures: Sequence[tuple[str, str]]
 
 

@@ -44,8 +44,8 @@ def calibration_blocks(
 ) -> Iterator[say.Block]:
     """An identification; `truth` and `published` (SI) stand beside the estimates."""
     budget = cache(lambda: gap_budget(result))
-    yield say.Fold("", lambda: [_key(result, budget())])
     yield words.judgement(result)
+    yield say.Fold("", lambda: [_key(result, budget())])
     yield say.Lines([
         ("Error (rms)", error_line(result)),
         ("Expected", at_new_poses(result.predicted)),
@@ -117,11 +117,9 @@ def _key(result: Calibration, budget: ErrorBudget | None) -> say.KeyFigures:
         figures.append(("test data", say.length(result.test.rms)))
     if (at := result.verdict.at) is not None:
         figures.append(("new poses, without noise", f"≤ {say.length(at)}"))
-    headline = f"{say.length(result.nominal_rms)} → {say.length(after)}"
     if budget is not None and budget.floor is not None:
         figures.append((f"noise ({budget.floor_name})", say.length(budget.floor)))
-        headline += f" (noise {say.length(budget.floor)})"
-    return say.KeyFigures(headline, figures)
+    return say.KeyFigures(figures)
 
 
 def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[say.Block]:
@@ -311,7 +309,7 @@ def spread_table(
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
         rows.append((name, str(len(e)), *(say.length(float(size)) for size in sizes)))
-    heads = ("error of the position", count, "mean", "std", "95 %", "max")
+    heads = ("error", count, "mean", "std", "95 % below", "max")
     return say.ShownTable(heads, rows, title=title)
 
 
@@ -507,7 +505,8 @@ def parameter_table(
 ) -> say.ShownTable:
     own = [e for e in result.ordinary if e.identifiable]
     known = {p.name: p for p in result.model.parameters}
-    after = {"nominal": [nominal_text(e, known[e.name]) for e in own]}
+    nominal = [nominal_text(e, known[e.name]) for e in own]
+    after = {} if set(nominal) <= {"–"} else {"nominal": nominal}
     if published:
         given = [(published.get(e.name), e.unit) for e in own]
         after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])

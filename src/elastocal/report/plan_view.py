@@ -28,9 +28,9 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
         yield stop_table(plan)
         yield plan_arm(plan)
 
-    yield say.Fold("", lambda: [_key(plan)])
     # A gap to the bound is no fault of the plan's: with few poses much of it is the bound's.
     yield say.ShownVerdict("warn" if plan.warnings else "good", plan_headline(plan))
+    yield say.Fold("", lambda: [_key(plan)])
     yield say.Lines([(say.WARNING, printable(text)) for text in plan.warnings])
     yield say.Fold("", arm, figures=("poses",))
     # Less digits where there is no room.
@@ -83,16 +83,15 @@ def position_error(metres: float) -> str:
 
 
 def _key(plan: Plan) -> say.KeyFigures:
-    n, minutes = say.counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = "criterion", f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     if plan.of_test_poses:
         worth = "error at the test poses", position_error(_rho(plan) * 1e-6)
     figures = [("poses", str(len(plan.q))), worth]
     if (e := plan.everywhere) is not None:
         figures.append(("error over the joint ranges", position_error(e.elsewhere)))
-    figures.append(("time", minutes))
+    figures.append(("time", f"{plan.execution.total / 60:.0f} min"))
     figures += [("load states", str(len(plan.forces)))][: 4 - len(figures)]
-    return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
+    return say.KeyFigures(figures)
 
 
 TOLD = 2  # parameters that a pose serves, in the table
@@ -428,11 +427,14 @@ def next_lines(found: NextPoses) -> Told:
         f"{n} lower the rms error at the test poses from {both(g.before, g.after)} with what "
         f"the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
     )
-    named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
+    named = [f"{say.effect_at(f)} ({say.probability(f.probability)})" for f in found.found]
     if named:
         text = f"{', '.join(named)}, added to the model here; write the cell with it"
         yield "Found", printable(f"{text} (diagnose, {option('cell_out')}).")
-    doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
+    doubts = [
+        f"{say.effect_at_places(effect, [where])} ({say.probability(p)})"
+        for effect, where, p in found.doubts[:3]
+    ]
     if doubts:
         rivals = found.diagnosis is not None and found.diagnosis.open
         apart = f"; poses that tell them apart: diagnose {option('plan')}" if rivals else ""

@@ -308,8 +308,7 @@ def _html(block: say.Block, deep: int, pictures: bool, summary: str) -> str:
             f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
             for name, number in block.figures
         )
-        line = f'<p class="change">{text_of(block.headline)}</p>'
-        return f'{line}<dl class="key">{figures}</dl>'
+        return f'<dl class="key">{figures}</dl>'
     if isinstance(block, say.Heading):
         return f"<h{deep}>{text_of(block.text)}</h{deep}>"
     if isinstance(block, say.Sentence):
