@@ -449,9 +449,12 @@ def _lacking(result: Calibration) -> str:
             "what is left: repeat some poses, which tell noise and repeatability from what the "
             "model lacks."
         )
+    ask = "Ask what the model lacks: elastocal diagnose with the same cell and data."
+    if result.excess is None:  # no noise is known that the residual could exceed
+        return ask
     return (
-        "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
-        "nothing, the excess is the robot's repeatability, or noise larger than stated ([tracker])."
+        f"{ask} Where it finds nothing, the excess is the robot's repeatability, or noise larger "
+        "than stated ([tracker])."
     )
 
 

@@ -163,11 +163,12 @@ def diagnosis_headline(d: Diagnosis) -> str:
         large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
         told = [
             f"{say.effect_at_places(g.name, g.places)} "
-            f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
+            f"({share_text(g.share) if g.share <= 1 else '> 100 %'}"
+            f"{' of the remaining error' * (k == 0)})"
             for k, g in enumerate(large)
         ]
         if more := len(d.groups) - len(told):
-            told.append(say.counted(more, "smaller cause"))
+            told.append(say.counted(more, "smaller effect"))
         first, n = d.groups[0], len(d.indistinguishable)
         one = max(len(d.groups), len(first.places)) == 1 and not first.name.endswith("errors")
         open_ = f"leave {'one effect' if n == 1 else f'{n} effects'} of it open"
@@ -491,10 +492,12 @@ def cause_table(d: Diagnosis) -> say.ShownTable:
     ]
     if d.gap.unexplained_share >= FINE**2:
         rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
+    over = any(g.share > 1 for g in d.groups) or any(c.share > 1 for _, c in _unnamed(d))
     heads = ("cause", "share", "90 %", "error falls by", "90 %")
     return say.ShownTable(heads, rows, title="Causes of the remaining error", note=(
         "share: part of the squared remaining error that goes when this is added last. error falls "
         "by: at new poses, if only this is added to the model."
+        + " A share above 100 %: causes that partly cancel each other." * over
     ))  # fmt: skip
 
 
@@ -544,8 +547,8 @@ def curve_span(curve: Curve) -> str:
 def _corrections(d: Diagnosis) -> Iterator[say.Block]:
     if d.slight:
         yield say.Sentence(
-            f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "
-            "the remaining error. They correct the arm and are not findings."
+            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each. "
+            "They correct the arm and are not findings."
         )
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")

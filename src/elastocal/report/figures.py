@@ -308,12 +308,15 @@ ABSCISSA = {
     "of the largest load": (1.0, "parts of the largest"),
 }
 ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
+COARSER = {"µm": "mm", "µrad": "mrad"}  # from 1000 on
 
 
 def unknown_curves(d: Diagnosis) -> say.Figure:
     def panel(axes: Axes, curve: Curve) -> None:
         wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
         high, y_unit = ORDINATE.get(curve.y_unit, (1.0, curve.y_unit))
+        if y_unit in COARSER and high * max(map(abs, curve.y)) >= 1000:
+            high, y_unit = high / 1000, COARSER[y_unit]
         x, y, sd = wide * np.array(curve.x), high * np.array(curve.y), high * np.array(curve.sd)
         stroke(axes, x, 0 * x, "-", FAINT)
         axes.fill_between(x, y - 2 * sd, y + 2 * sd, color=SERIES[0], alpha=0.25, linewidth=0,
@@ -572,10 +575,13 @@ class Residuals:
             signed = values.ndim == 1
             sizes = np.abs(values) if signed else np.linalg.norm(values, axis=1)
             told = say.signed if signed else say.significant
-            mean = values.mean() if signed else np.linalg.norm(values.mean(axis=0))
+            mean = float(values.mean() if signed else np.linalg.norm(values.mean(axis=0)))
             largest = float(values[sizes.argmax()] if signed else sizes.max())
-            rms = say.significant(float(np.sqrt((sizes**2).mean())))
-            rows.append((name, str(len(sizes)), told(float(mean)), rms, told(largest), unit))
+            rms = float(np.sqrt((sizes**2).mean()))
+            # Of the mean the digits that so many readings determine.
+            known = say.with_uncertainty(mean, rms / math.sqrt(len(sizes)))[0]
+            each = known, say.significant(rms), told(largest)
+            rows.append((name, str(len(sizes)), *each, unit))
         heads = ("readings of", "number", "mean", "rms", "largest", "unit")
         return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
@@ -589,7 +595,10 @@ FEWEST_ON_MAP = 30  # poses
 
 def uncertainty_map(result: Calibration) -> say.Figure | None:
     """How sure the tool's place is over reach and height, under the loads measured: rms in µm of
-    each part of the workspace; empty where the model asks for more than joints and load."""
+    each part of the workspace; None where no error is expected, or where the model asks for more
+    than joints and load."""
+    if result.predicted is None:  # as where only distances were read; nor has the verdict one
+        return None
     model, point = result.model, None
     markers, load_point = model.cell.tool.markers, model.cell.tool.load_point
     # The point that the verdict speaks of.
@@ -636,8 +645,8 @@ def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
         x, y = (low + side * key).tolist()
         axes.add_patch(Rectangle((x, y), side, side, facecolor=SERIES[0], linewidth=0,
                                  alpha=0.75 * size / largest))  # fmt: skip
-        axes.text(x + side / 2, y + side / 2, say.significant(float(size), 2), ha="center",
-                  va="center", fontsize=9)  # fmt: skip
+        text = say.significant(float(size), 2 if size < 100 else 3)
+        axes.text(x + side / 2, y + side / 2, text, ha="center", va="center", fontsize=9)
     high = low + side * (keys.max(axis=0) + 1)
     axes.set_xlim(float(low[0]) - 0.05 * side, float(high[0]) + 0.05 * side)
     axes.set_ylim(float(low[1]) - 0.05 * side, float(high[1]) + 0.05 * side)

@@ -311,7 +311,7 @@ def spread_table(
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
         rows.append((name, str(len(e)), *(say.length(float(size)) for size in sizes)))
-    heads = ("error of the position", count, "mean", "std", "95 %", "max")
+    heads = ("error", count, "mean", "std", "95 % below", "max")
     return say.ShownTable(heads, rows, title=title)
 
 
@@ -507,7 +507,8 @@ def parameter_table(
 ) -> say.ShownTable:
     own = [e for e in result.ordinary if e.identifiable]
     known = {p.name: p for p in result.model.parameters}
-    after = {"nominal": [nominal_text(e, known[e.name]) for e in own]}
+    nominal = [nominal_text(e, known[e.name]) for e in own]
+    after = {} if set(nominal) <= {"–"} else {"nominal": nominal}
     if published:
         given = [(published.get(e.name), e.unit) for e in own]
         after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])

@@ -428,11 +428,14 @@ def next_lines(found: NextPoses) -> Told:
         f"{n} lower the rms error at the test poses from {both(g.before, g.after)} with what "
         f"the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
     )
-    named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
+    named = [f"{say.effect_at(f)} ({say.probability(f.probability)})" for f in found.found]
     if named:
         text = f"{', '.join(named)}, added to the model here; write the cell with it"
         yield "Found", printable(f"{text} (diagnose, {option('cell_out')}).")
-    doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
+    doubts = [
+        f"{say.effect_at_places(effect, [where])} ({say.probability(p)})"
+        for effect, where, p in found.doubts[:3]
+    ]
     if doubts:
         rivals = found.diagnosis is not None and found.diagnosis.open
         apart = f"; poses that tell them apart: diagnose {option('plan')}" if rivals else ""

@@ -1,6 +1,15 @@
 // The pages' only script.  Without it everything but the turning 3-D view is there to be read.
 "use strict";
 
+// A number stays on the line of its unit.
+
+for (const element of document.querySelectorAll("p, dd, li, figcaption")) {
+  for (const node of element.childNodes) {
+    if (node.nodeType !== Node.TEXT_NODE) continue;
+    node.data = node.data.replace(/(\d) (?=([µm]?m|µ?rad|mrad|%|N|s|h|min|ppm)(?![\w/]))/g, "$1\u00a0");
+  }
+}
+
 // Tables: sorted by a click on a head, and saved as CSV.
 
 const LENGTHS = { "nm": 1e-9, "µm": 1e-6, "mm": 1e-3, "m": 1 };
@@ -212,7 +221,7 @@ class View {
       range: this.data.range[AXES.indexOf(name)], autorange: false });
     return {
       scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "manual",
-        aspectratio: this.shape(), camera: this.camera ?? { eye: { x: 1, y: -1.25, z: 0.55 } }, uirevision: "kept" },
+        aspectratio: this.shape(), camera: this.camera ?? { eye: { x: 1.15, y: -1.45, z: 0.65 } }, uirevision: "kept" },
       paper_bgcolor: "rgba(0,0,0,0)", font: { color: colour("ink"), size: 12 },
       margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept",
       legend: { orientation: "h", y: 0, x: 0, bgcolor: "rgba(0,0,0,0)" },

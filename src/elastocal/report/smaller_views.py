@@ -416,7 +416,6 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
 
 K = 2.0  # coverage factor: about 95 % of a normal distribution
 FEWEST = 3  # readings of one place from which on a repeatability is told
-SIDES = math.sqrt(3.0)  # a 3-D rms over that of one coordinate
 
 
 def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
@@ -472,8 +471,9 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
 class Certified:
     """What the certificate and its XML state, lengths in m.
 
-    `sources`: standard uncertainty of a coordinate by source (name, GUM's type, u); their root sum
-    of squares is that of a position predicted by the calibrated model against one reading.
+    `sources`: standard uncertainty of a coordinate by source (name, GUM's type, u), of the distance
+    where distances were read; their root sum of squares is that of what the calibrated model
+    predicts against one reading.  `coordinates`: how many a reading has, 3 or 1.
     `error`: the largest distance between places meant and read, of `places` that were not fitted.
     `repeatability`: RP of the places read often enough.
     """
@@ -482,6 +482,11 @@ class Certified:
     error: float | None
     places: str
     repeatability: Array
+    coordinates: int = 3
+
+    @property
+    def quantity(self) -> str:
+        return "position" if self.coordinates == 3 else "distance"
 
     @property
     def expanded(self) -> float:
@@ -493,15 +498,18 @@ class Certified:
         """Expanded uncertainty of a measured distance: of reading and instrument alone, since the
         arm's own errors are what is measured."""
         own = [u for name, _, u in self.sources if name in (READING, INSTRUMENT)]
-        return K * SIDES * math.sqrt(sum(u**2 for u in own))
+        return K * math.sqrt(self.coordinates * sum(u**2 for u in own))
 
     def conformity(self, limit: float) -> str:
         """The decision by ISO 14253-1, with a guard band of one expanded uncertainty."""
         if self.error is None:
-            return "No statement: no position error was measured at places that were not fitted."
+            return (
+                f"No statement: no {self.quantity} error was measured at places that were not "
+                "fitted."
+            )
         guard = self.of_deviations
         numbers = (
-            f"largest position error {say.length(self.error)} ({self.places}), "
+            f"largest {self.quantity} error {say.length(self.error)} ({self.places}), "
             f"limit {say.length(limit)}, guard band {say.length(guard)} (U, k = 2, of a "
             "measured distance)"
         )
@@ -527,8 +535,9 @@ PARTS = {
 
 def certified_values(result: Calibration, budget: ErrorBudget | None) -> Certified:
     parts, sources = result.uncertainty(), []
+    coordinates = 1 if result.observations.kind == "distance" else 3
     for key, (name, kind) in PARTS.items() if parts is not None else ():
-        sources.append((name, kind, getattr(parts, key) / SIDES))
+        sources.append((name, kind, getattr(parts, key) / math.sqrt(coordinates)))
     own = result.model.cell.certificate.instrument_uncertainty
     if own is not None:
         sources.append((INSTRUMENT, "B", own / K))
@@ -538,7 +547,7 @@ def certified_values(result: Calibration, budget: ErrorBudget | None) -> Certifi
     elif budget is not None:
         apart = pose_accuracy(result.observations, budget.steps[-1].errors)
         error, places = float(apart.max()), "each place left out of the fit"
-    return Certified(tuple(sources), error, places, pose_repeatability(result))
+    return Certified(tuple(sources), error, places, pose_repeatability(result), coordinates)
 
 
 def pose_repeatability(result: Calibration) -> Array:
@@ -569,9 +578,10 @@ def _uncertainty(certified: Certified) -> Iterator[say.Block]:
     rows.append(("combined", "", say.length(math.sqrt(square)), "100 %"))
     rows.append(("expanded, U with k = 2", "", say.length(certified.expanded), ""))
     heads = ("source", "type", "standard uncertainty", "share of the variance")
+    of_what = "coordinate of a position" if certified.coordinates == 3 else "distance"
     note = (
-        "Of a coordinate of a position that the calibrated model predicts, against one reading "
-        "(GUM, JCGM 100). U covers about 95 %."
+        f"Of a {of_what} that the calibrated model predicts, against one reading (GUM, JCGM 100). "
+        "U covers about 95 %."
     )
     if all(name != INSTRUMENT for name, *_ in certified.sources):
         note += " Without the instrument's own calibration, which [certificate] does not state."
