@@ -28,8 +28,7 @@ def diagnosed(
     curves: bool, again: int, shake: float = 0.0, common: float = 0.0
 ) -> tuple[Diagnosis, float]:
     """Of poses of which so many come `again`, 2 mrad apart in their joints, later in the campaign;
-    and the 3-D rms (m) of the noise put in: the tracker's, the joints', what configurations have in
-    `common` per axis, which the cell states."""
+    and the 3-D rms (m) of all noise put in, with what configurations have in `common` per axis."""
     chain, near = kr270_chain(), 2e-3
     arm = replace(cell(FITTED), noise=Unsteadiness(configuration=common))
     q = random_poses(chain, 40 - again, 1)
