@@ -11,6 +11,7 @@ from support.diagnosis_data import FITTED, REPEATABILITY, SIGMA, cell, measured
 
 import elastocal as ec
 from elastocal import Diagnosis
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.model.manipulator import Model
 
 AMPLITUDE, LENGTH = 1e-4, 0.07  # rad: an error curve of joints 2 and 3
@@ -23,10 +24,13 @@ def curve(q: np.ndarray, seed: int) -> np.ndarray:
     return AMPLITUDE * np.sqrt(2 / 400) * np.cos(q[:, None] * w + phase).sum(axis=1)
 
 
-def diagnosed(curves: bool, again: int, shake: float = 0.0) -> tuple[Diagnosis, float]:
+def diagnosed(
+    curves: bool, again: int, shake: float = 0.0, common: float = 0.0
+) -> tuple[Diagnosis, float]:
     """Of poses of which so many come `again`, 2 mrad apart in their joints, later in the campaign;
-    and the 3-D rms (m) of the tracker's noise and of the joints' scatter that was put in."""
+    and the 3-D rms (m) of all noise put in, with what configurations have in `common` per axis."""
     chain, near = kr270_chain(), 2e-3
+    arm = replace(cell(FITTED), noise=Unsteadiness(configuration=common))
     q = random_poses(chain, 40 - again, 1)
     step = np.random.default_rng(4).uniform(-near, near, (again, q.shape[1]))
     q = np.concatenate([q, q[:again] + step])
@@ -38,9 +42,9 @@ def diagnosed(curves: bool, again: int, shake: float = 0.0) -> tuple[Diagnosis, 
             off[:, j] += curve(table.q[:, j], j)
     joints = np.random.default_rng(8).normal(size=(len(q), q.shape[1]))
     off += shake * joints[table.configuration]
-    read = replace(measured(chain, cell(FITTED), [], replace(table, q=off), 1), q=table.q)
-    model, h = Model.assembled(chain, cell(FITTED)), 1e-6
-    square = 3 * SIGMA**2
+    read = replace(measured(chain, arm, [], replace(table, q=off), 1), q=table.q)
+    model, h = Model.assembled(chain, arm), 1e-6
+    square = 3 * (SIGMA**2 + common**2)
     for axis in np.eye(6):
         ahead, behind = (model.predict(replace(table, q=table.q + s * h * axis)) for s in (1, -1))
         lever = (ahead - behind).reshape(-1, 3) / (2 * h)
@@ -55,7 +59,8 @@ def test_an_error_curve_is_no_scatter() -> None:
     assert why.gap.calibrated > 3 * true
 
 
-def test_on_an_arm_that_only_scatters_nothing_is_unexplained() -> None:
-    why, true = diagnosed(curves=False, again=0, shake=1e-4)
+@pytest.mark.parametrize(("shake", "common"), [(1e-4, 0.0), (0.0, 8e-5)])
+def test_on_an_arm_that_only_scatters_nothing_is_unexplained(shake: float, common: float) -> None:
+    why, true = diagnosed(curves=False, again=0, shake=shake, common=common)
     assert why.gap.unexplained == 0.0 and why.verdict == "nothing_significant"
     assert why.gap.noise_floor == pytest.approx(true, rel=0.15)

@@ -11,7 +11,7 @@ from support.robots import KR270
 import elastocal as ec
 
 SCARA = (
-    "type,theta0_deg,d_mm,a_mm,alpha_deg,lower_mm,upper_mm\nrevolute,0,210,260,0,,\n"
+    "type,theta0_deg,d_mm,a_mm,alpha_deg,lower_mm,upper_mm\nrevolute,0,0,260,0,,\n"
     "revolute,0,0,240,180,,\nprismatic,0,0,0,0,0,160\nrevolute,0,40,0,0,,\n"
 )
 PLAN = "configuration,q1_deg,q2_deg,q3_mm,q4_deg\n1,10,20,50,0\n2,-40,60,120,30\n3,80,-50,20,-60\n"
@@ -27,6 +27,7 @@ def test_a_scara_simulates_at_any_seed_though_weights_turn_no_upright_joint(tmp_
     (tmp_path / "plan.csv").write_text(PLAN)
     assert told_by_init(tmp_path / "dh.csv")[0] == 0
     cell = tmp_path / "cell.toml"
+    assert "link_radius_mm = [0, 0, " in cell.read_text()  # never above the mounting plane
     assert [str(e) for e in ec.read_cell(cell).model.effects][4:] == ["joint_compliance:joint3"]
     every = cell.read_text().replace("joint_compliance:joint3", "joint_compliance")
     (tmp_path / "every.toml").write_text(every)

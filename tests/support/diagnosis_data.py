@@ -113,10 +113,8 @@ def measured(
 
     What the cell fits deviates at random from nominal.
     """
-    nominal, settings = (
-        plain.model.nominal,
-        {f.where: dict(f.settings) for f in faults if f.settings},
-    )
+    nominal = plain.model.nominal
+    settings = {f.where: dict(f.settings) for f in faults if f.settings}
     effects = (*plain.model.effects, *choices([f"{f.effect}:{f.where}" for f in faults]))
     spec = replace(plain.model, effects=effects, nominal=replace(nominal, settings=settings))
     truth = Model.assembled(chain, replace(plain, model=spec))

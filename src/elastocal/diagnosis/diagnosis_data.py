@@ -28,7 +28,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoisyData
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.noise_structure import TIME, stated_deviations
+from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit, numbered
 from elastocal.model.arm import Setting, usual_sizes
@@ -72,6 +72,12 @@ class DiagnosisData:
     def drift(self) -> float:
         """The drift in m that the cell states, and that is noise here; of distances none is."""
         return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
+
+    @property
+    def common(self) -> float:
+        """The deviation in m, per axis, that the cell states as common to a configuration."""
+        shown = self.base.observed.kind in ("position", "pose")
+        return self.base.model.cell.noise.configuration if shown else 0.0
 
     @property
     def table(self) -> Measurements:
@@ -245,7 +251,7 @@ def diagnosis_data_of(
         load_point = blocks.pack(shift)
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
         names += [h.name] * len(keys)
-    drift, faster = _stated_drift(base)
+    drift, common = _stated_in_common(base)
     B = np.concatenate([B, drift], axis=2)
     names += [BaseFrame.name] * drift.shape[2]
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
@@ -262,7 +268,7 @@ def diagnosis_data_of(
         r=blocks.pack(residual[:, :, None])[:, :, 0],
         X=blocks.pack(B),
         precision=np.ones(B.shape[2]),
-        covariance=blocks.pack_square(base.covariance) + faster,
+        covariance=blocks.pack_square(base.covariance) + common,
         G=blocks.pack(columns.entry(("joint_motion", joints))[observed.lead]),
         left_out=blocks.absent,
         stated=base.stated is not None,
@@ -271,22 +277,24 @@ def diagnosis_data_of(
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
 
 
-def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
-    """Columns (N, size, k) of the drift that the cell's [noise] states, coefficients of variance
-    one, and the covariance (C, m, m) of what changes faster than its waves.
+def _stated_in_common(base: Baseline) -> tuple[Array, Array]:
+    """What the cell's [noise] states that readings share: columns (N, size, k) of the drift,
+    coefficients of variance one, and the covariance (C, m, m) of what changes faster than its waves
+    and of what is common to a configuration.
 
-    It is noise that neighbours in time have in common: left out, it passes for an effect that goes
-    with time.
+    It is noise: left out, it passes for an effect that goes with time or with the joints' angles.
     """
     observed, member, n = base.observed, base.blocks.member, len(base.observed.lead)
     some = subset(observed, np.arange(n) < base.n_measured)
-    drifts = base.model.cell.noise.drift > 0
-    found = stated_deviations(base.model, some, base.x, (TIME,)) if drifts else ()
-    if not found or (waves := found[0].waves) is None:
-        return np.zeros((n, observed.size, 0)), 0.0
-    drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])
-    loading = found[0].packed(np.where(member < base.n_measured, member, -1))
-    return drift, loading @ loading.transpose(0, 2, 1)
+    rows = member.shape[1] * observed.size
+    waves, common = np.zeros((n, observed.size, 0)), np.zeros((len(member), rows, rows))
+    for found in stated_deviations(base.model, some, base.x, (CONFIGURATION, TIME)):
+        if found.waves is not None:
+            rest = np.zeros((n - base.n_measured, *found.waves.shape[1:]))
+            waves = np.concatenate([found.waves, rest])
+        loading = found.packed(np.where(member < base.n_measured, member, -1))
+        common = common + loading @ loading.transpose(0, 2, 1)
+    return waves, common
 
 
 # Dependences without a name: any place moves smoothly with anything that was recorded.

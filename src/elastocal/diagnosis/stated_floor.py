@@ -254,7 +254,8 @@ class SupportedFloor:
 
     `best` (m) is the smallest error left at held-out poses, which no noise exceeds.  Repeats and
     near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted variance σ²
-    where νs²/σ² is below the χ² quantile; they are then the floor themselves.
+    where νs²/σ² is below the χ² quantile; they are then the floor themselves, with what
+    is stated as common to a configuration, which its repeats do not show.
     """
 
     def __init__(
@@ -276,16 +277,16 @@ class SupportedFloor:
         self.instrument = above * mean_square(data, stated)
         variance = max(fitted**2 - self.joints.sum() - self.instrument, 0.0)
         total, dof = repeats(dataset, come_back=True)
-        near = near_repeats(dataset, data, at)
+        near, common = near_repeats(dataset, data, at), min(size * dataset.common**2, variance)
         if near is not None:
-            total += near.scatter**2 * near.independent * size
+            total += max(near.scatter**2 - dataset.common**2, 0.0) * near.independent * size
             dof += near.independent * size
         if dof:
             shown = size * total / dof
             low = float(special.chdtri(dof, 1 - CONTRADICTED)) / dof
             high = float(special.chdtri(dof, CONTRADICTED)) / dof
-            if shown < low * fitted**2 or shown > high * variance:
-                variance = shown
+            if shown < low * (fitted**2 - common) or shown > high * (variance - common):
+                variance = shown + common
         self.noise, self.stands_out = min(float(np.sqrt(variance)), fitted), bool(excess.any())
         self.unexplained = float(np.sqrt(max(fitted**2 - self.noise**2, 0.0)))
 

@@ -29,7 +29,7 @@ from elastocal.model.effects.loads import feels_weight
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import reach_of, suitable_load
+from elastocal.model.rigid import highest_origins, reach_of, suitable_load
 from elastocal.model.urdf import check_urdf, xacro_left
 from elastocal.text import listed, printable
 from elastocal.units import Array, rpy_from_rotation
@@ -321,9 +321,9 @@ def _guesses(chain: Chain, reach: float, turned: Array, whose: str) -> dict[str,
     thick = max(5 * round(reach * 1e3 / THICKNESS / 5), 5)
     thin = max(5 * round(thick * 0.6 / 5), 5)
     radii = [thick if i < n - 3 else thin for i in range(n)]
-    # What stands on the mounting plane is no body that could strike it.
-    if chain.joints[0].placement[2, 3] * 1e3 <= radii[0]:
-        radii[0] = 0
+    # What never leaves the mounting plane is no body that could strike it.
+    highest = highest_origins(chain, turned[:, 2]) * 1e3
+    radii = [0 if h <= r else r for h, r in zip(highest, radii, strict=True)]
     return {
         # Off the last joint's axis, which a load on it would not turn.
         "load_point": f"load_point_m = {_vector([side, 0, side])}",

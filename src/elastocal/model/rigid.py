@@ -116,13 +116,28 @@ def nominal_flanges(chain: Chain, q: Array) -> Array:
     return np.asarray(BatchFunction([symbol], [flange])(q)[0])
 
 
+def drawn_joints(chain: Chain) -> tuple[Array, Array, Array]:
+    """Ends (joints,) of the joints' ranges, and 500 poses (500, joints) drawn between them."""
+    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
+    low, high = finite_ranges(chain, *limits)
+    return low, high, np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
+
+
+def highest_origins(chain: Chain, up: Array) -> Array:
+    """The largest height (joints,) in m of each joint's origin along `up` (3,), of drawn poses."""
+    symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
+    frames = [base, *nominal_frames(chain, symbol, base)]
+    placed = zip(frames, chain.joints, strict=False)
+    origins = ca.horzcat(*(point(T, joint.placement[:3, 3]) for T, joint in placed))
+    heights = BatchFunction([symbol], [ca.DM(up).T @ origins])(drawn_joints(chain)[2])[0]
+    return np.asarray(heights).reshape(-1, chain.n_joints).max(axis=0)
+
+
 def reach_of(chain: Chain) -> float:
     """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
     poses.  What carries an arm, as a rail, stands still: a slide before it, or several before as
     many joints as an arm has; a gantry's slides move."""
-    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
-    low, high = finite_ranges(chain, *limits)
-    q = np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
+    low, high, q = drawn_joints(chain)
     turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
     first = turning[0] if turning else 0
     if first > 1 and chain.n_joints - first < MIN_JOINTS:
