@@ -25,18 +25,12 @@ def model_of(*effects: str, **model) -> Model:
     return Model.assembled(kr270_chain(), kr270_cell(effects, **model))
 
 
-# --- weights -------------------------------------------------------------------------------
-
-
 def test_weights_without_masses_are_refused() -> None:
     massless = replace(kr270_chain(), masses=())
     cell = kr270_cell(("joint_compliance",), link_gravity=True)
     with pytest.raises(InputError, match=r"no masses: .*\[robot\] masses.*link_gravity = false"):
         Model.assembled(massless, cell)
     Model.assembled(massless, kr270_cell(("joint_compliance",)))
-
-
-# --- markers -------------------------------------------------------------------------------
 
 
 def test_an_unknown_marker_in_the_table_is_refused() -> None:
@@ -48,16 +42,10 @@ def test_an_unknown_marker_in_the_table_is_refused() -> None:
     assert np.isfinite(model.regressor(known).B).all()  # a label without rows does no harm
 
 
-# --- nominal values ------------------------------------------------------------------------
-
-
 def test_compliances_must_be_one_per_joint() -> None:
     nominal = Nominal(joint_compliance=(1e-6,) * 5)
     with pytest.raises(InputError, match=r"joint_compliance has 5 values.*has 6 joints"):
         model_of("joint_compliance", nominal=nominal)
-
-
-# --- settings and sizes
 
 
 @pytest.mark.parametrize(
@@ -121,9 +109,6 @@ def test_every_effect_vanishes_at_its_nominal_parameters() -> None:
     )
     difference = all_of_it.predict(table) - plain.predict(table)
     assert np.abs(difference).max() < 1e-14
-
-
-# --- traits, and effects of one's own
 
 
 def test_the_example_of_the_page_is_one_more_effect(tmp_path: Path) -> None:
