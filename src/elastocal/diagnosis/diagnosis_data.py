@@ -277,7 +277,7 @@ def diagnosis_data_of(
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
 
 
-def _stated_in_common(base: Baseline) -> tuple[Array, Array]:
+def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     """What the cell's [noise] states that readings share: columns (N, size, k) of the drift,
     coefficients of variance one, and the covariance (C, m, m) of what changes faster than its waves
     and of what is common to a configuration.
@@ -286,8 +286,8 @@ def _stated_in_common(base: Baseline) -> tuple[Array, Array]:
     """
     observed, member, n = base.observed, base.blocks.member, len(base.observed.lead)
     some = subset(observed, np.arange(n) < base.n_measured)
-    rows = member.shape[1] * observed.size
-    waves, common = np.zeros((n, observed.size, 0)), np.zeros((len(member), rows, rows))
+    waves = np.zeros((n, observed.size, 0))
+    common: Array | float = 0.0
     for found in stated_deviations(base.model, some, base.x, (CONFIGURATION, TIME)):
         if found.waves is not None:
             rest = np.zeros((n - base.n_measured, *found.waves.shape[1:]))

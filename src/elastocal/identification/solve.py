@@ -356,9 +356,9 @@ CERTAIN = 0.99  # of typical errors, that chance does not make them look larger
 CLIP = 1.5
 _BEYOND, _EDGE = 2 * special.ndtr(-CLIP), CLIP * np.exp(-(CLIP**2) / 2) * np.sqrt(2 / np.pi)
 _WITHIN = 1 - _BEYOND - _EDGE
-MEAN = _WITHIN + CLIP**2 * _BEYOND
-VARIANCE = 3 * _WITHIN - CLIP**2 * _EDGE + CLIP**4 * _BEYOND - MEAN**2
-UNSURE = VARIANCE / (2 * _WITHIN) ** 2
+CLIPPED_MEAN = _WITHIN + CLIP**2 * _BEYOND
+CLIPPED_VARIANCE = 3 * _WITHIN - CLIP**2 * _EDGE + CLIP**4 * _BEYOND - CLIPPED_MEAN**2
+SIZE_VARIANCE = CLIPPED_VARIANCE / (2 * _WITHIN) ** 2
 SIZE_STEPS = 100
 
 
@@ -376,15 +376,16 @@ def of_this_arm(solution: Solution, std: Array) -> tuple[Solution, float]:
     variance = sizes[kept] ** 2 + (shares**2).sum(axis=1) + std**2
     square = (fit.x - problem.model.nominal)[kept] ** 2 / variance
     square = square[known[kept] & ~np.isin(kept, chosen.with_prior)]
-    most = MEAN + special.ndtri(CERTAIN) * np.sqrt(VARIANCE / max(len(square), 1))
+    chance = np.sqrt(CLIPPED_VARIANCE / max(len(square), 1))
+    most = CLIPPED_MEAN + special.ndtri(CERTAIN) * chance
     if np.minimum(square, CLIP**2).sum() <= most * len(square):
         return solution, 0.0
     own = square.max()
     for _ in range(SIZE_STEPS):
-        own = np.minimum(square, CLIP**2 * own).mean() / MEAN
+        own = np.minimum(square, CLIP**2 * own).mean() / CLIPPED_MEAN
     sizes = np.where(known, np.sqrt(own), 1.0) * sizes
     sized = replace(fit, problem=replace(problem, sizes=sizes))
-    return replace(solution, fit=sized), UNSURE / len(square)
+    return replace(solution, fit=sized), SIZE_VARIANCE / len(square)
 
 
 def posed(
@@ -421,7 +422,7 @@ BENDS = 24
 BENT_SAMPLE = 1000  # observations it is found from: what readings at random poses have in common
 
 
-def bent(solution: Solution, covariance: Array, unsure: float = 0.0) -> tuple[Array, Array]:
+def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, Array]:
     """Root mean square (kept,) of what estimates and combinations leave out by being linear, and
     the relative variance of its square, by the draws and where the logarithm of the size of what is
     held has the variance `unsure`.

@@ -481,10 +481,8 @@ def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
 
 def _check_distances(cell: Cell) -> None:
     """Distances are from somewhere: a place that is stated, or that a fitted effect finds."""
-    base, effects = (
-        cell.model.nominal.base_position,
-        (effect_of(c.name) for c in cell.model.effects),
-    )
+    base = cell.model.nominal.base_position
+    effects = (effect_of(c.name) for c in cell.model.effects)
     placed = cell.tracker.anchor is not None or (base is not None and bool(base.any()))
     found = placed or any(each.registered and each.at != "markers" for each in effects)
     require(

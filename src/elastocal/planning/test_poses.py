@@ -37,10 +37,10 @@ LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a 
 def check_cell(cell: Cell, chain: Chain) -> None:
     where, motion = cell.source, cell.design.motion
     lower, upper = joint_limits(cell, chain)
+    levels = wish("levels", f"{where}: [design.levels]")
     for joint, values in cell.design.levels.items():
         i, split = joint_index(joint), cell.model.compliance_levels.get(joint)
         for value in values:
-            levels = wish("levels", f"{where}: [design.levels]")
             found = f"{levels} has {joint} at {told(chain, i, value)}"
             require(
                 lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
