@@ -103,6 +103,22 @@ def test_what_another_choice_of_parameters_determined_is_told_in_that_of_the_old
     assert found.distance.max() < 1e-6
 
 
+def test_what_one_session_alone_shows_is_named_and_the_rest_compared(folder):
+    """No compliance shows without a load."""
+    (folder / "both.toml").write_text(CELL.replace('"link_geometry"', '"joint_compliance"'))
+    model = ec.Model("both.toml")
+    q = np.random.default_rng(3).uniform(-1.4, 1.0, (2, 20, 6))
+    bent = {"joint2.offset": 1e-3, "joint2.compliance": 2e-6}
+    loaded = ec.identify(model, ec.simulate(model, q[0], load=[0, 0, -300.0], values=bent, seed=1))
+    for offset in (1e-3, 1.2e-3):
+        bare = ec.simulate(model, q[1], values=bent | {"joint2.offset": offset}, seed=2)
+        unloaded = ec.identify(model, bare)
+        for pair in ((loaded, unloaded), (unloaded, loaded)):
+            found = ec.compare(*pair)
+            assert [c.name for c in found.changed] == ["joint2.offset"] * (offset > 1e-3)
+            assert "joint2.compliance (one session alone shows it)" in found.not_compared
+
+
 def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
     """Without a load no compliance moves the tool."""
     soft = CELL.replace('"joint_offset", "link_geometry"', '"joint_compliance"')

@@ -8,34 +8,40 @@ up anew each time and count for neither) and V₁, V₂ their covariances,
 since two campaigns err independently.  All of z together: zᵀ (V₁ + V₂)⁻¹ z / p against F(p, ν), ν
 the smaller of the campaigns' degrees of freedom.  Each alone: |z_k| / s_k against Student's t with
 Welch and Satterthwaite's degrees of freedom, and by Holm's rule, so that with probability 1 − level
-no parameter is called changed that is not.  Where the campaigns determined other parameters, the
-new ones are told in those of the old: to first order, by the columns of B over random poses,
-z ← B₁⁺ B z, whose column spaces must be the same.  The coefficients of a smooth function are one
-thing, tested together as all of z are.
+no parameter is called changed that is not.  The coefficients of a smooth function are one thing,
+tested together as all of z are.
+
+A campaign determines sums: a parameter with shares M of those that its poses do not tell from it,
+
+    y_i = A_i X + ε_i,   A_i = [1 M_i],   ε_i ~ N(0, V_i),   X ~ N(nominal, typical²),
+
+so that other poses move estimates without any change.  With y₂ = A₂ (X + z) + ε₂, ẑ and Cov ẑ are
+those of least squares, whatever both determined; a parameter that one campaign alone determined is
+told where the data say more of its change than its typical size does.  Set-up that was left open
+counts as noise of each.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
+from scipy import linalg, special
 
 from elastocal.above import Result, checked_arguments
 from elastocal.errors import InsufficientDataError, option, require
+from elastocal.identification.least_squares import drawing_root
 from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
-from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
     Conditions,
     ToolPoint,
-    Valued,
     arm_with,
     given_arm,
     random_table,
@@ -44,12 +50,13 @@ from elastocal.model.calibrated import (
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import smooth_groups
 from elastocal.text import listed
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
-SAME_SPACE = 1e-6  # of a column of B that others should hold
-RANK = 1e-9
+WORTH_A_COLUMN = 1.0  # deviations that a typical change has to move the data by
+UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
+STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
 MOST_POSES = 100_000
@@ -90,7 +97,8 @@ class Comparison(Result):
         forces: (L, 3) N that act at these poses, in turn.
         loads_of: Where they come from: "the option", "the earlier campaign", "the later campaign",
             "the cell's plan"; empty where nothing states a load.
-        first_order: Whether the new parameters were told in those of the old.
+        first_order: Whether the campaigns determined other parameters of the arm, of which sums
+            were compared, to first order.
         not_compared: What the models have and nothing was compared of, with the reason.
 
     Examples:
@@ -247,7 +255,7 @@ def _compared(
     conditions = Conditions()
     unstated = unstated_needs(old, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
-    before, after = (arm_with(arm, stated) for arm in (old, new))
+    before = arm_with(old, stated)
     own &= {*before.model.names}
     left = [f"{name.replace('_', ' ')} (follows {listed(needs)})"
             for name, needs in unstated.items() if needs]  # fmt: skip
@@ -261,7 +269,8 @@ def _compared(
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
-    names, z, V, first_order = _difference(old, new, before, after, own, table)
+    names, z, V, hidden = _difference(old, new, [n for n in before.model.names if n in own])
+    left += [f"{name} (one session alone shows it)" for name in hidden]
     if not names:
         raise InsufficientDataError(
             f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
@@ -271,7 +280,9 @@ def _compared(
     load = cell.tool.load_point
     at = load if load.any() else next(iter(cell.tool.markers.values()), load)
     # The set-up of the old campaign for both.
-    values = before.values | {name: after.values[name] for name in own}
+    values = before.values
+    for name, change in zip(names, z.tolist(), strict=True):
+        values[name] += change
     moved = np.array([values[name] for name in before.model.names])
     tool, tool_moved = (
         CalibratedTool(replace(old, model=before.model, x=x), ToolPoint(at, None, "tool"))
@@ -291,81 +302,79 @@ def _compared(
     changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
-        forces, whose, first_order, tuple(left),
+        forces, whose, {*old.determined} & own != {*new.determined} & own, tuple(left),
     )  # fmt: skip
 
 
-def _covariance(arm: CalibratedArm, names: Sequence[str]) -> Array:
-    at = [arm.determined.index(name) for name in names]
-    V = arm.covariance[np.ix_(at, at)]
+def _estimates(arm: CalibratedArm, own: list[str]) -> tuple[IntArray, Array, Array, Array]:
+    """Which of the parameters `own` were determined (k,), y (k,) and A (k, own) with y = A X + ε,
+    and the covariance (k, k) of ε: noise, and what was left open of the set-up.
+
+    Raises InputError where the covariance has no numbers.
+    """
+    kept = np.array([k for k, name in enumerate(own) if name in arm.determined], dtype=np.int64)
+    at = [arm.determined.index(own[k]) for k in kept]
+    A, V, values = np.eye(len(own))[kept], arm.covariance[np.ix_(at, at)], arm.values
     require(
         bool(np.isfinite(V).all()),
-        f"{arm.source}: its covariance has no numbers for {', '.join(names[:3])} …; identify anew",
+        f"{arm.source}: its covariance has no numbers for {', '.join(own[:3])} …; identify anew",
     )
-    return np.asarray(V)
+    y = np.array([values[own[k]] for k in kept])
+    for name, shares, typical in _left_open(arm):
+        share = shares[at]
+        if name in own:
+            A[:, own.index(name)] = share
+            y += share * values[name]
+        else:
+            V = V + typical**2 * np.outer(share, share)
+    return kept, y, A, V
+
+
+def _left_open(arm: CalibratedArm) -> Iterator[tuple[str, Array, float]]:
+    if arm.left is not None:
+        yield from zip(arm.left.names, arm.left.mixing.T, arm.left.typical.tolist(), strict=True)
 
 
 def _difference(
-    old: CalibratedArm, new: CalibratedArm, before: Valued, after: Valued, own: set[str],
-    table: Measurements,
-) -> tuple[list[str], Array, Array, bool]:  # fmt: skip
-    """Names, z (p,), Cov z (p, p), and whether z was told to first order."""
-    first, second = ([n for n in arm.determined if n in own] for arm in (old, new))
-    a, b = before.values, after.values
-    held = [n for n in own if n not in first and n not in second]
-    if set(first) == set(second) and all(np.isclose(a[n], b[n], rtol=1e-9) for n in held):
-        z = np.array([b[n] - a[n] for n in first])
-        return first, z, _covariance(old, first) + _covariance(new, first), False
+    old: CalibratedArm, new: CalibratedArm, own: list[str]
+) -> tuple[list[str], Array, Array, list[str]]:
+    """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows."""
+    (first, y1, A1, V1), (second, y2, A2, V2) = (_estimates(arm, own) for arm in (old, new))
+    both, alone = np.intersect1d(first, second), np.setxor1d(first, second)
+    # What both determined drops out of the differences, whatever it is: T of all estimates.
+    of, side = np.append(first, second), np.repeat([-1.0, 1.0], [len(first), len(second)])
+    T = np.vstack([(both[:, None] == of) * side, alone[:, None] == of])
+    size, unknown, nominal = np.zeros(len(own)), np.zeros(len(own)), old.model.nominal
+    unknown[of] = UNKNOWN * np.sqrt(np.append(np.diag(V1), np.diag(V2)))
+    for name, _, typical in (*_left_open(old), *_left_open(new)):
+        if name in own:
+            k = own.index(name)
+            size[k] = max(size[k], typical or unknown[k])
+    G, H = T @ np.vstack([A1, A2]), T[:, len(first) :] @ A2
+    G[:, both] = 0.0
+    t = T @ np.append(y1, y2) - G @ nominal[[old.model.names.index(name) for name in own]]
+    V = T @ linalg.block_diag(V1, V2) @ T.T + (G * size**2) @ G.T
     require(
-        old.model.names == new.model.names,
-        f"{old.source} and {new.source} determine other parameters, and have other markers: "
-        "identify both with the same cell, or with the same parameters held "
-        f"({option('fixed')})",
+        bool((np.diag(V) > 0).all()),
+        f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
     )
-    # All that both fitted, set-up included, which the new campaign's choice may have moved.
-    names, marked = before.model.names, tuple(before.model.cell.tool.markers)
-    # Smooth functions that are not compared are no one's to tell others by.
-    apart = {p.name for p in before.model.parameters if p.shrunk} - own
-    known, fitted = (
-        [n for n in names if n in arm.determined and n not in apart] for arm in (old, new)
+    root = drawing_root(V)
+    W, target = np.split(
+        linalg.solve_triangular(root, np.column_stack([H, t]), lower=True), [-1], 1
     )
-    tables = [
-        replace(table, marker=np.full(len(table.q), m), marker_names=marked or table.marker_names)
-        for m in range(len(marked) or 1)
-    ]
-    B = np.vstack([before.model.regressor(t, before.x).B for t in tables])
-    onto, beyond = _spanned(B, names, known, fitted)
-    _, beyond_new = _spanned(B, names, fitted, known)
-    told = [
-        f"{by.source} does not determine what {other.source} does: {listed(hidden, NAMED)}"
-        for by, other, hidden in ((old, new, beyond), (new, old, beyond_new))
-        if hidden
-    ]
-    require(
-        not told,
-        f"{'; '.join(told)}; identify both with these held ({option('fixed')}), or from poses and "
-        "loads that show them in both",
-    )
-    M, z = onto[:, np.isin(names, fitted)], onto @ (after.x - before.x)
-    V = _covariance(old, known) + M @ _covariance(new, fitted) @ M.T
-    arms = [k for k, n in enumerate(known) if n in own]
-    return [known[k] for k in arms], z[arms], V[np.ix_(arms, arms)], True
-
-
-def _spanned(
-    B: Array, names: Sequence[str], basis: list[str], wanted: list[str]
-) -> tuple[Array, list[str]]:
-    """M (basis, parameters) with B = B[:, basis] M, and which of the `wanted` it does not hold for.
-
-    `names` are those of B's columns, `basis` those of them that a campaign determined, `wanted`
-    those that the other one did.
-    """
-    whole, own = np.linalg.norm(B, axis=0), np.isin(names, basis)
-    whole[whole == 0] = 1.0
-    onto = np.linalg.pinv((B / whole)[:, own], rcond=RANK) / whole[own, None] @ B
-    rest = np.linalg.norm(B - B[:, own] @ onto, axis=0) / whole
-    beyond = np.array(names)[rest > SAME_SPACE].tolist()
-    return np.asarray(onto), [n for n in beyond if n in wanted and n not in basis]
+    told = both.tolist()
+    for k in alone.tolist():
+        beside = W[:, told]
+        off = W[:, k] - beside @ np.linalg.lstsq(beside, W[:, k], rcond=None)[0]
+        if np.linalg.norm(off) * size[k] > WORTH_A_COLUMN:
+            told.append(k)
+    length = np.linalg.norm(W[:, told], axis=0)
+    half = np.linalg.pinv(W[:, told] / length) / length[:, None]
+    # What one that is told stands for is no less told.
+    shares = np.abs(np.vstack([A1, A2])[np.isin(of, np.intersect1d(alone, told))]) * size
+    covered = (shares > STANDS_FOR * shares.max(axis=1, initial=0.0)[:, None]).any(axis=0)
+    hidden = [own[k] for k in alone if k not in told and not covered[k]]
+    return [own[k] for k in told], (half @ target)[:, 0], half @ half.T, hidden
 
 
 def _tested(
@@ -374,10 +383,6 @@ def _tested(
 ) -> tuple[tuple[ParameterChange, ...], float]:  # fmt: skip
     """Each parameter and each smooth function by Holm's rule, and p of all together.  `functions`:
     parameter → that which it is part of; `B` (poses, 3, p) in m per unit at the tool."""
-    require(
-        bool((np.diag(V) > 0).all()),
-        f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
-    )
     std = np.sqrt(np.diag(V))
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))

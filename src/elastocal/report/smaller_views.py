@@ -90,8 +90,8 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     ]
     if c.first_order:
         compared.append(
-            "The sessions determined other parameters; the new ones are given in those of the old, "
-            "to first order."
+            "The sessions determined different parameters; what both show is compared, to first "
+            "order."
         )
     if mostly := dict.fromkeys((*c.old.by_prior, *c.new.by_prior)):
         compared.append(
