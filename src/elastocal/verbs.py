@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
+from elastocal import ROOMS
 from elastocal.above import checked_arguments, later, shown, whole
 from elastocal.errors import InputError, option, options_given, require
 from elastocal.text import quoted
@@ -39,23 +40,17 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 else:
     globals().update(later(
+        *(f"elastocal.{room} {names}" for room, names in ROOMS.items()),
         "numpy.typing ArrayLike",
         "pandas DataFrame",
         "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.cell.work_cell Cell",
-        "elastocal.compensation.compensate Compensation Targets",
-        "elastocal.diagnosis.diagnosis Diagnosis",
-        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
+        "elastocal.compensation.compensate Targets",
+        "elastocal.identification.knowledge Constraints GaussianPrior",
         "elastocal.identification.options FaultyReadings IntervalKind Method",
-        "elastocal.identification.result Calibration",
         "elastocal.identification.weighted_problem WeightKind",
-        "elastocal.measurements Measurements",
-        "elastocal.model.calibrated CalibratedArm",
-        "elastocal.model.manipulator Model",
         "elastocal.planning.design Effort",
-        "elastocal.planning.plan Plan",
         "numpy.random Generator",
-    ))  # fmt: skip
+    ) | globals())  # fmt: skip
 
 # Each verb imports what it calls: one should not load another, and --help none of them.
 

@@ -452,13 +452,8 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "poses_without_point": [] if joined is None else list(joined.unused),
         "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
         "files": [
-            {
-                **observed,
-                "columns": [
-                    {"from": name, "to": to, "unit": unit} for name, to, unit in observed["columns"]
-                ],
-                "ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]],
-            }
+            observed
+            | {"ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]]}
             for observed in found.understood
         ],
         "warnings": list(found.warnings),

@@ -347,7 +347,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
             f"{seen['file']}: {say.counted(seen['rows'], 'row')} of {ROLES[seen['role']]} "
             f"({preset}{seen['encoding']}, {seen['layout']}{decimals})"
         )
-        rows = [(name, column, unit or "–") for name, column, unit in seen["columns"]]
+        rows = [(each["from"], each["to"], each["unit"] or "–") for each in seen["columns"]]
         yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
         yield say.Lines([("Not used", listed(seen["unused"], 20))])
     columns = found.columns
