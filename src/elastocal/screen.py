@@ -90,18 +90,14 @@ def noting_interrupts() -> Iterator[list[int]]:
         if what.exc_type is not KeyboardInterrupt:
             hooks[1](what)
         elif interrupts:
-            threading.Timer(0.05, _press_again).start()
+            # Unless all is written by then.
+            threading.Timer(0.05, lambda: _ended or os.kill(os.getpid(), signal.SIGINT)).start()
 
     sys.unraisablehook = swallowed
     try:
         yield interrupts
     finally:
         sys.excepthook, sys.unraisablehook = hooks
-
-
-def _press_again() -> None:
-    if not _ended:
-        os.kill(os.getpid(), signal.SIGINT)
 
 
 def _note(number: int, frame: FrameType | None) -> None:

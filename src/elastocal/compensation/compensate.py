@@ -516,7 +516,6 @@ LARGE_CORRECTION = np.radians(2.0)  # rad (or m) of a joint
 LEVEL_SLACK = 0.01  # rad or m
 WORTH_TELLING = 10e-6  # m
 
-
 UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
 
 
@@ -650,7 +649,6 @@ def _rows(targets: Targets, which: NDArray) -> str:
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
 DIGITS = 9
-
 
 REMEDIES = {
     "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "

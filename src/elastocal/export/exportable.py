@@ -387,7 +387,6 @@ JOINT, SIDE = "joint", "approach"
 MOST_BYTES = 50_000_000
 SEEN = 1e-7  # rad or m: a curve that stays below moves a tool by 0.1 µm in a metre
 
-
 # Joint (0-based), what it follows, positions (k,) of that and deltas (k,) of the joint.
 Curve = tuple[int, str, Array, Array]
 

@@ -142,7 +142,6 @@ def rendered(figure: Drawing) -> str:
 
 NO_LENGTH = 1e-6  # of a line that is a dot: of none at all a PNG has no caps
 
-
 ROW = 0.27  # inches per line of a name
 LONGEST = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.

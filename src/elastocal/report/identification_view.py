@@ -74,8 +74,8 @@ def calibration_blocks(
         ("Truth", held if truth else None),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    residuals = Residuals(result.model, result.observations, result.residual)
-    yield say.Fold("", residuals.figures, figures=("residuals", "against_joints"))
+    residuals = cache(lambda: Residuals(result.model, result.observations, result.residual))
+    yield say.Fold("", lambda: residuals().figures(), figures=("residuals", "against_joints"))
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
     yield say.Fold("Method, noise and intervals", lambda: _method(result), printed=True)
     missing = undetermined_table(result, truth)
@@ -93,7 +93,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: _on_the_arm(result, residuals),
+        lambda: _on_the_arm(result, residuals()),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)

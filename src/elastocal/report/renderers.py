@@ -70,7 +70,6 @@ VIEWS = {
     "Measurements": ("smaller_views", "readings_blocks", "Readings"),
 }
 
-
 PRINTED_WIDTH = 100  # columns of a result as plain text
 WIDEST = 1000  # columns; more than any table needs
 STYLES = {"inside": "green", "outside": "bold red", "changed": "bold yellow"}
