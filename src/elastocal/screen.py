@@ -90,14 +90,18 @@ def noting_interrupts() -> Iterator[list[int]]:
         if what.exc_type is not KeyboardInterrupt:
             hooks[1](what)
         elif interrupts:
-            # Unless all is written by then.
-            threading.Timer(0.05, lambda: _ended or os.kill(os.getpid(), signal.SIGINT)).start()
+            threading.Timer(0.05, _press_again).start()
 
     sys.unraisablehook = swallowed
     try:
         yield interrupts
     finally:
         sys.excepthook, sys.unraisablehook = hooks
+
+
+def _press_again() -> None:
+    if not _ended:
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def _note(number: int, frame: FrameType | None) -> None:
