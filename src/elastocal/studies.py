@@ -599,19 +599,11 @@ class Ending:
 
 
 def run_study(
-    study: Study,
-    output: str | Path,
-    *,
-    jobs: int | None = None,
-    cluster: str | None = None,
-    only: int | None = None,
-    restart: bool = False,
-    retry_failed: bool = False,
-    stop: StudyStop | None = None,
-    progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
-    tell: Callable[[str], None] = print,
-    **way: Any,
-) -> Ending:
+    study: Study, output: str | Path, *, jobs: int | None = None, cluster: str | None = None,
+    only: int | None = None, restart: bool = False, retry_failed: bool = False,
+    stop: StudyStop | None = None, progress: Callable[[int, int, int], None] = lambda *told: None,
+    tell: Callable[[str], None] = print, **way: Any,
+) -> Ending:  # fmt: skip
     """Run the tasks that have no result yet (of the first `only`) and record what comes.
 
     They run in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`,

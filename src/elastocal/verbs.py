@@ -642,11 +642,9 @@ def check_frame(frame: str) -> None:
 
 
 def _targets(
-    targets: Targets | str | Path | ArrayLike,
-    kinds: tuple[str, ...],
-    frame: Literal["base", "tracker"],
-    force: Array | None,
-) -> Targets:
+    targets: Targets | str | Path | ArrayLike, kinds: tuple[str, ...],
+    frame: Literal["base", "tracker"], force: Array | None,
+) -> Targets:  # fmt: skip
     import numpy as np
 
     from elastocal.compensation.compensate import Targets, read_targets, targets_at
