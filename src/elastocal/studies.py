@@ -133,8 +133,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
     settled: dict[str, Any] = {"title": stated.title or whole.name, "options": chosen}
     settled |= {} if seed is None else {"seed": seed}
-    contents = _contents(whole, stated, path)
-    sources = Sources(whole, contents, stated.model_copy(update=settled))
+    sources = Sources(whole, _contents(whole, stated, path), stated.model_copy(update=settled))
     module = load(sources)
     return Study(folder, sources, module, tuple(_tasks(folder, module, sources)))
 

@@ -189,8 +189,7 @@ def design_request(
     from elastocal.planning.design import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
-    of_the_search = ("effort", "seed", "jobs")
-    search = {name: asked.pop(name) for name in of_the_search if name in asked}
+    search = {name: asked.pop(name) for name in ("effort", "seed", "jobs") if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
     named = tuple(name for name, given in asked.items() if given is not None)

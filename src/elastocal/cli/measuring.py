@@ -327,8 +327,7 @@ def simulate(
     from elastocal.model.manipulator import Model
     from elastocal.saving import WRITERS, write_json
 
-    tables = " ".join(WRITERS["Measurements"])
-    run.writes((output, tables), (truth, ".json"))
+    run.writes((output, " ".join(WRITERS["Measurements"])), (truth, ".json"))
     model = Model(cell, plugins=run.plugins)
     run.reads(cell, plan, cell=model.cell)
     poses = model.read_plan(plan)

@@ -222,8 +222,7 @@ def next_command(
     from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan
 
-    summary = beside(output)
-    run.writes((output, ".csv"), (summary, ".json"))
+    run.writes((output, ".csv"), (beside(output), ".json"))
     limits = limits_of([] if required is None else [required], ("new_poses",))
     known = cell_of(cell, run.plugins)
     run.reads(cell, data, cell=known)

@@ -361,8 +361,7 @@ def posed(name: str, title: str, caption: str, space: Space) -> say.Figure:
             axes.set_xlabel("x in m")
             axes.set_ylabel(f"{up} in m")
         if space.groups:
-            handles = axes.get_legend_handles_labels()
-            figure.legend(*handles, loc="outside lower center", ncols=4)
+            figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
     return say.Figure(name, title, draw, 7.0, caption, space=space)
 
@@ -373,8 +372,7 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
     Raises InputError for another suffix and an unwritable place.
     """
     suffix = Path(path).suffix.lower()
-    told = f"{path}: a picture of poses is written as .png or .svg"
-    require(suffix in (".png", ".svg"), told)
+    require(suffix in (".png", ".svg"), f"{path}: a picture of poses is written as .png or .svg")
     figure: Any = figure_of(plan_arm(plan))
     picture = BytesIO()
     nothing = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}

@@ -450,8 +450,7 @@ class Residuals:
         n = len(observed.lead)
         self.shown = np.arange(n)
         if n > MOST_DRAWN:
-            chosen = np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False)
-            self.shown = np.sort(chosen)
+            self.shown = np.sort(np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False))
 
     def figures(self) -> Iterator[say.Figure]:
         yield self.by_configuration()
@@ -579,8 +578,7 @@ class Residuals:
             rms = float(np.sqrt((sizes**2).mean()))
             # Of the mean the digits that so many readings determine.
             known = say.with_uncertainty(mean, rms / math.sqrt(len(sizes)))[0]
-            each = known, say.significant(rms), told(largest)
-            rows.append((name, str(len(sizes)), *each, unit))
+            rows.append((name, str(len(sizes)), known, say.significant(rms), told(largest), unit))
         heads = ("readings of", "number", "mean", "rms", "largest", "unit")
         return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
