@@ -318,8 +318,7 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
         if name in data:
             found[name] = _value(one.kind, data[name], spot / name, one.takes)
         else:
-            missing = f"key {spot.key(name)} is missing; it takes {one.takes}"
-            spot.require(not one.required, missing)
+            spot.require(not one.required, f"key {spot.key(name)} is missing; it takes {one.takes}")
     if issubclass(cls, BaseModel):
         return cls.model_construct(**found)
     return from_table(cls, found, spot)
@@ -544,8 +543,7 @@ def _direction(value: object) -> Array:
 
 def direction(vector: Array, spot: Spot, name: str) -> Array:
     """The same of a key."""
-    told = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
-    spot.require(np.any(vector), told)
+    spot.require(np.any(vector), f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]")
     return _direction(vector)
 
 

@@ -429,12 +429,9 @@ def joint_columns(kinds: Sequence[str], before: str = "") -> list[str]:
 
 
 def columns_of(
-    source: str,
-    header: Sequence[str],
-    joint_kinds: Sequence[str],
-    observe: str,
+    source: str, header: Sequence[str], joint_kinds: Sequence[str], observe: str,
     extra: Sequence[Family] = (),
-) -> Columns:
+) -> Columns:  # fmt: skip
     """What the columns of a table mean.
 
     `joint_kinds`: "revolute" or "prismatic" per joint; `observe` decides what must be there;
@@ -482,13 +479,9 @@ READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured
 
 
 def read_measurements(
-    path: str | Path,
-    *,
-    joint_kinds: tuple[str, ...],
-    marker_names: tuple[str, ...] = (),
-    observe: str = "position",
-    text: str | None = None,
-) -> Measurements:
+    path: str | Path, *, joint_kinds: tuple[str, ...], marker_names: tuple[str, ...] = (),
+    observe: str = "position", text: str | None = None,
+) -> Measurements:  # fmt: skip
     """The measurements of a CSV or Parquet (.parquet, .pq) file, in SI units.
 
     `joint_kinds`: "revolute" or "prismatic" per joint of the robot; `marker_names`: the cell's

@@ -191,8 +191,7 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
             or ("", 0)
         )
         text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
-        told = f"{where}: {file}, line {line}: {text}; correct the plug-in"
-        raise InputError(told) from error
+        raise InputError(f"{where}: {file}, line {line}: {text}; correct the plug-in") from error
 
 
 # What may be registered, whatever it is.

@@ -146,8 +146,7 @@ def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
     from elastocal.export.export import Wish, export, write
 
     correction = how.pop("joint_correction", None)
-    wish = Wish(path, **how, correct_joints=correction is not None)
-    write(export(arm, wish), path, correction)
+    write(export(arm, Wish(path, **how, correct_joints=correction is not None)), path, correction)
 
 
 def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:

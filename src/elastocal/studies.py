@@ -133,8 +133,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
         _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
     settled: dict[str, Any] = {"title": stated.title or whole.name, "options": chosen}
     settled |= {} if seed is None else {"seed": seed}
-    contents = _contents(whole, stated, path)
-    sources = Sources(whole, contents, stated.model_copy(update=settled))
+    sources = Sources(whole, _contents(whole, stated, path), stated.model_copy(update=settled))
     module = load(sources)
     return Study(folder, sources, module, tuple(_tasks(folder, module, sources)))
 
@@ -599,19 +598,11 @@ class Ending:
 
 
 def run_study(
-    study: Study,
-    output: str | Path,
-    *,
-    jobs: int | None = None,
-    cluster: str | None = None,
-    only: int | None = None,
-    restart: bool = False,
-    retry_failed: bool = False,
-    stop: StudyStop | None = None,
-    progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
-    tell: Callable[[str], None] = print,
-    **way: Any,
-) -> Ending:
+    study: Study, output: str | Path, *, jobs: int | None = None, cluster: str | None = None,
+    only: int | None = None, restart: bool = False, retry_failed: bool = False,
+    stop: StudyStop | None = None, progress: Callable[[int, int, int], None] = lambda *told: None,
+    tell: Callable[[str], None] = print, **way: Any,
+) -> Ending:  # fmt: skip
     """Run the tasks that have no result yet (of the first `only`) and record what comes.
 
     They run in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`,

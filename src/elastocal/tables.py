@@ -149,14 +149,9 @@ def _rows(
 
 
 def first_bad_cell(
-    source: str,
-    rows: Iterable[Row],
-    columns: Mapping[int, str],
-    comma_allowed: bool,
-    blanks: Container[str] = (),
-    marks: dict[str, str] | None = None,
-    noun: str = "line",
-) -> InputError | None:
+    source: str, rows: Iterable[Row], columns: Mapping[int, str], comma_allowed: bool,
+    blanks: Container[str] = (), marks: dict[str, str] | None = None, noun: str = "line",
+) -> InputError | None:  # fmt: skip
     """What is wrong with the first bad cell of `rows`, or None.
 
     `columns`: field index → header of the number columns; `comma_allowed`: decimal commas may
@@ -253,12 +248,10 @@ Choose = Callable[[Sequence[str]], Columns]  # by the header
 
 
 def match_columns(
-    source: str,
-    header: Sequence[str],
-    known: Mapping[str, Family],
+    source: str, header: Sequence[str], known: Mapping[str, Family],
     passed_over: Callable[[str], bool] = lambda text: False,
     explain: Callable[[str], str | None] = lambda text: None,
-) -> Columns:
+) -> Columns:  # fmt: skip
     """Which column of a header is which of the `known` families.
 
     `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
@@ -301,13 +294,10 @@ def match_columns(
 
 
 def check_columns(
-    source: str,
-    columns: Columns,
-    known: Mapping[str, Family],
-    needed: Sequence[Sequence[str]] = (),
-    needed_by: str = "",
+    source: str, columns: Columns, known: Mapping[str, Family],
+    needed: Sequence[Sequence[str]] = (), needed_by: str = "",
     exclusive: Sequence[tuple[str, str]] = (),
-) -> Columns:
+) -> Columns:  # fmt: skip
     """These columns, where they make a table: no family is there in part.
 
     `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
@@ -472,14 +462,9 @@ PARQUET = (".parquet", ".pq")
 
 
 def read_table(
-    path: str | Path,
-    choose: Choose,
-    *,
-    what: str = "measurement table",
-    comments: bool = False,
-    text: str | None = None,
-    most: int = MOST_BYTES,
-) -> RawTable:
+    path: str | Path, choose: Choose, *, what: str = "measurement table", comments: bool = False,
+    text: str | None = None, most: int = MOST_BYTES,
+) -> RawTable:  # fmt: skip
     """The columns of a CSV or Parquet (.parquet, .pq) file that `choose` picks from its header.
 
     `what` names the kind of table in messages; `comments`: lines that begin with # are passed
@@ -577,11 +562,9 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
 
 
 def write_csv(
-    handle: TextIO,
-    header: Iterable[str],
-    rows: Iterable[Iterable[object]],
+    handle: TextIO, header: Iterable[str], rows: Iterable[Iterable[object]],
     comments: Iterable[str] = (),
-) -> None:
+) -> None:  # fmt: skip
     """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
     handle.writelines(f"# {printable(comment)}\n" for comment in comments)
     writer = csv.writer(handle, lineterminator="\n")

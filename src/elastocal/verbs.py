@@ -14,6 +14,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
+from elastocal import ROOMS
 from elastocal.above import checked_arguments, later, shown, whole
 from elastocal.errors import InputError, option, options_given, require
 from elastocal.text import quoted
@@ -39,23 +40,17 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 else:
     globals().update(later(
+        *(f"elastocal.{room} {names}" for room, names in ROOMS.items()),
         "numpy.typing ArrayLike",
         "pandas DataFrame",
         "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.cell.work_cell Cell",
-        "elastocal.compensation.compensate Compensation Targets",
-        "elastocal.diagnosis.diagnosis Diagnosis",
-        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
+        "elastocal.compensation.compensate Targets",
+        "elastocal.identification.knowledge Constraints GaussianPrior",
         "elastocal.identification.options FaultyReadings IntervalKind Method",
-        "elastocal.identification.result Calibration",
         "elastocal.identification.weighted_problem WeightKind",
-        "elastocal.measurements Measurements",
-        "elastocal.model.calibrated CalibratedArm",
-        "elastocal.model.manipulator Model",
         "elastocal.planning.design Effort",
-        "elastocal.planning.plan Plan",
         "numpy.random Generator",
-    ))  # fmt: skip
+    ) | globals())  # fmt: skip
 
 # Each verb imports what it calls: one should not load another, and --help none of them.
 
@@ -194,8 +189,7 @@ def design_request(
     from elastocal.planning.design import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
-    of_the_search = ("effort", "seed", "jobs")
-    search = {name: asked.pop(name) for name in of_the_search if name in asked}
+    search = {name: asked.pop(name) for name in ("effort", "seed", "jobs") if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
     named = tuple(name for name, given in asked.items() if given is not None)
@@ -647,11 +641,9 @@ def check_frame(frame: str) -> None:
 
 
 def _targets(
-    targets: Targets | str | Path | ArrayLike,
-    kinds: tuple[str, ...],
-    frame: Literal["base", "tracker"],
-    force: Array | None,
-) -> Targets:
+    targets: Targets | str | Path | ArrayLike, kinds: tuple[str, ...],
+    frame: Literal["base", "tracker"], force: Array | None,
+) -> Targets:  # fmt: skip
     import numpy as np
 
     from elastocal.compensation.compensate import Targets, read_targets, targets_at

@@ -274,13 +274,9 @@ class Run:
 
 
 def command(
-    *name: str,
-    verb: Callable[..., Any] | None = None,
-    offers: str = "",
-    texts: Texts | None = None,
-    flags: str = "plugins json quiet",
-    **how: Any,
-) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    *name: str, verb: Callable[..., Any] | None = None, offers: str = "",
+    texts: Texts | None = None, flags: str = "plugins json quiet", **how: Any,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:  # fmt: skip
     """Register a command of the app, which ends with a message where the user can act on it."""
 
     def register(function: Callable[..., None]) -> Callable[..., None]:

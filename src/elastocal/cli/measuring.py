@@ -43,16 +43,10 @@ if TYPE_CHECKING:
 
 @command(short_help="Write a working cell file for my arm", flags="")
 def init(
-    robot: Path,
-    output: Output = Path("cell.toml"),
-    base: str | None = None,
-    flange: str | None = None,
-    convention: str = "standard",
-    ur_model: str | None = None,
-    force: bool = False,
-    *,
-    run: Run,
-) -> None:
+    robot: Path, output: Output = Path("cell.toml"), base: str | None = None,
+    flange: str | None = None, convention: str = "standard", ur_model: str | None = None,
+    force: bool = False, *, run: Run,
+) -> None:  # fmt: skip
     """Write a working cell: joints and limits from the robot's file, commented guesses elsewhere.
 
     Example: elastocal init arm.urdf -o cell.toml
@@ -315,16 +309,9 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     offers="draw load repeats seed",
 )
 def simulate(
-    cell: CellFile,
-    plan: Path,
-    output: Output,
-    set_: list[str] | None = None,
-    truth: Path | None = None,
-    no_noise: bool = False,
-    *,
-    asked: Asked,
-    run: Run,
-) -> None:
+    cell: CellFile, plan: Path, output: Output, set_: list[str] | None = None,
+    truth: Path | None = None, no_noise: bool = False, *, asked: Asked, run: Run,
+) -> None:  # fmt: skip
     """Simulate measurements from the cell's model, with chosen errors and noise.
 
     Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
@@ -340,8 +327,7 @@ def simulate(
     from elastocal.model.manipulator import Model
     from elastocal.saving import WRITERS, write_json
 
-    tables = " ".join(WRITERS["Measurements"])
-    run.writes((output, tables), (truth, ".json"))
+    run.writes((output, " ".join(WRITERS["Measurements"])), (truth, ".json"))
     model = Model(cell, plugins=run.plugins)
     run.reads(cell, plan, cell=model.cell)
     poses = model.read_plan(plan)
@@ -452,13 +438,8 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "poses_without_point": [] if joined is None else list(joined.unused),
         "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
         "files": [
-            {
-                **observed,
-                "columns": [
-                    {"from": name, "to": to, "unit": unit} for name, to, unit in observed["columns"]
-                ],
-                "ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]],
-            }
+            observed
+            | {"ignored": [{"line": line, "reason": why} for line, why in observed["ignored"]]}
             for observed in found.understood
         ],
         "warnings": list(found.warnings),

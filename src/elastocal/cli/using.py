@@ -47,18 +47,10 @@ if TYPE_CHECKING:
     "outliers jobs seed",
 )
 def identify(
-    cell: CellFile,
-    data: DataFile,
-    output: JsonFile = None,
-    report: ReportFile = None,
-    certificate: Path | None = None,
-    residuals: Path | None = None,
-    require: list[str] | None = None,
-    *,
-    asked: Asked,
-    details: bool = False,
-    run: Run,
-) -> None:
+    cell: CellFile, data: DataFile, output: JsonFile = None, report: ReportFile = None,
+    certificate: Path | None = None, residuals: Path | None = None,
+    require: list[str] | None = None, *, asked: Asked, details: bool = False, run: Run,
+) -> None:  # fmt: skip
     """What are the parameters of my arm, and how certain are they?
 
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
@@ -115,17 +107,10 @@ MOST_POSES = 10
 
 @command(verb=verbs.diagnose, offers="without seed")
 def diagnose(
-    cell: CellFile,
-    data: DataFile,
-    output: JsonFile = None,
-    report: ReportFile = None,
-    plan: Path | None = None,
-    poses: Annotated[int | None, typer.Option(min=1)] = None,
-    cell_out: Path | None = None,
-    *,
-    asked: Asked,
-    run: Run,
-) -> None:
+    cell: CellFile, data: DataFile, output: JsonFile = None, report: ReportFile = None,
+    plan: Path | None = None, poses: Annotated[int | None, typer.Option(min=1)] = None,
+    cell_out: Path | None = None, *, asked: Asked, run: Run,
+) -> None:  # fmt: skip
     """Why does the real arm still differ from the model?
 
     Finds the unmodelled effect that explains the remaining error, its place, and how far the
@@ -210,18 +195,12 @@ def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> st
 
 @command("next")
 def next_command(
-    cell: CellFile,
-    data: DataFile,
-    output: Output,
-    batch: Annotated[int, typer.Option(min=1)] = 5,
+    cell: CellFile, data: DataFile, output: Output, batch: Annotated[int, typer.Option(min=1)] = 5,
     required: Annotated[str | None, typer.Option("--require")] = None,
     least_gain: Annotated[float, typer.Option(min=0, max=99)] = 1.0,
-    candidates: Annotated[int, typer.Option(min=1)] = 400,
-    jobs: int = 1,
-    seed: Seed = 0,
-    *,
+    candidates: Annotated[int, typer.Option(min=1)] = 400, jobs: int = 1, seed: Seed = 0, *,
     run: Run,
-) -> None:
+) -> None:  # fmt: skip
     """Which poses should I measure next, or are these enough?
 
     Diagnoses and identifies the measurements so far, and writes the next poses (CSV and
@@ -243,8 +222,7 @@ def next_command(
     from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan
 
-    summary = beside(output)
-    run.writes((output, ".csv"), (summary, ".json"))
+    run.writes((output, ".csv"), (beside(output), ".json"))
     limits = limits_of([] if required is None else [required], ("new_poses",))
     known = cell_of(cell, run.plugins)
     run.reads(cell, data, cell=known)
@@ -361,21 +339,12 @@ def _check(
 
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
 def export(
-    cell: CellFile,
-    result: ResultFile,
-    output: Output,
-    format: str | None = None,
-    load: FORCE | None = None,
-    frames: Annotated[bool, typer.Option("--frames/--no-frames")] = True,
-    base_frame: bool = False,
-    joint_correction: Path | None = None,
-    temperature_c: float | None = None,
-    time_s: float | None = None,
-    poses: Annotated[int, typer.Option(min=2, max=1_000_000)] = 500,
-    seed: Seed = 0,
-    *,
-    run: Run,
-) -> None:
+    cell: CellFile, result: ResultFile, output: Output, format: str | None = None,
+    load: FORCE | None = None, frames: Annotated[bool, typer.Option("--frames/--no-frames")] = True,
+    base_frame: bool = False, joint_correction: Path | None = None,
+    temperature_c: float | None = None, time_s: float | None = None,
+    poses: Annotated[int, typer.Option(min=2, max=1_000_000)] = 500, seed: Seed = 0, *, run: Run,
+) -> None:  # fmt: skip
     """Write the calibrated arm as URDF, MJCF, DH table or parameters, and state the loss.
 
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
@@ -421,19 +390,12 @@ def export(
 
 @command(short_help="What has changed since the last calibration?")
 def compare(
-    cell: Path,
-    old: Path,
-    new: Annotated[Path | None, typer.Argument()] = None,
+    cell: Path, old: Path, new: Annotated[Path | None, typer.Argument()] = None,
     cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
-    output: JsonFile = None,
-    report: ReportFile = None,
-    load: FORCE | None = None,
-    level: float = 0.05,
-    poses: Annotated[int, typer.Option(min=2, max=100_000)] = 300,
-    seed: Seed = 0,
-    *,
-    run: Run,
-) -> None:
+    output: JsonFile = None, report: ReportFile = None, load: FORCE | None = None,
+    level: float = 0.05, poses: Annotated[int, typer.Option(min=2, max=100_000)] = 300,
+    seed: Seed = 0, *, run: Run,
+) -> None:  # fmt: skip
     """What has changed between two calibrations: by parameter, and how far the tool moved.
 
     Example: elastocal compare cell.toml january.json june.json --report changes.html

@@ -152,8 +152,7 @@ def targets_at(
 ) -> Targets:  # fmt: skip
     """Targets that no table states, all under one `force` (3,) N; errors name `source`."""
     n = next(len(given) for given in (position, q) if given is not None)
-    pull = np.zeros(3) if force is None else force
-    table = Measurements.of_poses(source, np.zeros((n, 0)), pull)
+    table = Measurements.of_poses(source, np.zeros((n, 0)), np.zeros(3) if force is None else force)
     return Targets(table, frame, position, rotation, q)
 
 
@@ -516,7 +515,6 @@ LARGE_CORRECTION = np.radians(2.0)  # rad (or m) of a joint
 LEVEL_SLACK = 0.01  # rad or m
 WORTH_TELLING = 10e-6  # m
 
-
 UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
 
 
@@ -634,8 +632,7 @@ def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: BoolArray) -> Arr
     for name in list(arm.model.cell.tool.markers)[:MARKERS_ASKED]:
         tool = CalibratedTool(arm, tool_point(arm.model.cell, name))
         values = tool.rows(c.targets.moved(c.q, c.force))
-        sure = uncertainty_at(tool, [v[rows] for v in values], c.q[rows])
-        found = np.minimum(found, sure.std)
+        found = np.minimum(found, uncertainty_at(tool, [v[rows] for v in values], c.q[rows]).std)
     return found
 
 
@@ -650,7 +647,6 @@ def _rows(targets: Targets, which: NDArray) -> str:
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
 DIGITS = 9
-
 
 REMEDIES = {
     "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "
@@ -692,8 +688,7 @@ def commands_csv(result: Compensation) -> str:
     data's frame, as in every plan, so that `simulate` can read the table.
     """
     held, kinds = np.where(result.reached[:, None], 1.0, np.nan), result.chain.kinds
-    q = in_file_units(result.q, kinds)
-    blocks = [(joint_columns(kinds), held * q, f".{DIGITS}f")]
+    blocks = [(joint_columns(kinds), held * in_file_units(result.q, kinds), f".{DIGITS}f")]
     table = result.targets.table
     if result.force.any():
         blocks.append((["force_x_N", "force_y_N", "force_z_N"], result.force, ".9g"))

@@ -53,8 +53,7 @@ class CorrectionGrid:
         """(N, axes), neighbours one step apart, so that a posture can be followed through."""
         points = self.axes[0][:, None]
         for axis in self.axes[1:]:
-            n = len(points)
-            turns = [axis if i % 2 == 0 else axis[::-1] for i in range(n)]
+            turns = [axis if i % 2 == 0 else axis[::-1] for i in range(len(points))]
             points = np.column_stack([np.repeat(points, len(axis), axis=0), np.concatenate(turns)])
         return points
 

@@ -45,7 +45,6 @@ FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json", "corrections")
 FRAMED = ("urdf", "mjcf")
 FITTED = (*FRAMED, "dh", "mdh")
 
-
 SCHEMA = "elastocal/export/1"
 MOST_POSES = 1_000_000
 
@@ -612,7 +611,6 @@ CONVENTIONS: dict[str, Convention] = {"dh": "standard", "mdh": "modified"}
 HEADER = ("joint", "type", "theta0_rad", "d_m", "a_m", "alpha_rad", "beta_rad")
 LIMITS = {"revolute": ("lower_rad", "upper_rad"), "prismatic": ("lower_m", "upper_m")}
 ZERO = 1e-14  # m or rad; rounding of a product of rotations
-
 
 # One row of the table: its name, its joint, None for a fixed one, and its numbers.
 Line = tuple[str, Joint | None, Array]

@@ -101,8 +101,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
     file has no column of measured torques.
     """
-    chosen = calibrated.effects
-    instrument = tuple(name for name in chosen if CATALOGUE[name].of_the_measurement)
+    instrument = tuple(name for name in calibrated.effects if CATALOGUE[name].of_the_measurement)
     unstated = unstated_needs(calibrated, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
     full = arm_with(calibrated, stated)
@@ -115,8 +114,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         if format in CATALOGUE[name].formats and not reason:
             kept.append(name)
         else:
-            without = arm_with(calibrated, set(stated) - {name})
-            omissions.append(Omission(name, reason, without))
+            omissions.append(Omission(name, reason, arm_with(calibrated, set(stated) - {name})))
     for name, needs in unstated.items():
         if needs:
             missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
@@ -387,7 +385,6 @@ JOINT, SIDE = "joint", "approach"
 MOST_BYTES = 50_000_000
 SEEN = 1e-7  # rad or m: a curve that stays below moves a tool by 0.1 µm in a metre
 
-
 # Joint (0-based), what it follows, positions (k,) of that and deltas (k,) of the joint.
 Curve = tuple[int, str, Array, Array]
 
@@ -582,8 +579,7 @@ def _gears(kept: Kept) -> JointCorrection:
         x = np.linspace(low, high, int(np.ceil((high - low) / FINE)) + 1)
         q = np.tile(middle, (len(x) + 1, 1))
         q[1:, i] = x
-        rng = np.random.default_rng(0)
-        table = table_at(part.model, conditions, q, np.zeros(3), rng)
+        table = table_at(part.model, conditions, q, np.zeros(3), np.random.default_rng(0))
         still = np.zeros(q.shape)  # of no direction, though the joints have moved before
         table = replace(table, approach=still, direction=still + 1e-12, move=still)
         moved = np.broadcast_to(function(*row_inputs(arm, table), part.x)[0][..., 0], q.shape)

@@ -138,7 +138,6 @@ def with_loads_of_names(
 
 WHOLE = re.compile(r"-?[0-9]{1,15}")
 
-
 # Header → n texts or numbers, in the order of the table; note_source says where each row is from.
 Columns = dict[str, Sequence[str] | NDArray]
 

@@ -423,9 +423,8 @@ class Records:
     `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` (name,
     configuration, marker, repeat, load) → n texts; `load` of all rows, where one is stated.
     `understood` says for people what was made of the file, by the keys of the command's JSON:
-    `columns` are (its name in the file, column of the measurement table, unit), `unused` names of
-    the file's other columns, `ignored` (line, reason) of everything passed over; `doubts`: what to
-    warn of.
+    `unused` names of the file's other columns, `ignored` (line, reason) of everything passed over;
+    `doubts`: what to warn of.
     """
 
     file: list[str]
@@ -568,7 +567,10 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     understood = {
         "file": name, "preset": source.preset, "role": "",
         "encoding": encoding, "layout": table.layout, "decimal": cells.decimal,
-        "columns": tuple(dict.fromkeys((c.header, column(c.stem, c.unit), c.unit) for c in every)),
+        "columns": [
+            {"from": header, "to": column(stem, unit), "unit": unit}
+            for header, stem, unit in dict.fromkeys((c.header, c.stem, c.unit) for c in every)
+        ],
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
                         if i - 1 not in used),
         "rows": len(kept), "ignored": tuple(sorted({*table.ignored, *ignored})),

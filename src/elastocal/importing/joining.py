@@ -351,8 +351,7 @@ class Joined:
 def join(points: Records, log: Records, settings: JoinTable) -> Joined:
     """By name where names agree, by time where both have one, else by order, unless stated."""
     named = points.texts.get("configuration")
-    both = "time" in points.numbers and "time" in log.numbers
-    obvious = "time" if both else "order"
+    obvious = "time" if "time" in points.numbers and "time" in log.numbers else "order"
     how = settings.by or ("name" if named and _keys(named, _names_of(log)) else obvious)
     if how in ("time", "standstill"):
         found = _by_clock(points, log, settings, how)

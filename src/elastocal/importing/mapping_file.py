@@ -171,8 +171,7 @@ def read_mapping(
     A mapping file without [[source]] tables says how to join and convert what `presets` read.
     """
     given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
-    options = f"{option('length_unit')}, {option('angle_unit')}"
-    checked(MappingTable, {"units": given}, options)
+    checked(MappingTable, {"units": given}, f"{option('length_unit')}, {option('angle_unit')}")
     where = option("presets") if path is None else str(path)
     data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file")
     if presets and data.get("source"):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from html import escape
 from io import BytesIO
 from pathlib import Path
@@ -140,20 +139,24 @@ class Posed:
         return np.vstack([self.frames[:, :3, 3], self.flange[None, :3, 3]])
 
 
-@dataclass(frozen=True)
 class Space:
-    """All poses, bodies as of `shells_of`, and the instrument where it stands near; `first` is
-    shown first, and a legend names the `groups` of poses."""
+    """The poses with the bodies of the cell, as of `shells_of`, and the tracker where it is known
+    to stand near; `first` is shown first, and a legend names the `groups` of poses."""
 
-    poses: tuple[Posed, ...]
-    arm: tuple[Shell, ...]
-    around: tuple[Shell, ...]
-    walls: tuple[HalfSpace, ...]
-    drawn_from: str
-    tracker: Array | None
-    first: int
-    what: str
-    groups: tuple[str, ...] = ()
+    def __init__(
+        self, cell: Cell, chain: Chain, poses: Sequence[Posed], first: int = 0,
+        what: str = "pose", groups: tuple[str, ...] = (),
+    ) -> None:  # fmt: skip
+        self.poses, self.first, self.what, self.groups = poses, first, what, groups
+        self.arm, self.around, self.walls, self.drawn_from = shells_of(cell, chain)
+        self.tracker: Array | None = None
+        low, high = self.extent = self._box()
+        at = cell.tracker.position
+        away = float(np.linalg.norm(np.maximum(np.maximum(low - at, at - high), 0.0)))
+        # At the origin of its own data: most likely nobody said where it stands.
+        if at.any() and away < FAR * float((high - low).max()):
+            self.tracker = at
+            self.extent = self._box()
 
     @property
     def has_arrows(self) -> bool:
@@ -165,8 +168,7 @@ class Space:
         placed = [(s.points, self.poses[self.first].frames[s.carrier]) for s in self.arm]
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
 
-    @cached_property
-    def extent(self) -> Array:
+    def _box(self) -> Array:
         """Corners (2, 3) of the box around everything that is drawn, with room for arrows."""
         every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
         every = np.vstack([every, *self.bodies])
@@ -247,21 +249,6 @@ def frames_at(
     return (T @ np.linalg.inv(poses.flange))[:, None] @ frames, T
 
 
-def space_of(
-    cell: Cell, chain: Chain, poses: Sequence[Posed], first: int = 0, what: str = "pose",
-    groups: tuple[str, ...] = (),
-) -> Space:  # fmt: skip
-    """The poses with the bodies of the cell, and the tracker where it is known to stand near."""
-    space = Space(tuple(poses), *shells_of(cell, chain), None, first, what, groups)
-    low, high = space.extent
-    at = cell.tracker.position
-    if not at.any():
-        return space  # the origin of its own data: most likely nobody said where it stands
-    away = np.maximum(np.maximum(low - at, at - high), 0.0)
-    near = float(np.linalg.norm(away)) < FAR * float((high - low).max())
-    return replace(space, tracker=at if near else None)
-
-
 MOST_POSES = 80  # in the page; of more, those with the largest residuals and a random choice
 WORST = 30
 
@@ -310,7 +297,7 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
             np.array([vectors[g].mean(axis=0) for g in groups]),
         ))  # fmt: skip
     first_shown = int(np.argmax(rms[chosen]))
-    space = space_of(model.cell, model.chain, poses, first_shown, "configuration")
+    space = Space(model.cell, model.chain, poses, first_shown, "configuration")
     text = (
         f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
         f"configuration {printable(poses[first_shown].name)}, which has the largest, and in all of "
@@ -340,7 +327,7 @@ def plan_arm(plan: Plan) -> say.Figure:
             Posed(plan.configurations[k], "; ".join(about), frames[k], T, markers, names, None,
                   int(plan.group[k]))
         )  # fmt: skip
-    space = space_of(cell, chain, poses, groups=plan.group_names)
+    space = Space(cell, chain, poses, groups=plan.group_names)
     caption = (
         "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
         f"{space.drawn_from}."
@@ -374,8 +361,7 @@ def posed(name: str, title: str, caption: str, space: Space) -> say.Figure:
             axes.set_xlabel("x in m")
             axes.set_ylabel(f"{up} in m")
         if space.groups:
-            handles = axes.get_legend_handles_labels()
-            figure.legend(*handles, loc="outside lower center", ncols=4)
+            figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
 
     return say.Figure(name, title, draw, 7.0, caption, space=space)
 
@@ -386,8 +372,7 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
     Raises InputError for another suffix and an unwritable place.
     """
     suffix = Path(path).suffix.lower()
-    told = f"{path}: a picture of poses is written as .png or .svg"
-    require(suffix in (".png", ".svg"), told)
+    require(suffix in (".png", ".svg"), f"{path}: a picture of poses is written as .png or .svg")
     figure: Any = figure_of(plan_arm(plan))
     picture = BytesIO()
     nothing = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}

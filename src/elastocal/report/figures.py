@@ -142,7 +142,6 @@ def rendered(figure: Drawing) -> str:
 
 NO_LENGTH = 1e-6  # of a line that is a dot: of none at all a PNG has no caps
 
-
 ROW = 0.27  # inches per line of a name
 LONGEST = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.
@@ -451,8 +450,7 @@ class Residuals:
         n = len(observed.lead)
         self.shown = np.arange(n)
         if n > MOST_DRAWN:
-            chosen = np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False)
-            self.shown = np.sort(chosen)
+            self.shown = np.sort(np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False))
 
     def figures(self) -> Iterator[say.Figure]:
         yield self.by_configuration()
@@ -580,8 +578,7 @@ class Residuals:
             rms = float(np.sqrt((sizes**2).mean()))
             # Of the mean the digits that so many readings determine.
             known = say.with_uncertainty(mean, rms / math.sqrt(len(sizes)))[0]
-            each = known, say.significant(rms), told(largest)
-            rows.append((name, str(len(sizes)), *each, unit))
+            rows.append((name, str(len(sizes)), known, say.significant(rms), told(largest), unit))
         heads = ("readings of", "number", "mean", "rms", "largest", "unit")
         return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 

@@ -74,8 +74,8 @@ def calibration_blocks(
         ("Truth", held if truth else None),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    residuals = Residuals(result.model, result.observations, result.residual)
-    yield say.Fold("", residuals.figures, figures=("residuals", "against_joints"))
+    residuals = cache(lambda: Residuals(result.model, result.observations, result.residual))
+    yield say.Fold("", lambda: residuals().figures(), figures=("residuals", "against_joints"))
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
     yield say.Fold("Method, noise and intervals", lambda: _method(result), printed=True)
     missing = undetermined_table(result, truth)
@@ -93,7 +93,7 @@ def calibration_blocks(
     yield say.Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield say.Fold(
         "Residuals on the arm, over time and by group",
-        lambda: _on_the_arm(result, residuals),
+        lambda: _on_the_arm(result, residuals()),
         figures=("space", "over_time"),
     )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
@@ -311,8 +311,7 @@ def spread_table(
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
         rows.append((name, str(len(e)), *(say.length(float(size)) for size in sizes)))
-    heads = ("error", count, "mean", "std", "95 % below", "max")
-    return say.ShownTable(heads, rows, title=title)
+    return say.ShownTable(("error", count, "mean", "std", "95 % below", "max"), rows, title=title)
 
 
 def _influence_table(result: Calibration) -> say.ShownTable:
@@ -462,8 +461,7 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.S
         if kind == findings.COMBINED:
             why = f"only as {shortened(result.combination(e.name))}"
         elif kind == findings.ABSORBED:
-            names = some(map(printable, e.combined_with), 3, more=" + {} more")
-            why = f"held: absorbed in {names}"
+            why = f"held: absorbed in {some(map(printable, e.combined_with), 3, more=' + {} more')}"
         elif kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}: {limits(result, e)}"
         else:
@@ -525,8 +523,7 @@ def parameter_table(
 def combination_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
     found = result.combinations
     true = None if truth is None else [combination_truth(result, c, truth) for c in found]
-    title = "Combinations (factors in SI units)"
-    return _numbers(title, [*map(shortened, found)], found, true, {})
+    return _numbers("Combinations (factors in SI units)", [*map(shortened, found)], found, true, {})
 
 
 def _numbers(

@@ -70,7 +70,6 @@ VIEWS = {
     "Measurements": ("smaller_views", "readings_blocks", "Readings"),
 }
 
-
 PRINTED_WIDTH = 100  # columns of a result as plain text
 WIDEST = 1000  # columns; more than any table needs
 STYLES = {"inside": "green", "outside": "bold red", "changed": "bold yellow"}
@@ -119,8 +118,7 @@ def _needs(heading: str, block: say.Block) -> bool:
 
 def _shown(console: Console, block: say.Block) -> Iterable[RenderableType]:
     if isinstance(block, say.ShownVerdict):
-        style = "bold" if block.tone == "good" else "bold yellow"
-        yield _line("Verdict", block.sentence, style)
+        yield _line("Verdict", block.sentence, "bold" if block.tone == "good" else "bold yellow")
     elif isinstance(block, say.Lines):
         for label, text in block.items:
             yield _line(label, text, "bold yellow" if label == say.WARNING else "bold")
@@ -310,8 +308,7 @@ def _html(block: say.Block, deep: int, pictures: bool, summary: str) -> str:
             f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
             for name, number in block.figures
         )
-        line = f'<p class="change">{text_of(block.headline)}</p>'
-        return f'{line}<dl class="key">{figures}</dl>'
+        return f'<p class="change">{text_of(block.headline)}</p><dl class="key">{figures}</dl>'
     if isinstance(block, say.Heading):
         return f"<h{deep}>{text_of(block.text)}</h{deep}>"
     if isinstance(block, say.Sentence):
@@ -392,8 +389,7 @@ def plotly() -> tuple[str, str]:
     from plotly.offline import get_plotlyjs
 
     source = get_plotlyjs()
-    packed = gzip.compress(source.encode(), 9, mtime=0)
-    return source, base64.b64encode(packed).decode()
+    return source, base64.b64encode(gzip.compress(source.encode(), 9, mtime=0)).decode()
 
 
 def sources(result: Any) -> list[Path]:

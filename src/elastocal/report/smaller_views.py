@@ -347,7 +347,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
             f"{seen['file']}: {say.counted(seen['rows'], 'row')} of {ROLES[seen['role']]} "
             f"({preset}{seen['encoding']}, {seen['layout']}{decimals})"
         )
-        rows = [(name, column, unit or "–") for name, column, unit in seen["columns"]]
+        rows = [(each["from"], each["to"], each["unit"] or "–") for each in seen["columns"]]
         yield say.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
         yield say.Lines([("Not used", listed(seen["unused"], 20))])
     columns = found.columns
@@ -359,7 +359,7 @@ def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
     rest = len(columns) - len(shown)
     words = tuple(k for k, n in enumerate(shown) if not isinstance(columns[n], np.ndarray))
     cells = [tuple(every[n][i] for n in shown) for i in first]
-    title = "The first rows of the table" + (f", {rest} more columns" if rest else "")
+    title = "The first rows of the table" + f", {say.counted(rest, 'more column')}" * bool(rest)
     yield say.ShownTable(tuple(shown), cells, words, title=title)
     ranges = [
         (name, f"{values.min():.6g}", f"{values.max():.6g}")
