@@ -182,7 +182,7 @@ class FitToGood:
 
 ROUNDS = 12
 Found = TypeVar("Found")
-# A fit, the observations (n,) it is of, and their `better_half`.
+# A fit, the observations (n,) it is of, and the `better_half` of all.
 Stand = tuple[Found, BoolArray, tuple[float, float]]
 
 
@@ -201,11 +201,12 @@ def explains_more(one: Stand, other: Stand) -> bool:
 
 
 def until_it_stands(
-    good: BoolArray, judged: Callable[[BoolArray], tuple[Stand[Found], BoolArray]]
+    good: BoolArray, judged: Callable[[BoolArray], tuple[Found, Array, float, BoolArray]]
 ) -> Stand[Found]:
     """Fit and good observations (n,) that agree with each other, starting from `good`.
 
-    `judged` fits to the good ones and says which observations the fit does not contradict.  A set
+    `judged` fits to the good ones and says the squared lengths of all errors, the fit's degrees of
+    freedom, and which observations it does not contradict.  A set
     that comes back after others ends the search: those good at any time of that round are kept.  So
     does a fit that no majority agrees with: it cannot judge.  Observations that are taken back bend
     the fit, so that more of them seem to fit: where the better half of all is left worse explained
@@ -217,12 +218,12 @@ def until_it_stands(
     visited: list[Stand[Found]] = []
     for _ in range(ROUNDS):
         try:
-            stand, agrees = judged(good)
+            found, squared, dof, agrees = judged(good)
         except ElastocalError:
             if not visited:
                 raise
             break  # so few cannot judge the others
-        visited.append(stand)
+        visited.append((found, good, better_half(squared, dof, good)))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]
@@ -262,7 +263,7 @@ def find_faulty(solution: Solution) -> BoolArray:
         starts.append(majority(B, y))
     variance = starts[0][1]
 
-    def judged(good: BoolArray) -> tuple[Stand[FitToGood], BoolArray]:
+    def judged(good: BoolArray) -> tuple[FitToGood, Array, float, BoolArray]:
         nonlocal B, y, variance
         fit = FitToGood(B, y, good, variance)
         for _ in range(STEPS):
@@ -273,8 +274,8 @@ def find_faulty(solution: Solution) -> BoolArray:
             fit = FitToGood(B, y, good, variance)
             if np.linalg.norm(fit.R @ (fit.z - z)) <= SETTLED * np.sqrt(fit.variance):
                 break
-        half = better_half((fit.e**2).sum(axis=1), fit.dof, good)
-        return (fit, good, half), fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+        agrees = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+        return fit, (fit.e**2).sum(axis=1), fit.dof, agrees
 
     ends = []
     for good, at_first in starts:
@@ -462,7 +463,7 @@ def settle(
     good = every if good is None else good
     precision: list[Array] = []  # of single readings, by the first noise
 
-    def judged(chosen: BoolArray) -> tuple[Stand[NoiseFit], BoolArray]:
+    def judged(chosen: BoolArray) -> tuple[NoiseFit, Array, float, BoolArray]:
         nonlocal noise
         noise = found = estimate_noise(readings.take(chosen), kind, noise)
         own, behind = own_noise(found.fit, readings)
@@ -479,7 +480,7 @@ def settle(
         point = rejection_point(t.size, np.where(inside, outside, behind))
         agrees = np.asarray(~(np.where(inside, left_out, np.abs(t)) > point).any(axis=1))
         squared = np.einsum("ni,nij,nj->n", r, precision[0], r)
-        return (found, chosen, better_half(squared, dof, chosen)), agrees
+        return found, squared, dof, agrees
 
     try:
         return until_it_stands(good, judged)[:2]
