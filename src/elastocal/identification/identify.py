@@ -34,7 +34,7 @@ from elastocal.identification.noise_choice import (
     not_knowing_times,
     weights_of,
 )
-from elastocal.identification.noise_structure import Kind, Readings, check_supported
+from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
 from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
@@ -162,12 +162,14 @@ def _course(
     x0 = start_values(model, table, options.seed, free)
     if smooth := bool(model.shrunk[free].any()):
         options.check_functions()
-    every = _solution(model, observed, x0, ordinary(model, free), options, progress, not smooth)
+    own = ordinary(model, free)
 
-    def refit(good: NDArray[np.bool_]) -> Solution:
-        chosen, own = _without(options, ~good, observed.size), ordinary(model, free)
-        return _solution(model, subset(observed, good), x0, own, chosen, progress, not smooth)
+    def refit(good: BoolArray) -> Solution:
+        some = observed if good.all() else subset(observed, good)
+        chosen = _without(options, ~good, observed.size)
+        return _solution(model, some, x0, own, chosen, progress, not smooth)
 
+    every = refit(np.ones(len(observed.lead), dtype=bool))
     progress("looking for outliers")
     none = np.zeros(len(observed.lead), dtype=bool)
     faulty, sound = none if every.exact else find_faulty(every), every
@@ -430,7 +432,6 @@ def _adapted(
     asked, every = "auto" if kind == OF_READINGS else kind, course.every
     problem, solution, now, fitted = every.problem, start, good, good
     readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
-    check_supported(asked, readings)
     sure, restarts, fewer = False, 0, None
     for left in reversed(range(ROUNDS)):
         before, kept, first = now, start.reduction.kept, noise is None

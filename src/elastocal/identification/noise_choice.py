@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse, special
 
 from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
@@ -26,6 +26,7 @@ from elastocal.identification.noise_structure import (
     TIME,
     Deviation,
     Kind,
+    NoiseModel,
     Readings,
     ranked_within,
     stated_deviations,
@@ -446,7 +447,7 @@ def estimate_noise(
     the criterion smaller, until nothing does; scatter of the joints and drift are tried where a
     test finds a trace of them.
 
-    Raises InputError for an unknown kind or one that the readings do not support.
+    Raises InputError for an unknown kind, or one of a plug-in that lacks something in the readings.
     """
     Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
     basis = replace(readings, B=Q.reshape(readings.B.shape))
@@ -454,7 +455,15 @@ def estimate_noise(
         found = fitted(basis, Kind.parsed(like.kind), like.fit)
         return replace(like, fit=found, T=T, to_longest=0.0, over_times=None)
     asked = Kind.of(kind)
-    return _chosen(basis, T) if kind == "auto" else NoiseFit(kind, fitted(basis, asked), T)
+    if kind == "auto":
+        return _chosen(basis, T)
+    model = STRUCTURES[asked.own]
+    require(
+        type(model).components is NoiseModel.components or model.supports(readings),
+        f"{option('noise', kind)}: this table does not support the noise model '{asked.own}'; add "
+        "the columns that it needs, or take another one",
+    )
+    return NoiseFit(kind, fitted(basis, asked), T)
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:

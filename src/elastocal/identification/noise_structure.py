@@ -728,17 +728,6 @@ def noise_models() -> tuple[str, ...]:
     return ("auto", *STRUCTURES, *(f"{name}+{CONFIGURATION}" for name in STRUCTURES))
 
 
-def check_supported(kind: str, readings: Readings) -> None:
-    """Raise InputError where a noise model of a plug-in lacks something in these readings."""
-    own = Kind.parsed(kind).own
-    model = STRUCTURES.get(own, NoiseModel())
-    require(
-        type(model).components is NoiseModel.components or model.supports(readings),
-        f"{option('noise', kind)}: this table does not support the noise model '{own}'; add the "
-        "columns that it needs, or take another one",
-    )
-
-
 def stated_deviations(
     model: Model, observed: Observations, x: Array, parts: Sequence[str] = tuple(PARTS)
 ) -> list[Deviation]:

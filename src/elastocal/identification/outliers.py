@@ -553,18 +553,6 @@ class HuberFit:
         """ψ(d)/d (n,)."""
         return c / np.maximum(self.distance, c)
 
-    @property
-    def smooth_c(self) -> float:
-        """c of a loss that is as good and has a curvature to be estimated.
-
-        ψ of l1 jumps at zero: a share of the residuals there tells its slope, that of Hall and
-        Sheather's bandwidth, without the p residuals that the fit makes zero (Koenker 2005, section
-        3.4).
-        """
-        kept = np.sort(self.distance)[len(self.z) // self.size :]
-        h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3) * (1.5 / (2 * np.pi)) ** (1 / 3)
-        return max(self.c, float(np.quantile(kept, min(2 * h, 0.98)))) if self.c == L1 else self.c
-
     def covariance(self, cluster: IntArray | None = None) -> Covariance:
         """Covariance (p, p) of x̂.
 
@@ -576,8 +564,15 @@ class HuberFit:
         Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster
         alone determines a combination of the parameters.
         """
-        rows, p, size, c = len(self.residual), len(self.z), self.size, self.smooth_c
-        d, across = self.distance, self.weights(c)
+        rows, p, size, c, d = len(self.residual), len(self.z), self.size, self.c, self.distance
+        if c == L1:
+            # ψ of l1 jumps at zero: a share of the residuals there tells its slope, that of Hall
+            # and Sheather's bandwidth, without the p residuals that the fit makes zero (Koenker
+            # 2005, section 3.4); c of that share is as good and has a curvature to be estimated.
+            kept = np.sort(d)[p // size :]
+            h = (special.ndtri(0.975) ** 2 * 1.5 / (2 * np.pi) / len(kept)) ** (1 / 3)
+            c = max(c, float(np.quantile(kept, min(2 * h, 0.98))))
+        across = self.weights(c)
         along, psi = (d <= c).astype(float), np.minimum(d, c)
         a = float(np.mean(along + (size - 1) * across)) / size
         if not a > 0:
