@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
 
@@ -31,7 +30,7 @@ from elastocal.config import (
 from elastocal.errors import InputError, option, require, said_of
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 # Constraints as numbers: bounds, linear equalities and matrix inequalities on a vector.
 
@@ -89,7 +88,7 @@ class System:
             matrices=tuple(m.moved(centre, unit) for m in self.matrices),
         )  # fmt: skip
 
-    def restricted(self, columns: NDArray[np.int64], x: Array) -> System:
+    def restricted(self, columns: IntArray, x: Array) -> System:
         """The constraints on x[columns], all other parameters held at x (p,).
 
         Raises InputError where the held values alone break a constraint.

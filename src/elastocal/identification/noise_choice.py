@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse, special
 
 from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
@@ -637,9 +636,7 @@ def not_knowing_times(found: NoiseFit) -> NoiseFit:
 # Between a fit and its noise: readings linearised at the fit, weights from an estimated noise.
 
 
-def linearised(
-    model: Model, observed: Observations, x: Array, columns: NDArray[np.int64]
-) -> Readings:
+def linearised(model: Model, observed: Observations, x: Array, columns: IntArray) -> Readings:
     at = model.regressor(observed.table, x, columns, observed)
     n, size, table, sight, reach = len(observed.lead), observed.size, observed.table, None, None
     if table.position is not None and size == 3:

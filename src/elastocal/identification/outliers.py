@@ -346,11 +346,11 @@ def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[O
     return tuple(map(Outlier, lines, labels, markers, length.tolist(), ratio.tolist()))
 
 
-def rejection_point(values: int, dof: ArrayLike = np.inf, level: float = FALSE_ALARM) -> Array:
+def rejection_point(values: int, dof: ArrayLike = np.inf) -> Array:
     """How many standard deviations off a reading's component lies that is set apart: beyond what t
-    on `dof` degrees of freedom makes of a table of so many `values`, at a `level` for the whole
+    on `dof` degrees of freedom makes of a table of so many `values`, at FALSE_ALARM for the whole
     table (Bonferroni)."""
-    return np.asarray(-special.stdtrit(dof, level / values / 2))
+    return np.asarray(-special.stdtrit(dof, FALSE_ALARM / values / 2))
 
 
 # What setting readings apart makes of an estimate.

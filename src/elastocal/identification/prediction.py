@@ -38,7 +38,7 @@ from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVi
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
-from elastocal.units import Array, IntArray, microns
+from elastocal.units import Array, BoolArray, IntArray, microns
 
 # What the identification knows of where the tool will be, and what it does not.
 
@@ -238,7 +238,7 @@ class Position(ByValue):
     def _quantile(self, level: float) -> Array:
         return np.asarray(3 * self.share * special.fdtri(3, np.clip(self.dof, 1, 1e9), level))
 
-    def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
+    def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> BoolArray:
         """Whether the regions of that `level` hold the places (n, 3)."""
         total = self.covariance + (self.visit if visit else 0.0)
         off = np.asarray(places) - self.position

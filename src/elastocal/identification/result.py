@@ -33,7 +33,6 @@ from elastocal.identification.prediction import (
     position_at,
 )
 from elastocal.identification.residuals import ResidualSummary
-from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
@@ -487,7 +486,7 @@ class Calibration(scrutiny.FoundFit, Result):
         decides there is not said by B alone."""
         numbers = len(self.residual) * len(self.estimates)
         others = self.prior_share or self.smooth or self.active
-        return not others and bool(self.residual.any()) and numbers <= MOST_NUMBERS
+        return not others and bool(self.residual.any()) and numbers <= scrutiny.MOST_NUMBERS
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
         """Leverage and influence of every configuration, in the table's order; empty for tables
