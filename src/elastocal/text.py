@@ -121,9 +121,11 @@ def plain_minus(cell: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """`value` with dataclasses as their fields, numpy numbers and arrays as plain ones, and None
-    for numbers not finite."""
-    if hasattr(value, "__dataclass_fields__"):
+    """`value` with objects by their `to_json`, else dataclasses as their fields, numpy numbers and
+    arrays as plain ones, and None for numbers not finite."""
+    if hasattr(value, "to_json"):
+        value = value.to_json()
+    elif hasattr(value, "__dataclass_fields__"):
         value = vars(value)
     if isinstance(value, Mapping):
         return {str(key): plain(v) for key, v in value.items()}

@@ -58,10 +58,10 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
     r = drawn(readings(), np.random.default_rng(1), SCATTER, DRIFT)
     found = estimate_noise(r, kind)
     V = found.fit.own[0] * np.eye(3 * len(r))
-    if found.lasting is None:
+    if found.fit.lasting is None:
         V += found.fit.common[0] / SCATTER**2 * (covariance(r, SCATTER) - covariance(r))
     else:
-        V += found.fit.common[0] * np.kron(course(r, found.lasting), np.eye(3))
+        V += found.fit.common[0] * np.kron(course(r, found.fit.lasting), np.eye(3))
     B, e = r.B.reshape(3 * len(r), -1), r.e.ravel()
     whole = Dense(B, e, [V], np.ones(1))
     x, Phi = whole.x, whole.Phi

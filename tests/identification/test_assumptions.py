@@ -11,6 +11,7 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.errors import InputError
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
@@ -66,12 +67,15 @@ def doubled(table, lines, labels=0):
 
 def test_copies_under_new_labels_are_counted_once(clean):
     model, table, _, alone = clean
-    result = identify(model, doubled(table, np.arange(len(table)), len(table.configuration_labels)))
+    twice = doubled(table, np.arange(len(table)), len(table.configuration_labels))
+    result = identify(model, twice)
     assert result.copies == tuple(range(len(table) + 2, 2 * len(table) + 2))
     assert np.allclose(result.covariance, alone.covariance, rtol=1e-3, atol=0)
     assert result.finding("copied_readings").numbers["copies"] == len(table)
     assert any("repeat others to the last digit (lines" in w for w in result.warnings)
     assert result.to_json()["copies"] == list(result.copies)
+    with pytest.raises(InputError, match="the covariance is"):
+        identify(model, twice, Options(covariance=np.eye(6 * len(twice))))
 
 
 def test_repeats_that_rounding_makes_equal_are_no_copies():

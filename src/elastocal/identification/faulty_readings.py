@@ -198,7 +198,7 @@ class _Judged:
         width = prior_widths(clean.problem)[columns]
         B, e = readings.B.reshape(len(observed.value), -1) * width, readings.e.ravel()
         shared = noise is not None and (
-            bool((noise.fit.common > 0).any()) or noise.lasting is not None
+            bool((noise.fit.common > 0).any()) or noise.fit.lasting is not None
         )
         if noise is None:
             B, e = problem.weights.apply(B), problem.weights.apply(e)

@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 
 from elastocal.errors import ElastocalError, option, said_of
@@ -34,10 +33,10 @@ from elastocal.identification.noise_choice import (
     not_knowing_times,
     weights_of,
 )
-from elastocal.identification.noise_structure import Kind, Readings, check_supported
+from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.noise_summary import noise_of
 from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
-from elastocal.identification.outliers import Outlier, describe, find_faulty, robust_result, settle
+from elastocal.identification.outliers import describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
     left_open,
@@ -115,12 +114,12 @@ def identify(
     copies = tuple(table.row[observed.lead[again]].tolist())
     if copies:
         observed = subset(observed, ~again)
-        options = _without(options, again, observed.size)
+        covariance = _of_readings(options.covariance, ~again, observed.size)
+        options = replace(options, covariance=covariance)
     course = _course(model, table, observed, options, progress)
     found = run_method(course)
     progress("intervals and held-out residuals")
-    outliers = describe(course.every, found.solution, ~found.good)
-    result = summarise(course, found, outliers, new_poses, copies, test)
+    result = summarise(course, found, new_poses, copies, test)
     body = solved_body(table, float(found.solution.fit.residual.std()))
     told = (*told, *_doubts(model, table, test, result.x))
     return replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
@@ -162,12 +161,26 @@ def _course(
     x0 = start_values(model, table, options.seed, free)
     if smooth := bool(model.shrunk[free].any()):
         options.check_functions()
-    every = _solution(model, observed, x0, ordinary(model, free), options, progress, not smooth)
+    own = ordinary(model, free)
 
-    def refit(good: NDArray[np.bool_]) -> Solution:
-        chosen, own = _without(options, ~good, observed.size), ordinary(model, free)
-        return _solution(model, subset(observed, good), x0, own, chosen, progress, not smooth)
+    def refit(good: BoolArray) -> Solution:
+        some = observed if good.all() else subset(observed, good)
+        kind = "none" if options.method == "ols" else options.weights
+        covariance = _of_readings(options.covariance, good, observed.size)
+        weights = weights_for(some, model.cell.tracker, kind, covariance)
+        problem = posed(model, some, weights, x0, own)
+        solution = solve(problem, progress, not smooth)
+        if some.kind == "pose" and weights.kind == "none" and kind == "auto":
+            # Without stated noise, metres and radians get their relative weight from a first fit.
+            parts = solution.fit.residual.reshape(-1, 2, 3)
+            sigma = np.tile(np.repeat(np.maximum(parts.std(axis=(0, 2)), 1e-12), 3), len(parts))
+            whiten = sparse.csr_array(sparse.diags_array(1 / sigma))
+            text = "position and rotation weighted by the spread of their residuals in a first fit"
+            weights = Weights("component", whiten, False, text)
+            solution = solve(replace(problem, weights=weights), progress, not smooth)
+        return solution
 
+    every = refit(np.ones(len(observed.lead), dtype=bool))
     progress("looking for outliers")
     none = np.zeros(len(observed.lead), dtype=bool)
     faulty, sound = none if every.exact else find_faulty(every), every
@@ -183,35 +196,13 @@ def _course(
     return Course(every, sound, faulty, free, refit, options, progress)
 
 
-def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:
-    if options.covariance is None:
-        return options
-    rows = np.repeat(~left_out, size)
-    return replace(options, covariance=options.covariance[np.ix_(rows, rows)])
-
-
-def _solution(
-    model: Model,
-    observed: Observations,
-    x0: Array,
-    free: NDArray[np.int64],
-    options: Options,
-    progress: Progress,
-    try_wider: bool = True,
-) -> Solution:
-    kind = "none" if options.method == "ols" else options.weights
-    weights = weights_for(observed, model.cell.tracker, kind, options.covariance)
-    problem = posed(model, observed, weights, x0, free)
-    solution = solve(problem, progress, try_wider)
-    if observed.kind == "pose" and weights.kind == "none" and kind == "auto":
-        # Without stated noise, metres and radians get their relative weight from a first fit.
-        parts = solution.fit.residual.reshape(-1, 2, 3)
-        sigma = np.broadcast_to(np.maximum(parts.std(axis=(0, 2)), 1e-12)[:, None], parts.shape)
-        text = "position and rotation weighted by the spread of their residuals in a first fit"
-        whiten = sparse.csr_array(sparse.diags_array(1 / sigma.ravel()))
-        weights = Weights("component", whiten, False, text)
-        solution = solve(replace(problem, weights=weights), progress, try_wider)
-    return solution
+def _of_readings(covariance: Array | None, good: BoolArray, size: int) -> Array | None:
+    """The given covariance, that of the good readings (N,) alone; a matrix of another shape stays
+    as it is, to be refused where it becomes weights."""
+    rows = np.repeat(good, size)
+    if covariance is None or covariance.shape != (len(rows), len(rows)):
+        return covariance
+    return covariance[np.ix_(rows, rows)]
 
 
 def _test_errors(model: Model, result: Calibration, table: Measurements) -> TestErrors:
@@ -241,13 +232,12 @@ NOT_SHOWN = "held: the readings do not show the smooth function that it is part 
 
 
 def summarise(
-    course: Course, found: MethodResult, faulty: tuple[Outlier, ...], new_poses: NewPoses | None,
-    copies: tuple[int, ...], test: Measurements | None,
+    course: Course, found: MethodResult, new_poses: NewPoses | None, copies: tuple[int, ...],
+    test: Measurements | None,
 ) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    `faulty` are the readings beyond the noise.  `new_poses`: where the arm will be used, by default
-    the workspace.
+    `new_poses`: where the arm will be used, by default the workspace.
     """
     every, solution, covariance = course.every, found.solution, found.spread.matrix
     final = solution.fit
@@ -261,6 +251,7 @@ def summarise(
     sized = replace(found, solution=own_sizes)
     estimates, combinations = _estimates(sized, left_out, unsure)
     determined = tuple(model.names[c] for c in kept)
+    faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage = solution.crossed
     plainly_large = problem.large and solution.held is None
@@ -430,7 +421,6 @@ def _adapted(
     asked, every = "auto" if kind == OF_READINGS else kind, course.every
     problem, solution, now, fitted = every.problem, start, good, good
     readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
-    check_supported(asked, readings)
     sure, restarts, fewer = False, 0, None
     for left in reversed(range(ROUNDS)):
         before, kept, first = now, start.reduction.kept, noise is None

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
 
@@ -31,7 +30,7 @@ from elastocal.config import (
 from elastocal.errors import InputError, option, require, said_of
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 # Constraints as numbers: bounds, linear equalities and matrix inequalities on a vector.
 
@@ -89,7 +88,7 @@ class System:
             matrices=tuple(m.moved(centre, unit) for m in self.matrices),
         )  # fmt: skip
 
-    def restricted(self, columns: NDArray[np.int64], x: Array) -> System:
+    def restricted(self, columns: IntArray, x: Array) -> System:
         """The constraints on x[columns], all other parameters held at x (p,).
 
         Raises InputError where the held values alone break a constraint.
@@ -255,22 +254,17 @@ class Constraints:
                 f"the bounds of {bound.name} contradict each other: at least {lower[i]:.6g} and "
                 f"at most {upper[i]:.6g}; drop one of them",
             )
-        rows, values, labels = [], [], []
-        for equality in self.equalities:
-            row, _ = _row(equality.terms, position, f"equality '{equality}'")
-            rows.append(row)
-            values.append(equality.value)
-            labels.append(str(equality))
         # Equal bounds have no inside, which an inequality solver needs; they are an equality.
-        for i in np.flatnonzero(lower == upper).tolist():
-            rows.append(np.eye(p)[i])
-            values.append(lower[i])
-            labels.append(f"{names[i]} = {lower[i]:.6g}")
-            lower[i], upper[i] = -np.inf, np.inf
+        met = lower == upper
+        pinned = (
+            LinearEquality({names[i]: 1.0}, float(lower[i])) for i in np.flatnonzero(met).tolist()
+        )
+        equalities = (*self.equalities, *pinned)
+        rows = [_row(e.terms, position, f"equality '{e}'")[0] for e in equalities]
         return System(
-            tuple(names), lower, upper, np.array(rows).reshape(len(rows), p),
-            np.array(values, dtype=float), tuple(labels),
-            tuple(_matrix(m, position) for m in self.matrices),
+            tuple(names), np.where(met, -np.inf, lower), np.where(met, np.inf, upper),
+            np.array(rows).reshape(len(rows), p), np.array([e.value for e in equalities]),
+            tuple(map(str, equalities)), tuple(_matrix(m, position) for m in self.matrices),
         )  # fmt: skip
 
 
@@ -365,13 +359,7 @@ class GaussianPrior:
         cls, names: Sequence[str], mean: Sequence[float] | Array, std: Sequence[float] | Array
     ) -> GaussianPrior:
         """x_i ~ N(mean_i, std_i²), independent of each other."""
-        spread = np.asarray(std, dtype=float)
-        for name, value in zip(names, spread, strict=True):
-            require(
-                bool(np.isfinite(value) and value > 0),
-                f"prior of {quoted(name)}: std must be positive and finite, found {value}",
-            )
-        return cls(tuple(names), np.asarray(mean, dtype=float), np.diag(spread**2))
+        return cls(tuple(names), np.asarray(mean, dtype=float), np.diag(np.square(std)))
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> GaussianPrior:

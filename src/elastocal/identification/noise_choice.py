@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse, special
 
 from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
@@ -26,6 +25,7 @@ from elastocal.identification.noise_structure import (
     TIME,
     Deviation,
     Kind,
+    NoiseModel,
     Readings,
     ranked_within,
     stated_deviations,
@@ -88,6 +88,7 @@ class NoisyReadings:
     def __init__(self, readings: Readings, kind: Kind, lasting: float | None = None) -> None:
         self.readings, self.kind, self.lasting = readings, kind, lasting
         self.structure = STRUCTURES[kind.own].structure(readings)
+        self.own = len(self.structure.names)
         apart = []
         if kind.by_visit:
             if readings.visits is None:
@@ -116,10 +117,6 @@ class NoisyReadings:
             fewer = [d for d in own if len(np.unique(d.unit)) < self.sets.n]
             own = fewer or own
         return [d for d in found if d.part != CONFIGURATION or d in own]
-
-    @property
-    def own(self) -> int:
-        return len(self.structure.names)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -216,25 +213,15 @@ def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
 
 
 class Fitted(MixedFit):
-    """A kind of noise fitted to readings."""
+    """A kind of noise fitted to readings: the variances of single readings are its `own`, those of
+    deviations `common`, and what drifts is `lasting` a share of the campaign (None: nothing)."""
 
     def __init__(
         self, noisy: NoisyReadings, prior: LogPrior | None, start: Array, enough: float
     ) -> None:
         super().__init__(noisy.model(prior), start, noisy.may_vanish, enough)
-        self.noisy = noisy
-
-    @property
-    def own(self) -> Array:
-        return self.theta[: self.noisy.own]
-
-    @property
-    def common(self) -> Array:
-        return self.theta[self.noisy.own :]
-
-    @property
-    def lasting(self) -> float | None:
-        return self.noisy.lasting
+        self.noisy, self.lasting = noisy, noisy.lasting
+        self.own, self.common = np.split(self.theta, [noisy.own])
 
     @property
     def found(self) -> list[tuple[Deviation, float]]:
@@ -441,11 +428,6 @@ class NoiseFit:
             text += PARTS[part][0].format(named)
         return text
 
-    @property
-    def lasting(self) -> float | None:
-        """Correlation time of what drifts, as a share of the campaign; None where nothing does."""
-        return self.fit.lasting
-
     def of_readings(self) -> NoiseFit:
         tried = [t for t in self.trials if not Kind.parsed(t.kind).by_visit]
         kind = min(tried, key=lambda t: t.criterion).kind
@@ -464,7 +446,7 @@ def estimate_noise(
     the criterion smaller, until nothing does; scatter of the joints and drift are tried where a
     test finds a trace of them.
 
-    Raises InputError for an unknown kind or one that the readings do not support.
+    Raises InputError for an unknown kind, or one of a plug-in that lacks something in the readings.
     """
     Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
     basis = replace(readings, B=Q.reshape(readings.B.shape))
@@ -472,7 +454,15 @@ def estimate_noise(
         found = fitted(basis, Kind.parsed(like.kind), like.fit)
         return replace(like, fit=found, T=T, to_longest=0.0, over_times=None)
     asked = Kind.of(kind)
-    return _chosen(basis, T) if kind == "auto" else NoiseFit(kind, fitted(basis, asked), T)
+    if kind == "auto":
+        return _chosen(basis, T)
+    model = STRUCTURES[asked.own]
+    require(
+        type(model).components is NoiseModel.components or model.supports(readings),
+        f"{option('noise', kind)}: this table does not support the noise model '{asked.own}'; add "
+        "the columns that it needs, or take another one",
+    )
+    return NoiseFit(kind, fitted(basis, asked), T)
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:
@@ -483,7 +473,7 @@ def _chosen(readings: Readings, T: Array) -> NoiseFit:
         return _Choice(readings).result(T)
     try:
         found = _Choice(some, supported(readings)).result(T)
-        again = fitted(readings, Kind.parsed(found.kind), found.fit, found.lasting)
+        again = fitted(readings, Kind.parsed(found.kind), found.fit, found.fit.lasting)
     except ElastocalError:  # the sample does not show all parameters, or not all labels
         return _Choice(readings).result(T)
     why = f"{found.reason}; chosen from {len(some)} readings at random, estimated from all"
@@ -624,10 +614,10 @@ def not_knowing_times(found: NoiseFit) -> NoiseFit:
     Σ_m w_m/f_m, comes what the models differ by (`Covariance.tails`), most for base and tracker.
     """
     readings, T, fits = found.fit.noisy.readings, found.T, [found.fit]
-    if found.lasting is None or readings.visits is None:
+    if found.fit.lasting is None or readings.visits is None:
         return found
     for lasting in readings.visits.lasting:
-        if lasting != found.lasting:
+        if lasting != found.fit.lasting:
             with suppress(ElastocalError, np.linalg.LinAlgError):
                 fits.append(fitted(readings, Kind.parsed(found.kind), found.fit, lasting))
     level = np.array([one.log_likelihood for one in fits])
@@ -646,9 +636,7 @@ def not_knowing_times(found: NoiseFit) -> NoiseFit:
 # Between a fit and its noise: readings linearised at the fit, weights from an estimated noise.
 
 
-def linearised(
-    model: Model, observed: Observations, x: Array, columns: NDArray[np.int64]
-) -> Readings:
+def linearised(model: Model, observed: Observations, x: Array, columns: IntArray) -> Readings:
     at = model.regressor(observed.table, x, columns, observed)
     n, size, table, sight, reach = len(observed.lead), observed.size, observed.table, None, None
     if table.position is not None and size == 3:
@@ -671,8 +659,8 @@ def weights_of(noise: NoiseFit, readings: Readings, more: Array | float = 0.0) -
     whiten = block_diagonal(inverse_factor(own_noise(noise.fit, readings)[0] + more))
     weights = Weights(noise.kind, whiten, True, noise.description)
     together, record = readings.configuration, readings.visits
-    if noise.lasting is not None and record is not None:
-        together = record.blocks(together, noise.lasting)
+    if noise.fit.lasting is not None and record is not None:
+        together = record.blocks(together, noise.fit.lasting)
     return weights_sharing(weights, noise.fit.of(readings), together)
 
 

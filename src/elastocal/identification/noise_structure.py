@@ -728,17 +728,6 @@ def noise_models() -> tuple[str, ...]:
     return ("auto", *STRUCTURES, *(f"{name}+{CONFIGURATION}" for name in STRUCTURES))
 
 
-def check_supported(kind: str, readings: Readings) -> None:
-    """Raise InputError where a noise model of a plug-in lacks something in these readings."""
-    own = Kind.parsed(kind).own
-    model = STRUCTURES.get(own, NoiseModel())
-    require(
-        type(model).components is NoiseModel.components or model.supports(readings),
-        f"{option('noise', kind)}: this table does not support the noise model '{own}'; add the "
-        "columns that it needs, or take another one",
-    )
-
-
 def stated_deviations(
     model: Model, observed: Observations, x: Array, parts: Sequence[str] = tuple(PARTS)
 ) -> list[Deviation]:
@@ -748,11 +737,9 @@ def stated_deviations(
     Without times a visit takes as long as the arm stands still, as in a simulation.
     """
     noise, size, found = model.cell.noise, observed.size, list[Deviation]()
-    position, record = np.arange(size) < 3, None
     scatters = JOINTS in parts and bool(noise.joints.any())
     drifts = TIME in parts and noise.drift > 0 and size > 1
-    if scatters or drifts:
-        record = visit_record(model, observed, x)
+    record = visit_record(model, observed, x) if scatters or drifts else None
     if scatters and record is not None:
         settling = _settling(record, JOINTS, "joints", np.arange(model.chain.n_joints))
         scatter = noise.of_joints(model.chain.n_joints)
@@ -762,6 +749,6 @@ def stated_deviations(
         found.append(common_to(observed.configuration, axes, OF_CONFIGURATION))
     if drifts and record is not None:
         span = record.span * (1.0 if record.timed else model.cell.design.motion.dwell)
-        along = np.where(position, noise.drift, 0.0)
+        along = np.where(np.arange(size) < 3, noise.drift, 0.0)
         found.append(_drift(record, DRIFT, noise.lasting / span, along))
     return found

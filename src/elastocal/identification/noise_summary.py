@@ -246,7 +246,7 @@ class Noise:
         known = {
             "single_readings": self.single,
             "reason": self.reason,
-            "variances": self.sizes and [size.to_json() for size in self.sizes],
+            "variances": self.sizes,
             "tests": self.tests or None,
             "drift": self.drift,
             "tried": self.tried,
@@ -319,9 +319,9 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     for d, s, r in zip(fit.noisy.deviations, sigma[own:], error[own:].tolist(), strict=True):
         sizes.append(NoiseSize(d.name, s, None, d.part, d.joints, d.turns, r))
     drift, record = None, fit.noisy.readings.visits
-    if found.lasting is not None and record is not None:
-        seconds = found.lasting * record.span if record.timed else None
-        drift = Drift(found.lasting, seconds, found.to_longest > LIKELY)
+    if fit.lasting is not None and record is not None:
+        seconds = fit.lasting * record.span if record.timed else None
+        drift = Drift(fit.lasting, seconds, found.to_longest > LIKELY)
     return replace(
         noise, kind=found.kind, description=found.description, reason=found.reason,
         sigma=sigma[0] if kind == "independent" and own == 1 else None, sizes=tuple(sizes),

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any, Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
 from elastocal.identification.knowledge import ActiveConstraint, Constraints, GaussianPrior
@@ -239,7 +238,7 @@ class Options:
     method: Method = "auto"
     noise: str = "auto"
     weights: WeightKind = "auto"
-    covariance: NDArray[np.float64] | None = None
+    covariance: Array | None = None
     intervals: IntervalKind = "auto"
     fixed: tuple[str, ...] = ()
     constraints: Constraints | None = None
@@ -296,7 +295,7 @@ class Options:
             raise InputError(f"{option('intervals', self.intervals)} knows of {what}; {remedy}")
 
     def sets_aside(
-        self, faulty: NDArray[np.bool_], explained: Callable[[], NDArray[np.bool_]] | None = None
+        self, faulty: BoolArray, explained: Callable[[], BoolArray] | None = None
     ) -> bool:
         """Whether the `faulty` readings (N,) are left out of the fit: in auto, where but for those
         `explained` by one common shift each, whose cause is known, they are few."""

@@ -182,7 +182,7 @@ class FitToGood:
 
 ROUNDS = 12
 Found = TypeVar("Found")
-# A fit, the observations (n,) it is of, and their `better_half`.
+# A fit, the observations (n,) it is of, and the `better_half` of all.
 Stand = tuple[Found, BoolArray, tuple[float, float]]
 
 
@@ -201,11 +201,12 @@ def explains_more(one: Stand, other: Stand) -> bool:
 
 
 def until_it_stands(
-    good: BoolArray, judged: Callable[[BoolArray], tuple[Stand[Found], BoolArray]]
+    good: BoolArray, judged: Callable[[BoolArray], tuple[Found, Array, float, BoolArray]]
 ) -> Stand[Found]:
     """Fit and good observations (n,) that agree with each other, starting from `good`.
 
-    `judged` fits to the good ones and says which observations the fit does not contradict.  A set
+    `judged` fits to the good ones and says the squared lengths of all errors, the fit's degrees of
+    freedom, and which observations it does not contradict.  A set
     that comes back after others ends the search: those good at any time of that round are kept.  So
     does a fit that no majority agrees with: it cannot judge.  Observations that are taken back bend
     the fit, so that more of them seem to fit: where the better half of all is left worse explained
@@ -217,12 +218,12 @@ def until_it_stands(
     visited: list[Stand[Found]] = []
     for _ in range(ROUNDS):
         try:
-            stand, agrees = judged(good)
+            found, squared, dof, agrees = judged(good)
         except ElastocalError:
             if not visited:
                 raise
             break  # so few cannot judge the others
-        visited.append(stand)
+        visited.append((found, good, better_half(squared, dof, good)))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]
@@ -262,7 +263,7 @@ def find_faulty(solution: Solution) -> BoolArray:
         starts.append(majority(B, y))
     variance = starts[0][1]
 
-    def judged(good: BoolArray) -> tuple[Stand[FitToGood], BoolArray]:
+    def judged(good: BoolArray) -> tuple[FitToGood, Array, float, BoolArray]:
         nonlocal B, y, variance
         fit = FitToGood(B, y, good, variance)
         for _ in range(STEPS):
@@ -273,8 +274,8 @@ def find_faulty(solution: Solution) -> BoolArray:
             fit = FitToGood(B, y, good, variance)
             if np.linalg.norm(fit.R @ (fit.z - z)) <= SETTLED * np.sqrt(fit.variance):
                 break
-        half = better_half((fit.e**2).sum(axis=1), fit.dof, good)
-        return (fit, good, half), fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+        agrees = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+        return fit, (fit.e**2).sum(axis=1), fit.dof, agrees
 
     ends = []
     for good, at_first in starts:
@@ -345,11 +346,11 @@ def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[O
     return tuple(map(Outlier, lines, labels, markers, length.tolist(), ratio.tolist()))
 
 
-def rejection_point(values: int, dof: ArrayLike = np.inf, level: float = FALSE_ALARM) -> Array:
+def rejection_point(values: int, dof: ArrayLike = np.inf) -> Array:
     """How many standard deviations off a reading's component lies that is set apart: beyond what t
-    on `dof` degrees of freedom makes of a table of so many `values`, at a `level` for the whole
+    on `dof` degrees of freedom makes of a table of so many `values`, at FALSE_ALARM for the whole
     table (Bonferroni)."""
-    return np.asarray(-special.stdtrit(dof, level / values / 2))
+    return np.asarray(-special.stdtrit(dof, FALSE_ALARM / values / 2))
 
 
 # What setting readings apart makes of an estimate.
@@ -462,7 +463,7 @@ def settle(
     good = every if good is None else good
     precision: list[Array] = []  # of single readings, by the first noise
 
-    def judged(chosen: BoolArray) -> tuple[Stand[NoiseFit], BoolArray]:
+    def judged(chosen: BoolArray) -> tuple[NoiseFit, Array, float, BoolArray]:
         nonlocal noise
         noise = found = estimate_noise(readings.take(chosen), kind, noise)
         own, behind = own_noise(found.fit, readings)
@@ -479,7 +480,7 @@ def settle(
         point = rejection_point(t.size, np.where(inside, outside, behind))
         agrees = np.asarray(~(np.where(inside, left_out, np.abs(t)) > point).any(axis=1))
         squared = np.einsum("ni,nij,nj->n", r, precision[0], r)
-        return (found, chosen, better_half(squared, dof, chosen)), agrees
+        return found, squared, dof, agrees
 
     try:
         return until_it_stands(good, judged)[:2]
@@ -552,18 +553,6 @@ class HuberFit:
         """ψ(d)/d (n,)."""
         return c / np.maximum(self.distance, c)
 
-    @property
-    def smooth_c(self) -> float:
-        """c of a loss that is as good and has a curvature to be estimated.
-
-        ψ of l1 jumps at zero: a share of the residuals there tells its slope, that of Hall and
-        Sheather's bandwidth, without the p residuals that the fit makes zero (Koenker 2005, section
-        3.4).
-        """
-        kept = np.sort(self.distance)[len(self.z) // self.size :]
-        h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3) * (1.5 / (2 * np.pi)) ** (1 / 3)
-        return max(self.c, float(np.quantile(kept, min(2 * h, 0.98)))) if self.c == L1 else self.c
-
     def covariance(self, cluster: IntArray | None = None) -> Covariance:
         """Covariance (p, p) of x̂.
 
@@ -575,8 +564,15 @@ class HuberFit:
         Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster
         alone determines a combination of the parameters.
         """
-        rows, p, size, c = len(self.residual), len(self.z), self.size, self.smooth_c
-        d, across = self.distance, self.weights(c)
+        rows, p, size, c, d = len(self.residual), len(self.z), self.size, self.c, self.distance
+        if c == L1:
+            # ψ of l1 jumps at zero: a share of the residuals there tells its slope, that of Hall
+            # and Sheather's bandwidth, without the p residuals that the fit makes zero (Koenker
+            # 2005, section 3.4); c of that share is as good and has a curvature to be estimated.
+            kept = np.sort(d)[p // size :]
+            h = (special.ndtri(0.975) ** 2 * 1.5 / (2 * np.pi) / len(kept)) ** (1 / 3)
+            c = max(c, float(np.quantile(kept, min(2 * h, 0.98))))
+        across = self.weights(c)
         along, psi = (d <= c).astype(float), np.minimum(d, c)
         a = float(np.mean(along + (size - 1) * across)) / size
         if not a > 0:

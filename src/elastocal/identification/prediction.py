@@ -38,7 +38,7 @@ from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVi
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
-from elastocal.units import Array, IntArray, microns
+from elastocal.units import Array, BoolArray, IntArray, microns
 
 # What the identification knows of where the tool will be, and what it does not.
 
@@ -202,14 +202,11 @@ def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -
         p = parameters[k]
         found.setdefault((p.effect, p.unit), []).append(float(x[k]))
     rms = {kind: float(np.sqrt(np.mean(np.square(values)))) for kind, values in found.items()}
-    own = set(map(int, kept))
+    own = np.isin(np.arange(len(parameters)), kept).astype(float)
+    each = zip(parameters, own.tolist(), strict=True)
     return np.array(
-        [
-            p.typical or abs(p.nominal) or rms.get((p.effect, p.unit), 1.0 if k in own else 0.0)
-            or (1.0 if k in own else 0.0)
-            for k, p in enumerate(parameters)
-        ]
-    )  # fmt: skip
+        [p.typical or abs(p.nominal) or rms.get((p.effect, p.unit)) or k for p, k in each]
+    )
 
 
 # The position of the tool at a pose, with its region.
@@ -241,7 +238,7 @@ class Position(ByValue):
     def _quantile(self, level: float) -> Array:
         return np.asarray(3 * self.share * special.fdtri(3, np.clip(self.dof, 1, 1e9), level))
 
-    def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
+    def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> BoolArray:
         """Whether the regions of that `level` hold the places (n, 3)."""
         total = self.covariance + (self.visit if visit else 0.0)
         off = np.asarray(places) - self.position
@@ -476,19 +473,12 @@ def predicted_error(
     alone = np.inf
     if unchecked is not None:
         alone = float(np.sqrt((((known @ (unchecked @ root)) * each) ** 2).sum() * inflated.mean()))
-    low, high, sure = np.sqrt(np.quantile(squares, [0.025, 0.975, 0.95]))
+    low, high, sure = np.sqrt(np.quantile(squares, [0.025, 0.975, 0.95])).tolist()
+    mean, own, rest, lack = np.sqrt([own + rest + lacking, own, rest, lacking]).tolist()
     return PredictedError(
-        float(np.sqrt(own + rest + lacking)),
-        (float(low), float(high)),
-        float(np.sqrt(own)),
-        float(np.sqrt(rest)),
-        None if excess is None else float(np.sqrt(lacking)),
-        _blamed(left, np.diag(G)[n:]),
-        len(poses.q),
-        poses.source,
-        alone,
-        float(sure),
-    )
+        mean, (low, high), own, rest, None if excess is None else lack,
+        _blamed(left, np.diag(G)[n:]), len(poses.q), poses.source, alone, sure,
+    )  # fmt: skip
 
 
 def readings_at(

@@ -10,11 +10,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from elastocal.errors import InputError
 from elastocal.identification.least_squares import orthogonal
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse
 SIGMA_0 = 10e-6  # m, the tracker's claimed precision, σ₀ of eq. (14)
@@ -81,7 +80,7 @@ def eq14_weights(sigma: Array, sigma_0: float = SIGMA_0, lam: float = 1.0) -> Ar
     return sigma_0 / (sigma_0 + lam * np.asarray(sigma, dtype=float))
 
 
-def group_sigma(residual: Array, group: NDArray[np.int64]) -> Array:
+def group_sigma(residual: Array, group: IntArray) -> Array:
     """σ_i (rows,) as the standard deviation of the residuals in the row's group.
 
     A group is a configuration in one direction: 3 markers × 6 repeats give 18 values.
@@ -98,7 +97,7 @@ def group_sigma(residual: Array, group: NDArray[np.int64]) -> Array:
 def eq14(
     B: Array,
     dp: Array,
-    group: NDArray[np.int64] | None = None,
+    group: IntArray | None = None,
     *,
     sigma_0: float = SIGMA_0,
     lam: float = 1.0,

@@ -21,7 +21,7 @@ ALONE = 1e-9  # share of a direction that the other configurations must see
 
 
 def held_out_residual(
-    B: Array, residual: Array, weights: Weights, configuration: NDArray, size: int
+    B: Array, residual: Array, weights: Weights, configuration: IntArray, size: int
 ) -> Array:
     """Residual (rows,) of every configuration under the fit to all the others.
 
@@ -177,7 +177,7 @@ def f_test(
 
 
 def predicts_better(
-    narrow: Array, wide: Array, weights: Weights, configuration: NDArray, size: int
+    narrow: Array, wide: Array, weights: Weights, configuration: IntArray, size: int
 ) -> bool:
     """Do the held-out residuals `wide` (rows,) of more parameters show that `narrow` (rows,) lacks
     some?
@@ -271,7 +271,7 @@ def simultaneous_level(n: int) -> float:
 
 
 def groupings(
-    observed: Observations, chosen: NDArray[np.bool_]
+    observed: Observations, chosen: BoolArray
 ) -> Iterator[tuple[str, IntArray, NDArray[np.object_]]]:
     """By what the `chosen` rows (rows,) fall into more than one group, the number of each row's
     group and the groups' names, in the table's order."""
@@ -295,7 +295,7 @@ def groupings(
             yield by, place[code], np.array(names, dtype=object)[order]
 
 
-def _named(force: NDArray[np.float64]) -> str:
+def _named(force: Array) -> str:
     if not force.any():
         return "unloaded"
     return "(" + ", ".join(f"{f + 0.0:.6g}" for f in force) + ") N"
@@ -337,7 +337,7 @@ class GroupSummary:
 
     name: str
     n: int
-    counts: NDArray[np.int64]
+    counts: IntArray
     expected: Array
     beyond: int
     scores: NormalScores
@@ -474,7 +474,7 @@ class _Table:
         return np.linspace(-reach, reach, (bins | 1) + 1)  # 0 in the middle of a bin
 
     def summary(
-        self, name: str, rows: NDArray[np.int64] | slice, edges: Array, holm: float | None
+        self, name: str, rows: IntArray | slice, edges: Array, holm: float | None
     ) -> GroupSummary:
         z = self.z[rows]
         counts = np.histogram(z, edges)[0]

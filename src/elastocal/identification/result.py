@@ -33,7 +33,6 @@ from elastocal.identification.prediction import (
     position_at,
 )
 from elastocal.identification.residuals import ResidualSummary
-from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
@@ -55,7 +54,8 @@ FEW_POSES = 64  # of those over the workspace, for an rms
 LENGTHS = ("residual_rms", "heldout_rms", "heldout_all_rms", "nominal_rms")
 AS_THEY_ARE = (
     "residual_summary", "prior_share", "converged", "outliers", "excluded", "copies",
-    "autocorrelation", "warnings", "findings",
+    "autocorrelation", "warnings", "findings", "method", "combinations", "covariance",
+    "correlations", "dof", "noise", "faulty_report", "test",
 )  # fmt: skip
 LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
 
@@ -486,7 +486,7 @@ class Calibration(scrutiny.FoundFit, Result):
         decides there is not said by B alone."""
         numbers = len(self.residual) * len(self.estimates)
         others = self.prior_share or self.smooth or self.active
-        return not others and bool(self.residual.any()) and numbers <= MOST_NUMBERS
+        return not others and bool(self.residual.any()) and numbers <= scrutiny.MOST_NUMBERS
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
         """Leverage and influence of every configuration, in the table's order; empty for tables
@@ -648,29 +648,22 @@ class Calibration(scrutiny.FoundFit, Result):
             "nominal_flange": nominal_flange_rows(chain),
             "cell": self.model.cell.name,
             "data": observed.table.source,
-            "method": self.method,
             "parameters": [_estimate_json(e) for e in self.estimates],
-            "combinations": [c.to_json() for c in self.combinations],
-            "covariance": self.covariance,
             "covariance_of": self.determined,
-            "correlations": self.correlations,
             "loads_N": measured_loads(observed),
             "n_rows": len(self.residual),
             "n_readings": len(observed.lead),
-            "dof": self.dof,
             "heldout_kept_rms_um": microns(self.heldout_rms),
             **{f"{name}_um": microns(getattr(self, name)) for name in LENGTHS},
-            "test": _json(test),
             "test_rms_um": None if test is None else microns(test.rms),
             "test_mean_um": None if test is None else microns(test.mean),
             "test_max_um": None if test is None else microns(test.maximum),
             "verdict": self.verdict.to_json() | {"sentence": said},
-            "predicted_new_poses_um": _json(self.predicted),
+            "predicted_new_poses_um": self.predicted,
             "load_point_um": microns(self.load_point_error),
-            "measured_visits": measured_visits(observed).to_json(),
-            "measured_poses": _json(self.shown),
+            "measured_visits": measured_visits(observed),
+            "measured_poses": self.shown,
             "open": self.left,
-            "noise": self.noise.to_json(),
             "tails": None,
             "cell_noise": {
                 "joints_urad": 1e6 * off.joints, "drift_um": microns(off.drift),
@@ -683,17 +676,12 @@ class Calibration(scrutiny.FoundFit, Result):
                 for a in self.active
             ],
             "smooth": [entry for part in self.smooth for entry in part.to_json()],
-            "faulty_report": _json(self.faulty_report),
             "backend": self.model.backend_report(),
             "influence": self.influence(),
-            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
-            "uncertainty": _json(self.uncertainty()),
+            "parameter_sets": self.parameter_sets(),
+            "uncertainty": self.uncertainty(),
             **{name: getattr(self, name) for name in AS_THEY_ARE},
         })  # fmt: skip
-
-
-def _json(part: Any) -> dict[str, Any] | None:
-    return None if part is None else part.to_json()
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:

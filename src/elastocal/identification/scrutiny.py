@@ -58,6 +58,10 @@ class FoundFit:
         observed = self.observations
         return self.model.regressor(observed.table, self.x, observations=observed).B
 
+    @property
+    def stage(self) -> IntArray:
+        return np.array([stage_of(p.effect) for p in self.model.parameters], dtype=np.int64)
+
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
 
@@ -229,8 +233,7 @@ DRAWS = 1000
 def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
-    model, free = fit.model, ~fit.model.shrunk
-    stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
+    model, free, stage = fit.model, ~fit.model.shrunk, fit.stage
     fitted = np.isin(np.arange(len(stage)), fit.columns) & free
     observed, weights, size = fit.observations, fit.weights, fit.observations.size
     white, typical, at = weights.apply(fit.B), model.sizes(fit.B), np.flatnonzero(free)
@@ -393,12 +396,10 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
     too large to do it in passing.
     """
     model = result.model
-    if len(result.residual) * len(result.determined) > MOST_BUDGETED:
+    large = len(result.residual) * len(result.determined) > MOST_BUDGETED
+    if large or not np.isfinite(result.held_out).all():
         return None
-    if not np.isfinite(result.held_out).all():
-        return None
-    stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
-    stage[model.shrunk] = len(STAGES) - 1
+    stage = np.where(model.shrunk, len(STAGES) - 1, result.stage)
     determined, observed = np.isin(model.names, result.determined), result.observations
     last = int(stage[determined].max(initial=0))
     _, code = np.unique(observed.configuration, return_inverse=True)
@@ -416,7 +417,7 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
     return ErrorBudget(tuple(steps), *_floor(result))
 
 
-def _fitted(result: FoundFit, columns: NDArray[np.int64], held: NDArray[np.bool_]) -> Array:
+def _fitted(result: FoundFit, columns: IntArray, held: BoolArray) -> Array:
     """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
     model linearised at the whole fit."""
     model, B = result.model, result.B

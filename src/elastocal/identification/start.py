@@ -583,16 +583,19 @@ class Fallen:
     @property
     def axis(self) -> str | None:
         """The axis that points up, "−y" say; None where none does within FALLEN."""
-        k = int(np.argmax(np.abs(self.up)))
-        near = np.arccos(min(abs(self.up[k]), 1.0)) <= FALLEN
-        return ("−" if self.up[k] < 0 else "") + AXES[k] if near else None
+        near = np.arccos(min(np.abs(self.up).max(), 1.0)) <= FALLEN
+        return self.columns[2] if near else None
+
+    @property
+    def columns(self) -> list[str]:
+        """What the table's x, y, z would have to be: "x", "−z", "y"."""
+        return [("−" if row.sum() < 0 else "") + AXES[int(np.argmax(np.abs(row)))]
+                for row in self.turn]  # fmt: skip
 
     @property
     def turn(self) -> Array:
         """R (3, 3) from the readings' frame to one whose z is that axis."""
         k, eye = int(np.argmax(np.abs(self.up))), np.eye(3)
-        if k == 2:  # at most half a turn about x
-            return eye if self.up[k] > 0 else np.diag([1.0, -1.0, -1.0])
         axis, across = np.sign(self.up[k]) * eye[k], eye[(k + 1) % 3]
         return np.round(np.stack([across, np.cross(axis, across), axis]))
 
@@ -613,12 +616,9 @@ class Fallen:
         )
         if self.axis is None:
             return f"{text}. State how the arm is mounted, [model.nominal] base_rpy_deg"
-        # What the table's x, y, z would have to be: "x, −z, y".
-        columns = ", ".join(("−" if row.sum() < 0 else "") + AXES[int(np.argmax(np.abs(row)))]
-                            for row in self.turn)  # fmt: skip
         return (
             f"{text}. If it is mounted as stated, {self.axis} of that frame points up: write the "
-            f"columns {columns} as x, y, z; else state [model.nominal] base_rpy_deg"
+            f"columns {', '.join(self.columns)} as x, y, z; else state [model.nominal] base_rpy_deg"
         )
 
 
