@@ -401,12 +401,9 @@ class Diagnosis(Result):
     n_readings: int = 0
     n_configurations: int = 0
     extra: ExtraPlan | None = field(default=None)
-    # Keys of [model] that the effects found rest on, beyond their own names.
     model_keys: dict[str, str] = field(default_factory=dict)
-    # What was diagnosed: the model as it was given, and the name of its measurements.
     model: Model | None = field(default=None, repr=False, compare=False)
     data: str = field(default="", compare=False)
-    # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -442,6 +439,14 @@ class Diagnosis(Result):
     @property
     def findings(self) -> tuple[Finding, ...]:
         return tuple(_findings(self))
+
+    def to_json(self) -> dict[str, Any]:
+        """The diagnosis as a JSON-ready dictionary (DESIGN: diagnose → JSON).
+
+        Lengths are in µm where the key says _um, everything else in the SI unit that stands beside
+        it.  A number that is not known or not finite is null, as JSON has none.
+        """
+        return _published(self)
 
     def __repr__(self) -> str:
         found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
@@ -540,14 +545,9 @@ PUBLISHED = (
 NORMAL_95 = 1.959964
 
 
-def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
-    """The diagnosis as a JSON-ready dictionary (DESIGN: diagnose → JSON).
-
-    `model` is the arm that was diagnosed, `data` names its measurements.  Lengths are in µm where
-    the key says _um, everything else in the SI unit that stands beside it.  A number that is not
-    known or not finite is null, as JSON has none.
-    """
-    d = diagnosis
+def _published(d: Diagnosis) -> dict[str, Any]:
+    model = d.model
+    assert model is not None  # `diagnose` states it
     content = {
         "gap": _in_um(d.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"),
         "budget": [
@@ -560,12 +560,12 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         ],
         "fields": [_found(effect) for effect in d.fields],
         "slight": [_found(effect) for effect in d.slight],
-        "location": d.location and _location(d.location),
+        "location": d.location and _with_evidence(d.location),
         "noise": _noise(d.noise, model),
-        "extra_plan": d.extra and _without(vars(d.extra), "plan"),
+        "extra_plan": d.extra and {k: v for k, v in vars(d.extra).items() if k != "plan"},
         "backend": model.backend_report(),
     }
-    head = {"schema": SCHEMA, "robot": model.chain.name, "cell": model.cell.name, "data": data}
+    head = {"schema": SCHEMA, "robot": model.chain.name, "cell": model.cell.name, "data": d.data}
     as_they_are = {key: getattr(d, key, None) for key in PUBLISHED}
     return {key: plain(value) for key, value in (head | as_they_are | content).items()}
 
@@ -579,9 +579,12 @@ def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:
             for i, (value, kind) in enumerate(joints, 1)
         ],
         "near_repeat_um": near and _um(near.scatter),
-        "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),
+        "near_repeats": near and {
+            "pairs": near.pairs, "independent": near.independent,
+            "soon_um": _um(near.soon), "later_um": _um(near.later),
+        },
         "faulty": [_in_um(reading, "error") for reading in noise.faulty],
-    }
+    }  # fmt: skip
 
 
 def _um(length: Any) -> Any:
@@ -599,10 +602,6 @@ def _in_um(part: Any, *lengths: str) -> dict[str, Any]:
     }
 
 
-def _without(content: dict[str, Any], key: str) -> dict[str, Any]:
-    return {name: value for name, value in content.items() if name != key}
-
-
 def _found(f: FoundEffect) -> dict[str, Any]:
     def told(p: FittedParameter) -> dict[str, Any]:
         if math.isinf(p.std):
@@ -613,7 +612,7 @@ def _found(f: FoundEffect) -> dict[str, Any]:
     return vars(f) | {"parameters": [told(p) for p in f.parameters]}
 
 
-def _location(location: Location) -> dict[str, Any]:
+def _with_evidence(location: Location) -> dict[str, Any]:
     out = dict(vars(location))
     parts = ("stages", "places", "drivers", "shares")
     return out | {"evidence": {key: out.pop(key) for key in parts}}
