@@ -212,11 +212,16 @@ MOST_IN_ONE = 60
 def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measurements, str | None]:
     """The table, or a part of it that is large enough, and what was left out.
 
-    Of each configuration the first readings of every marker under every load; of too many
-    configurations those evenly spaced in the order they were measured, so that whatever changes
-    with time still does.
+    Of each configuration the first readings of every marker under every load, as many of each as
+    leave MOST_IN_ONE in it; of too many configurations those evenly spaced in the order they were
+    measured, so that whatever changes with time still does.
     """
-    part = table.take(_first_of_each(table))
+    kind = numbered(table.configuration, load_states(table.force), table.marker)
+    order, at = np.argsort(kind, kind="stable"), numbered(table.configuration)
+    rank = np.empty(len(table), dtype=np.int64)
+    rank[order] = np.arange(len(table)) - np.searchsorted(kind[order], kind[order])
+    n_kinds = np.bincount(at[np.unique(kind, return_index=True)[1]])
+    part = table.take(rank < np.maximum(MOST_IN_ONE // n_kinds, 1)[at])
     labels, first, rows = np.unique(part.configuration, return_index=True, return_counts=True)
     order = labels[np.argsort(first)]
     wanted = min(int(most_rows / rows.mean()), MOST_CONFIGURATIONS)
@@ -229,17 +234,6 @@ def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measuremen
         f"the table is large: {len(part)} of {len(table)} rows were looked at, from "
         f"{min(len(order), wanted)} of {len(order)} configurations, evenly spaced"
     )
-
-
-def _first_of_each(table: Measurements) -> NDArray[np.bool_]:
-    """Rows that are among the first of their configuration, load and marker, as many of each as
-    leave MOST_IN_ONE in the configuration."""
-    kind = numbered(table.configuration, load_states(table.force), table.marker)
-    order, at = np.argsort(kind, kind="stable"), numbered(table.configuration)
-    rank = np.empty(len(table), dtype=np.int64)
-    rank[order] = np.arange(len(table)) - np.searchsorted(kind[order], kind[order])
-    n_kinds = np.bincount(at[np.unique(kind, return_index=True)[1]])
-    return np.asarray(rank < np.maximum(MOST_IN_ONE // n_kinds, 1)[at])
 
 
 # Models that are derived from another one, kept for as long as that one is.

@@ -12,11 +12,18 @@ from scipy.special import expit
 
 from elastocal.diagnosis.baseline import from_centre, prior_deviations
 from elastocal.diagnosis.component_families import (
+    FEW_POSES,
+    OrderPosterior,
     catalogue_components,
     drifts,
+    families_of,
     family_of,
     joint_curves,
+    line_families,
+    ripples,
+    sharpened,
     shorter,
+    with_scatter,
     without_a_name,
 )
 from elastocal.diagnosis.components import (
@@ -34,15 +41,6 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import ModelSet, about, extended, settings_of, spans_of
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.lines import (
-    FEW_POSES,
-    OrderPosterior,
-    families_of,
-    line_families,
-    ripples,
-    sharpened,
-    with_scatter,
-)
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
 from elastocal.diagnosis.stated_floor import scatter_beyond
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
@@ -199,12 +197,12 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
         some += [stand_out[:n] for n in range(2, min(TRIED, len(stand_out)) + 1)]
         for chosen in [stand_out] if many else some:
             noise = found.noise
-            for family in chosen:
-                noise = with_scatter(noise, index(family.component.where), family.scatter)
+            for _, component, scatter, _ in chosen:
+                noise = with_scatter(noise, index(component.where), scatter)
             fitted = exchanged(
                 replace(found, noise=noise),
-                [c for family in chosen for c in family.instead_of],
-                [family.component for family in chosen],
+                [c for *_, instead_of in chosen for c in instead_of],
+                [component for _, component, *_ in chosen],
             )  # fmt: skip
             if fitted.score > found.score + GAINED:
                 wider = fitted
@@ -259,7 +257,7 @@ SWEEPS = 2
 def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with a family of lines at each joint where the others let expect one, and a line at
     one order is more probable than all others and none together; the most probable first."""
-    while lined := {family.where for family in families_of(found)}:
+    while lined := families_of(found):
         others = (h for h in ripples(dataset) if h.where not in lined)
         each = [OrderPosterior(dataset, found, h) for h in others]
         chances = [p.probability(p.likeliest_line[0]) for p in each]

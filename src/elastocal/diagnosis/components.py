@@ -476,19 +476,14 @@ def fit_sum(
                 enough = SETTLED
         problem, at = problem.scaled(at.factor), replace(at, factor=0.0)
         if refit_noise:
-            problem = _under_own_noise(problem, at)
+            problem = posed(data, problem.components, _noise_beside(problem, at))
+            # Some of the configurations do not tell its size as all do: a sum under it would be
+            # worth less than the next one, whose factor is free.
+            if len(data.r) >= 2 * SOME:
+                problem = problem.scaled(problem.climbed(at, factor_alone=True).factor)
         if not problem.components:
             break
     return at_maximum(problem, at)
-
-
-def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
-    found = posed(problem.data, problem.components, _noise_beside(problem, at))
-    if len(problem.data.r) < 2 * SOME:
-        return found
-    # Some of the configurations do not tell its size as all do: a sum under it would be worth less
-    # than the next one, whose factor is free.
-    return found.scaled(found.climbed(replace(at, factor=0.0), factor_alone=True).factor)
 
 
 def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:

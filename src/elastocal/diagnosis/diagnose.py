@@ -50,7 +50,7 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.scrutiny import BudgetStep
-from elastocal.identification.start import Fallen, check_table, fallen, solved_body, without_copies
+from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
@@ -86,9 +86,18 @@ def write_extended_cell(
     data = {"name": cell.name} | read_toml(source, "cell file")
     # The real folders: ".." of a link to a folder is not where the link stands.
     data = _redirected(data, source.parent, os.path.realpath(target.parent))
-    if found:
-        _switch_on(data.setdefault("model", {}), found)
-        data["model"] |= dict(model_keys or {})
+    model = data.setdefault("model", {}) if found else {}
+    for f in found:
+        effects = model.setdefault("effects", [])
+        if (entry := f"{f.effect}:{f.where}") not in effects:
+            effects.append(entry)
+        values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
+        if hints := effect_of(f.effect).hints(f.where, values):
+            model.setdefault("nominal", {}).update(hints)
+        for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
+            if found_there:
+                _join(model, {"nominal": {key: {f.where: found_there}}})
+    model |= dict(model_keys or {})
     if keys:
         data.get("design", {}).pop("choose", None)
         _join(data, keys)
@@ -110,19 +119,6 @@ def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:
             _join(data.setdefault(name, {}), value)
         else:
             data[name] = value
-
-
-def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
-    effects = model.setdefault("effects", [])
-    for f in found:
-        if (entry := f"{f.effect}:{f.where}") not in effects:
-            effects.append(entry)
-        values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
-        if hints := effect_of(f.effect).hints(f.where, values):
-            model.setdefault("nominal", {}).update(hints)
-        for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
-            if found_there:
-                _join(model, {"nominal": {key: {f.where: found_there}}})
 
 
 def _redirected(value: Any, old: Path, new: str, key: str = "") -> Any:
@@ -192,19 +188,15 @@ def diagnose(
         return replace(found, warnings=(str(lies), *found.warnings))
     progress(f"once more with {lies.axis} up")
     upright = _diagnosed(model, lies.turned(table), options, progress)
-    return replace(found, warnings=(_if_upright(lies, found, upright), *found.warnings))
-
-
-def _if_upright(lies: Fallen, found: Diagnosis, upright: Diagnosis) -> str:
-    """What is different where the readings' frame is turned so that the arm stands."""
     before, after = (1e6 * d.budget[-2].heldout_rms for d in (found, upright))
-    if after > (1 - PAYS) * before:
-        return f"{lies}. Here it makes no difference"
     names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "none"
-    return (
+    told = (
         f"{lies}. With {lies.axis} up the verdict is {upright.verdict} (effects: {names}), and the "
         f"held-out error falls to {after:.3g} µm instead of {before:.3g} µm"
     )
+    if after > (1 - PAYS) * before:
+        told = f"{lies}. Here it makes no difference"
+    return replace(found, warnings=(told, *found.warnings))
 
 
 def _diagnosed(

@@ -446,7 +446,33 @@ class Diagnosis(Result):
         Lengths are in µm where the key says _um, everything else in the SI unit that stands beside
         it.  A number that is not known or not finite is null, as JSON has none.
         """
-        return _published(self)
+        model = self.model
+        assert model is not None  # `diagnose` states it
+        content = {
+            "schema": SCHEMA,
+            "robot": model.chain.name,
+            "cell": model.cell.name,
+            "data": self.data,
+            **{key: getattr(self, key, None) for key in PUBLISHED},
+            "gap": _in_um(
+                self.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"
+            ),
+            "budget": [
+                {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
+                for s in self.budget
+            ],
+            "effects": [_found(effect) for effect in self.effects],
+            "components": [
+                _in_um(c, "rms", "rms_ci95") | {"effect": c.effects[0]} for c in self.components
+            ],
+            "fields": [_found(effect) for effect in self.fields],
+            "slight": [_found(effect) for effect in self.slight],
+            "location": self.location and _with_evidence(self.location),
+            "noise": _noise(self.noise, model),
+            "extra_plan": self.extra and {k: v for k, v in vars(self.extra).items() if k != "plan"},
+            "backend": model.backend_report(),
+        }
+        return {key: plain(value) for key, value in content.items()}
 
     def __repr__(self) -> str:
         found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
@@ -523,7 +549,6 @@ UNSEEN = (
 
 
 def _remedy(verdict: Verdict) -> str:
-    """What to do after a verdict."""
     return {
         "explained": f"Identify with the cell that {option('cell_out')} writes, and check the "
         f"error on poses kept back (identify with {option('test')}).",
@@ -543,31 +568,6 @@ PUBLISHED = (
     "backend", "n_readings", "n_configurations",
 )  # fmt: skip
 NORMAL_95 = 1.959964
-
-
-def _published(d: Diagnosis) -> dict[str, Any]:
-    model = d.model
-    assert model is not None  # `diagnose` states it
-    content = {
-        "gap": _in_um(d.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"),
-        "budget": [
-            {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
-            for s in d.budget
-        ],
-        "effects": [_found(effect) for effect in d.effects],
-        "components": [
-            _in_um(c, "rms", "rms_ci95") | {"effect": c.effects[0]} for c in d.components
-        ],
-        "fields": [_found(effect) for effect in d.fields],
-        "slight": [_found(effect) for effect in d.slight],
-        "location": d.location and _with_evidence(d.location),
-        "noise": _noise(d.noise, model),
-        "extra_plan": d.extra and {k: v for k, v in vars(d.extra).items() if k != "plan"},
-        "backend": model.backend_report(),
-    }
-    head = {"schema": SCHEMA, "robot": model.chain.name, "cell": model.cell.name, "data": d.data}
-    as_they_are = {key: getattr(d, key, None) for key in PUBLISHED}
-    return {key: plain(value) for key, value in (head | as_they_are | content).items()}
 
 
 def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:

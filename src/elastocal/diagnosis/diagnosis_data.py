@@ -69,17 +69,6 @@ class DiagnosisData:
         return self.data.blocks
 
     @property
-    def drift(self) -> float:
-        """The drift in m that the cell states, and that is noise here; of distances none is."""
-        return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
-
-    @property
-    def common(self) -> float:
-        """The deviation in m, per axis, that the cell states as common to a configuration."""
-        shown = self.base.observed.kind in ("position", "pose")
-        return self.base.model.cell.noise.configuration if shown else 0.0
-
-    @property
     def table(self) -> Measurements:
         return self.base.observed.table
 
@@ -105,7 +94,7 @@ class DiagnosisData:
 
     def pack(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → packed (C, m, k)."""
-        return self.blocks.pack(self.columns.observed(rows))
+        return self.blocks.pack(self.base.observed.apply(rows))
 
     def entry(self, key: EntryKey) -> Array:
         """Packed columns (C, m, d) of an entry; not to be written to."""
@@ -124,7 +113,7 @@ class DiagnosisData:
 
     def sizes_in(self, h: Hypothesis, rows: Array) -> Array:
         """Its typical sizes by columns (n_rows, size, k), what is only planned not counted."""
-        return usual_sizes(h.parameters, self.columns.observed(rows)[: self.base.n_measured])
+        return usual_sizes(h.parameters, self.base.observed.apply(rows)[: self.base.n_measured])
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
@@ -247,7 +236,7 @@ def diagnosis_data_of(
     load_point = None
     for h in loads:
         keys = [k for k, p in enumerate(h.parameters) if p.key.startswith("load_point")]
-        shift = columns.observed(columns.of(h)[:, :, keys])
+        shift = observed.apply(columns.of(h)[:, :, keys])
         load_point = blocks.pack(shift)
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
         names += [h.name] * len(keys)

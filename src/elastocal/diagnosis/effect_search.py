@@ -270,7 +270,7 @@ def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]
         what = item.what
         if isinstance(what, Hypothesis):
             values = chosen.at.beta[span] * dataset.sizes[what.key]
-            starts = what.effect.starts(what.where, model.chain, model.cell)
+            starts = what.starts(model)
             for p, v in zip(what.parameters, values, strict=True):
                 name = f"{what.where}.{p.key}"
                 start[name] = float(about[name]) if starts else float(v) + p.nominal
@@ -437,13 +437,12 @@ def about(
     back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
     for what in added:
         # What an effect tries from several starts has no size about any of them.
-        starts = what.effect.starts(what.where, model.chain, model.cell)
-        open_keys = {key for start in starts for key in start}
+        open_keys = {key for start in what.starts(model) for key in start}
         moved_by = [
             0.0 if p.key in open_keys else x[f"{what.where}.{p.key}"] - p.nominal
             for p in what.parameters
         ]
-        back[:, :, 0] += about_fit.columns.observed(about_fit.columns.of(what)) @ np.array(moved_by)
+        back[:, :, 0] += base.observed.apply(about_fit.columns.of(what)) @ np.array(moved_by)
     r = about_fit.data.r + about_fit.blocks.pack(back)[:, :, 0]
     shares = dataset.columns.shares | about_fit.columns.shares
     columns = replace(about_fit.columns, shares=shares)

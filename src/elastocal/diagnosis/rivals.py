@@ -244,10 +244,8 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
 
 def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
     """Columns (C, m, k) of an item about each of its starts, per typical size; none without."""
-    what, model, of = item.what, dataset.base.model, dataset.columns
-    if not isinstance(what, Hypothesis) or not what.effect.starts(
-        what.where, model.chain, model.cell
-    ):
+    what, of = item.what, dataset.columns
+    if not isinstance(what, Hypothesis) or not what.starts(dataset.base.model):
         return []
     starts = StartSearch(of.full, what, of.base, of.x, of.rows).tangents()
     return [dataset.pack(C) * dataset.sizes_in(what, C) for _, C in starts]

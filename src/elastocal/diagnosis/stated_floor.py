@@ -60,7 +60,8 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
         data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
         tuple(noise.joint.tolist()), noise.shared_by_all,
         float(np.sqrt(square / dof)) if dof else None,
-        tuple(noise.shared.tolist()), faulty, near_repeats(dataset, data, at), dataset.drift,
+        tuple(noise.shared.tolist()), faulty, near_repeats(dataset, data, at),
+        dataset.base.model.cell.noise.drift if data.blocks.size > 1 else 0.0,
     )  # fmt: skip
 
 
@@ -224,27 +225,22 @@ MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREA
 MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
 
 
-def most_scatter(joint: Array) -> Array:
-    """Scatter (joints,) that each joint may have where the others have theirs, `joint` (joints,).
+def scatter_beyond(noise: NoiseValues) -> Array:
+    """Variance (joints,) of each joint's scatter beyond what the others let expect.
 
-    Their logarithms spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its own
-    spread, so that the others tell what one is to be expected of; beyond its limit any joint of an
-    arm is with a chance of FALSE_SMOOTH.
+    The logarithms of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its
+    own spread, so that the others tell what one is to be expected of; beyond its limit any joint of
+    an arm is with a chance of FALSE_SMOOTH.
     """
-    J, usual = len(joint), np.log(REPEATABILITY)
-    off = np.log(joint) - usual
+    J, usual = len(noise.joint), np.log(REPEATABILITY)
+    off = np.log(noise.joint) - usual
     told = (J - 1) / JOINT_SPREAD**2
     known = told + 1 / REPEATABILITY_SPREAD**2
     others = (off.sum() - off) / JOINT_SPREAD**2 / known
     spread = np.sqrt(JOINT_SPREAD**2 + 1 / known)
     limit = np.exp(usual + others - float(special.ndtri(FALSE_SMOOTH / J)) * spread)
-    return np.minimum(limit, MOST_SCATTER)
-
-
-def scatter_beyond(noise: NoiseValues) -> Array:
-    """Variance (joints,) of each joint's scatter beyond what the others let expect."""
     scatter = noise.joint**2 * (1 + noise.shared**2)
-    return np.maximum(scatter - most_scatter(noise.joint) ** 2, 0.0)
+    return np.maximum(scatter - np.minimum(limit, MOST_SCATTER) ** 2, 0.0)
 
 
 class SupportedFloor:
@@ -277,9 +273,12 @@ class SupportedFloor:
         self.instrument = above * mean_square(data, stated)
         variance = max(fitted**2 - self.joints.sum() - self.instrument, 0.0)
         total, dof = repeats(dataset, come_back=True)
-        near, common = near_repeats(dataset, data, at), min(size * dataset.common**2, variance)
+        # What the cell states as common to a configuration, per axis.
+        seen = dataset.base.observed.kind in ("position", "pose")
+        alike = dataset.base.model.cell.noise.configuration**2 if seen else 0.0
+        near, common = near_repeats(dataset, data, at), min(size * alike, variance)
         if near is not None:
-            total += max(near.scatter**2 - dataset.common**2, 0.0) * near.independent * size
+            total += max(near.scatter**2 - alike, 0.0) * near.independent * size
             dof += near.independent * size
         if dof:
             shown = size * total / dof
