@@ -10,13 +10,12 @@ from scipy.stats import multivariate_normal
 from support.diagnosis_data import campaign
 from support.noisy_data import dense_noise, random_data, used_rows
 
-from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.baseline import NoiseValues, NoisyData, fit_baseline
 from elastocal.diagnosis.component_search import _component
 from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum, posed
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Item
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 

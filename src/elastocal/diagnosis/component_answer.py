@@ -13,6 +13,7 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
+from elastocal.diagnosis.baseline import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.component_search import exchanged, imitators, size_of_fellows
 from elastocal.diagnosis.components import Component, FittedSum, drawn, presence_cost
 from elastocal.diagnosis.diagnosis import (
@@ -30,8 +31,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import spans_of
-from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
-from elastocal.diagnosis.stated_floor import (
+from elastocal.diagnosis.noise_floor import (
     NEW_POSES,
     SupportedFloor,
     each_left_out,

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import logit, logsumexp, ndtri
 
 from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis.baseline import NoiseValues, log_prior, project
 from elastocal.diagnosis.components import ALONE, Component, Family, FittedSum, presence_cost
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, wrenches
 from elastocal.diagnosis.evidence import Grams, direct
@@ -27,7 +28,6 @@ from elastocal.diagnosis.hypotheses import (
     RegressorDirection,
     recorded,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues, log_prior, project
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit, with_moves
 from elastocal.model.effects.base import Effect, JointMotion, Stage, index, turning_joints

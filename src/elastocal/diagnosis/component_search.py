@@ -10,7 +10,14 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit
 
-from elastocal.diagnosis.baseline import from_centre, prior_deviations
+from elastocal.diagnosis.baseline import (
+    NoiseValues,
+    NoisyData,
+    from_centre,
+    posterior,
+    prior_deviations,
+    project,
+)
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
     OrderPosterior,
@@ -41,8 +48,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import ModelSet, about, extended, settings_of, spans_of
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
-from elastocal.diagnosis.stated_floor import scatter_beyond
+from elastocal.diagnosis.noise_floor import scatter_beyond
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE

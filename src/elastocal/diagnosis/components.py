@@ -28,10 +28,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy import linalg, special
 
-from elastocal.diagnosis.effect_search import spans_of, within_bounds
-from elastocal.diagnosis.evidence import at_scales
-from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.noise_floor import (
+from elastocal.diagnosis.baseline import (
     NoiseValues,
     NoisyData,
     Weighted,
@@ -40,6 +37,9 @@ from elastocal.diagnosis.noise_floor import (
     log_prior,
     posterior,
 )
+from elastocal.diagnosis.effect_search import spans_of, within_bounds
+from elastocal.diagnosis.evidence import at_scales
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.engine.mixed import Products, Standardised, beside, climb
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import Waves

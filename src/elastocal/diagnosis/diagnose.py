@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
-from elastocal.diagnosis.baseline import fit_baseline, thinned
+from elastocal.diagnosis.baseline import NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
@@ -35,9 +35,7 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     with_recorded_drivers,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues
-from elastocal.diagnosis.reading_faults import screen_outliers
-from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, first_steps, noise_floor
+from elastocal.diagnosis.noise_floor import FALSE_SMOOTH, first_steps, noise_floor, screen_outliers
 from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,

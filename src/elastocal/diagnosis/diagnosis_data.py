@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import Baseline, Blocks, from_centre, prior_deviations
+from elastocal.diagnosis.baseline import Baseline, Blocks, NoisyData, from_centre, prior_deviations
 from elastocal.diagnosis.hypotheses import (
     KEPT,
     NO_SETTINGS,
@@ -26,7 +26,6 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     recorded,
 )
-from elastocal.diagnosis.noise_floor import NoisyData
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
@@ -67,6 +66,11 @@ class DiagnosisData:
     @property
     def blocks(self) -> Blocks:
         return self.data.blocks
+
+    @property
+    def drift(self) -> float:
+        """The drift in m that the cell states, and that is noise here; of distances none is."""
+        return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
 
     @property
     def table(self) -> Measurements:

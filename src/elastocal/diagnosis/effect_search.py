@@ -12,21 +12,23 @@ import numpy as np
 from scipy.special import expit, log_ndtr, logsumexp, ndtr
 
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
-from elastocal.diagnosis.noise_floor import (
+from elastocal.diagnosis.baseline import (
     SHARED,
+    Baseline,
     NoiseValues,
     NoisyData,
     Projection,
     Weighted,
+    fit_baseline,
     fit_noise,
     log_prior,
+    made_once,
     project,
 )
-from elastocal.diagnosis.stated_floor import left_out_square
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
+from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
+from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.evaluate import ahead

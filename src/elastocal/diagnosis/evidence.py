@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logsumexp
 
-from elastocal.diagnosis.baseline import Blocks
+from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array

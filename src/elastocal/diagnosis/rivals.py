@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 from scipy.sparse.csgraph import connected_components
 
-from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.baseline import SMALLEST_NOISE, Baseline, NoiseValues, project
 from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
 from elastocal.diagnosis.diagnosis_data import (
     UNKNOWN_EFFECT,
@@ -28,7 +28,6 @@ from elastocal.diagnosis.effect_search import (
 )
 from elastocal.diagnosis.evidence import Grams, Item, at_scales
 from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
-from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements

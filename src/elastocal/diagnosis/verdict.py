@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
+from elastocal.diagnosis.baseline import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer
 from elastocal.diagnosis.component_search import sum_of
 from elastocal.diagnosis.diagnosis import (
@@ -34,8 +35,7 @@ from elastocal.diagnosis.effect_search import (
 )
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
-from elastocal.diagnosis.stated_floor import NEW_POSES, each_left_out, mean_square, with_intervals
+from elastocal.diagnosis.noise_floor import NEW_POSES, each_left_out, mean_square, with_intervals
 from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
