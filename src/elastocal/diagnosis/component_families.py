@@ -18,9 +18,11 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import NoiseValues, log_prior, project
 from elastocal.diagnosis.components import ALONE, Component, Family, FittedSum, presence_cost
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, wrenches
-from elastocal.diagnosis.evidence import Grams, direct
+from elastocal.diagnosis.effect_search import settings_of
+from elastocal.diagnosis.evidence import Grams, Item, direct
 from elastocal.diagnosis.hypotheses import (
     CHANGE_TIMES,
+    NO_SETTINGS,
     SCALES,
     UNSIZED_SCALES,
     EntryKey,
@@ -97,18 +99,25 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
 
 
 def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
-    cell = dataset.base.model.cell
-    places = Counter(h.effect.name for h in dataset.hypotheses)
-    for h in dataset.hypotheses:
-        if h.settings:
-            continue
-        columns = dataset.packed(h)
-        if np.abs(columns).max(initial=0.0) > 0:
+    places = Counter(h.name for h in dataset.hypotheses)
+    for h in (h for h in dataset.hypotheses if not h.settings):
+        c = component_of(dataset, Item(h, NO_SETTINGS.values[0], 0.0))
+        if np.abs(c.columns).max(initial=0.0) > 0:
             search = -dataset.columns.shares.get(h.key, 0.0)
-            yield Component(
-                family_of(h.effect, cell), h.effect, h.where, columns, hypothesis=h, search=search,
-                fellows=places[h.effect.name],
-            )  # fmt: skip
+            yield replace(c, search=search, fellows=places[h.name])
+
+
+def component_of(dataset: DiagnosisData, item: Item) -> Component:
+    """What the forward search found, as a component."""
+    h, columns = item.what, dataset.packed(item.what, item.settings)
+    if not isinstance(h, Hypothesis):
+        return Component("pose", ResidualField(), h.where, columns, follows=h.covariate)
+    family, settings, search = family_of(h.effect, dataset.base.model.cell), settings_of(item), 0.0
+    if settings:
+        grid = dataset.grids[h.key]
+        search = -float(grid.log_prior[grid.nearest(item.settings)])
+    return Component(family, h.effect, h.where, columns, settings=tuple(settings.items()),
+                     hypothesis=h, search=search)  # fmt: skip
 
 
 def drifts(dataset: DiagnosisData) -> Iterator[Component]:

@@ -35,7 +35,7 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     with_recorded_drivers,
 )
-from elastocal.diagnosis.noise_floor import FALSE_SMOOTH, first_steps, noise_floor, screen_outliers
+from elastocal.diagnosis.noise_floor import FALSE_SMOOTH, first_steps, screen_outliers
 from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,
@@ -234,7 +234,11 @@ def _diagnosed(
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
-    p, nothing = chance_of_noise(found, nats)
+    p, nothing = found.p_value, found.slots[0].probabilities()[1]
+    if nats > 0:
+        # Of a sum that is so many nats more probable than nothing, noise alone yields as much with
+        # a chance of exp(−nats) at most (Markov's inequality).
+        p, nothing = max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
     if answers["gap"].open:
         # What is left is no noise, whatever it is.
         nothing = min(nothing, FALSE_SMOOTH)
@@ -257,18 +261,6 @@ def _diagnosed(
         data=source,
         calibrated=base,
     )
-
-
-def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
-    """p of what was found, and the probability that it is nothing.
-
-    By the flips of the forward search; of a sum that is so many `nats` more probable than nothing,
-    noise alone yields as much with a chance of exp(−nats) at most (Markov's inequality).
-    """
-    p, nothing = found.p_value, found.slots[0].probabilities()[1]
-    if nats <= 0:
-        return p, nothing
-    return max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
 
 
 def _sum_of_all(
@@ -332,7 +324,7 @@ def _pieces(
         "effects": beside_unknown(answer.effects) if gap.open else answer.effects,
         "indistinguishable": answer.indistinguishable,
         "location": location,
-        "noise": noise_floor(answer.dataset, answer.found.data, answer.found.noise),
+        "noise": answer.supported.told,
         "probability_unknown": max(answer.unnamed_probability, gap.open * (1 - FALSE_SMOOTH)),
         "curves": answer.curves(),
         "components": answer.components,

@@ -624,10 +624,8 @@ class ForwardSelection:
         offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
         slot, best = Slot(scanned.items, scanned.scores + offset), None
         close, there = self._close(slot, behind), {id(item.what) for item in current.items}
-        scores, added = (
-            slot.scores.copy(),
-            [k for k in close if id(slot.items[k].what) not in there],
-        )
+        scores = slot.scores.copy()
+        added = [k for k in close if id(slot.items[k].what) not in there]
         scores[[k for k in close if id(slot.items[k].what) in there]] = -np.inf
         fits = self._with_each(current, [slot.items[k] for k in added])
         for k, fitted in zip(added, fits, strict=True):

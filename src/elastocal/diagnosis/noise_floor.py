@@ -40,34 +40,6 @@ from elastocal.model.observations import pure_error
 from elastocal.units import Array, BoolArray, IntArray
 
 
-def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> NoiseFloor:
-    """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
-    (square, dof), at = repeats(dataset), project(data, noise)
-    variance = np.diagonal(data.covariance, axis1=1, axis2=2)
-    ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
-    variance = variance[~data.left_out]
-    # Those left out have their error against the fit to the others.
-    e, stated = _left_over(data, at), data.blocks.unpack_square(data.covariance)
-    sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
-    table, gone = dataset.table, np.flatnonzero(data.faulty)
-    faulty = tuple(
-        FaultyReading(
-            int(table.row[row]),
-            table.configuration_labels[table.configuration[row]],
-            table.marker_names[table.marker[row]],
-            float(np.linalg.norm(e[k, :3])),
-            float(np.linalg.norm(e[k] / sigma[k])),
-        )
-        for k, row in zip(gone, dataset.lead[gone], strict=True)
-    )
-    return NoiseFloor(
-        data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
-        tuple(noise.joint.tolist()), noise.shared_by_all,
-        float(np.sqrt(square / dof)) if dof else None,
-        tuple(noise.shared.tolist()), faulty, near_repeats(dataset, data, at), dataset.drift,
-    )  # fmt: skip
-
-
 def _left_over(data: NoisyData, at: Projection) -> Array:
     """r − Xβ̂ (N, size) of each observation."""
     return data.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
@@ -260,11 +232,11 @@ class SupportedFloor:
     def __init__(
         self, dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
     ) -> None:
-        at = project(data, noise)
+        self.of, self.at = (dataset, data, noise), project(data, noise)
         fitted = min(noise_rms(data, noise), best)
         size = min(data.blocks.size, 3)
         scatter = noise.joint**2 * (1 + noise.shared**2)
-        smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
+        smooth = np.minimum(smooth_scatter(dataset, data, self.at), scatter)
         above, excess = 0.0, np.zeros_like(scatter)
         if data.stated:  # else what joints do and what the instrument does are not to be told apart
             excess = scatter_beyond(noise)
@@ -279,8 +251,9 @@ class SupportedFloor:
         # What the cell states as common to a configuration, per axis.
         seen = dataset.base.observed.kind in ("position", "pose")
         alike = dataset.base.model.cell.noise.configuration**2 if seen else 0.0
-        near, common = near_repeats(dataset, data, at), min(size * alike, variance)
-        if near is not None:
+        self.near_repeats = near_repeats(dataset, data, self.at)
+        common = min(size * alike, variance)
+        if near := self.near_repeats:
             total += max(near.scatter**2 - alike, 0.0) * near.independent * size
             dof += near.independent * size
         if dof:
@@ -291,6 +264,34 @@ class SupportedFloor:
                 variance = shown + common
         self.noise, self.stands_out = min(float(np.sqrt(variance)), fitted), bool(excess.any())
         self.unexplained = float(np.sqrt(max(fitted**2 - self.noise**2, 0.0)))
+
+    @property
+    def told(self) -> NoiseFloor:
+        """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
+        (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
+        variance = np.diagonal(data.covariance, axis1=1, axis2=2)
+        ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
+        variance = variance[~data.left_out]
+        # Those left out have their error against the fit to the others.
+        e, stated = _left_over(data, self.at), data.blocks.unpack_square(data.covariance)
+        sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
+        table, gone = dataset.table, np.flatnonzero(data.faulty)
+        faulty = tuple(
+            FaultyReading(
+                int(table.row[row]),
+                table.configuration_labels[table.configuration[row]],
+                table.marker_names[table.marker[row]],
+                float(np.linalg.norm(e[k, :3])),
+                float(np.linalg.norm(e[k] / sigma[k])),
+            )
+            for k, row in zip(gone, dataset.lead[gone], strict=True)
+        )
+        return NoiseFloor(
+            data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
+            tuple(noise.joint.tolist()), noise.shared_by_all,
+            float(np.sqrt(square / dof)) if dof else None,
+            tuple(noise.shared.tolist()), faulty, self.near_repeats, dataset.drift,
+        )  # fmt: skip
 
     @property
     def open(self) -> bool:
