@@ -13,11 +13,10 @@ import numpy as np
 from draw import World
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, project
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.model.manipulator import Model
 
 

@@ -92,13 +92,6 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
     write_json(summary, {"schema": SCHEMA, **plan.to_json(), **repeat})
 
 
-def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
-    from elastocal.diagnosis.diagnosis import publish
-
-    assert diagnosis.model is not None  # `diagnose` states it
-    write_json(path, publish(diagnosis, diagnosis.model, diagnosis.data))
-
-
 def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
     """The cell file that was diagnosed with the effects found added; it is returned as written.
 
@@ -178,7 +171,7 @@ WRITERS: dict[str, dict[str, Callable[..., Any]]] = {
     "Comparison": {".json": save_published},
     "Calibration": {".json": save_published, ".csv": save_residuals},
     "Plan": {".csv": save_plan},
-    "Diagnosis": {".json": save_diagnosis, ".toml": save_found_cell},
+    "Diagnosis": {".json": save_published, ".toml": save_found_cell},
     "Compensation": {".csv": save_compensation},
     "CalibratedArm": {ANY: save_arm},
     "Measurements": dict.fromkeys((".csv", *PARQUET), write_measurements),

@@ -10,13 +10,12 @@ from scipy.stats import multivariate_normal
 from support.diagnosis_data import campaign
 from support.noisy_data import dense_noise, random_data, used_rows
 
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.component_search import _component
+from elastocal.diagnosis.baseline import NoiseValues, NoisyData, fit_baseline
+from elastocal.diagnosis.component_families import component_of
 from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum, posed
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Item
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
@@ -115,5 +114,5 @@ def test_what_was_found_at_settings_of_its_own_costs_its_search() -> None:
     dataset = diagnosis_data_of(base, [h])
     grid = dataset.grids[h.key]
     k = int(np.argmin(grid.log_prior))
-    found = _component(dataset, Item(h, grid.values[k], 0.0))
+    found = component_of(dataset, Item(h, grid.values[k], 0.0))
     assert found.search == -grid.log_prior[k] > np.log(10)

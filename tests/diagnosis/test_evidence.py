@@ -8,8 +8,8 @@ from scipy import stats
 from scipy.special import logsumexp
 from support.noisy_data import dense_noise, random_data, used_rows
 
+from elastocal.diagnosis.baseline import NoiseValues, NoisyData, project
 from elastocal.diagnosis.evidence import SCALES, direct, exceedance
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
 SEEDS = range(2)

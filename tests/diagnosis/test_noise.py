@@ -11,9 +11,9 @@ from support.diagnosis_data import campaign
 from support.noisy_data import dense_noise, random_data, used_rows
 
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.diagnosis.baseline import Blocks, fit_baseline
+from elastocal.diagnosis import baseline
+from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, fit_baseline, project
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise, log_prior, project
 from elastocal.measurements import visits
 from elastocal.model.manipulator import Model
 
@@ -30,7 +30,7 @@ def test_the_marginal_likelihood_is_that_of_the_dense_gaussian(seed: int) -> Non
     expected = stats.multivariate_normal(cov=1e10 * S).logpdf(1e5 * data.r.ravel()[rows])
     expected += len(rows) * np.log(1e5)
     assert project(data, NOISE).marginal == pytest.approx(expected, rel=1e-9)
-    prior = log_prior(data.stated, NOISE)
+    prior = baseline.log_prior(data.stated, NOISE)
     assert data.model.objective(NOISE.logs())[0] == pytest.approx(-2 * expected + prior, rel=1e-9)
 
 
@@ -62,7 +62,7 @@ def test_the_noise_that_made_the_readings_is_found() -> None:
     than whether it does so at every visit."""
     true_noise = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), np.full(2, 0.6))
     data = drawn(true_noise, 400, 3)
-    found = fit_noise(data)
+    found = baseline.fit_noise(data)
     assert found.factor == pytest.approx(true_noise.factor, rel=0.05)
     np.testing.assert_allclose(found.joint, true_noise.joint, rtol=0.2)
     assert found.shared_by_all == pytest.approx(true_noise.shared_by_all, abs=0.35)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED
 
-from elastocal.diagnosis.diagnosis import Gap, publish
+from elastocal.diagnosis.diagnosis import Gap
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.manipulator import Model
 
@@ -25,7 +25,7 @@ def test_what_is_not_known_is_null():
         location=None,
         noise=replace(EXPLAINED.noise, pure_error=None),
     )
-    content = json.loads(json.dumps(publish(unknown, model, "data.csv"), allow_nan=False))
+    content = json.loads(json.dumps(replace(unknown, model=model).to_json(), allow_nan=False))
     assert content["gap"]["nominal_um"] is None and content["gap"]["calibrated_um"] is None
     assert content["budget"][0] == {"step": "nominal", "heldout_rms_um": None, "ci95": [None] * 2}
     assert content["location"] is None

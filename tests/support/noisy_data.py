@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import Blocks
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
+from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData
 
 Array = np.ndarray
 

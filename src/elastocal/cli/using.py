@@ -123,10 +123,9 @@ def diagnose(
         poses: Most extra poses of --plan; default: 10.
         cell_out: Write the cell (TOML) with the effects found added.
     """
-    from elastocal.diagnosis.diagnosis import publish
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.renderers import print_report, write_page
-    from elastocal.saving import save_diagnosis
+    from elastocal.saving import save_published
 
     require(
         poses is None or plan is not None,
@@ -142,16 +141,12 @@ def diagnose(
         assert model is not None  # `diagnose` states it
         told = [f"wrote {path}" for path in (output, report) if path is not None]
         run.write(
-            (output, partial(save_diagnosis, found)),
+            (output, partial(save_published, found)),
             (report, lambda path: write_page(found, path, [cell, data], repeated(), asked["seed"])),
             (plan, lambda path: told.append(_write_extra_poses(path, found, model.chain.kinds))),
             (cell_out, lambda path: told.extend(_write_extended(path, found, data, run.plugins))),
         )
-    if run.answer(
-        lambda: publish(found, model, found.data),
-        lambda screen: print_report(screen, found),
-        files=False,
-    ):
+    if run.answer(found.to_json, lambda screen: print_report(screen, found), files=False):
         for line in told:
             say(line)
 

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
+from elastocal.diagnosis.baseline import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.component_search import exchanged, imitators, size_of_fellows
 from elastocal.diagnosis.components import Component, FittedSum, drawn, presence_cost
 from elastocal.diagnosis.diagnosis import (
@@ -30,8 +31,7 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import spans_of
-from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, project
-from elastocal.diagnosis.stated_floor import (
+from elastocal.diagnosis.noise_floor import (
     NEW_POSES,
     SupportedFloor,
     each_left_out,
@@ -49,7 +49,7 @@ DRAWS = 400
 DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
 PROBABLE = 0.5
-NAMED = 0.9  # probability from which a named effect needs no rivals beside it
+NAMED = 0.9  # probability from which an effect is named without rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 PAYS = 0.01  # of the error of left-out configurations, by which a name has to lower it
 HARM = 2.0  # standard errors by which they are predicted worse with what is taken out of the sum
@@ -126,11 +126,6 @@ class SumAnswer:
         """Posterior draws (p + Σ k, draws) of the fitted columns' coefficients and of these."""
         return drawn(self.found, self.hidden, self._weighted, self._wide.precision, DRAWS, self.rng)
 
-    @property
-    def draws(self) -> Array:
-        """Those (Σ k, draws) of the components."""
-        return self._drawn[self._own :]
-
     @cached_property
     def moved(self) -> Array:
         """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
@@ -139,28 +134,18 @@ class SumAnswer:
         They follow in the directions that the readings determine, not in what rounding leaves of
         parallel axes; what is only uncertain of the load's point is no fitted parameter.
         """
-        moved, known = self._wide.X[self._rows][:, self._own :], self._fitted_directions
-        return np.asarray(moved - known @ (known.T @ moved))
-
-    @cached_property
-    def _fitted_directions(self) -> Array:
-        """Orthonormal (rows, q)."""
         before = self.before
-        fitted = np.isin(before.fitted, before.base.model.names)
-        B = before.data.X[self._rows][:, fitted]
-        U, size, _ = linalg.svd(
-            B / np.maximum(np.linalg.norm(B, axis=0), 1e-300), full_matrices=False
-        )
-        return np.asarray(U[:, size > DETERMINED * size.max(initial=0.0)])
+        B = before.data.X[self._rows][:, np.isin(before.fitted, before.base.model.names)]
+        B = B / np.maximum(np.linalg.norm(B, axis=0), 1e-300)
+        U, size, _ = linalg.svd(B, full_matrices=False)
+        known = U[:, size > DETERMINED * size.max(initial=0.0)]
+        moved = self._wide.X[self._rows][:, self._own :]
+        return np.asarray(moved - known @ (known.T @ moved))
 
     @cached_property
     def gram(self) -> Array:
         """G (Σ k, Σ k): w'Gw is the mean square in m² per reading that coefficients w leave."""
-        return np.asarray(self.moved.T @ self.moved / self._readings)
-
-    @property
-    def _readings(self) -> int:
-        return int(self._left_out[1].sum())
+        return np.asarray(self.moved.T @ self.moved / self._left_out[1].sum())
 
     @cached_property
     def _poses(self) -> tuple[IntArray, Array]:
@@ -186,7 +171,7 @@ class SumAnswer:
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
-        w = self.draws[index := self._index(members)]
+        w = self._drawn[self._own :][index := self._index(members)]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
     def _index(self, members: Sequence[int]) -> IntArray:
@@ -301,37 +286,32 @@ class SumAnswer:
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first."""
-        groups = self._by(lambda c: (c.family, c.where)).items()
-        rows = [self._share(family, where, own) for (family, where), own in groups]
+        rows = []
+        for (family, where), members in self._by(lambda c: (c.family, c.where)).items():
+            chosen = [self.found.components[k] for k in members]
+            every = [k for k, c in enumerate(self._every) if (c.family, c.where) == (family, where)]
+            rms, _, rms_ci95 = with_intervals(np.sqrt(self.squares(every)))
+            rows.append(ComponentShare(
+                family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
+                *with_intervals(self.shares(every))[:2], rms, rms_ci95,
+                self._matters(members), any(c.named for c in chosen),
+            ))  # fmt: skip
         return tuple(sorted(rows, key=lambda row: -row.share))
-
-    def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
-        chosen = [self.found.components[k] for k in members]
-        everything = [
-            k for k, c in enumerate(self._every) if (c.family, c.where) == (family, where)
-        ]
-        rms, _, rms_ci95 = with_intervals(np.sqrt(self.squares(everything)))
-        return ComponentShare(
-            family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
-            *with_intervals(self.shares(everything))[:2], rms, rms_ci95,
-            self._matters(members), any(c.named for c in chosen),
-        )  # fmt: skip
 
     @cached_property
     def groups(self) -> tuple[EffectGroup, ...]:
-        """One for each effect at all its places, lines and curves of joints as one."""
-        kinds = self._by(_kind)
-        counting = {name: [k for k in own if k not in self._slight] for name, own in kinds.items()}
-        groups = (self._group(name, own) for name, own in counting.items() if own)
+        """One for each effect at all its places, lines and curves of joints as one; what the same
+        does at others, where it hardly shows, is in the share."""
+        groups = []
+        for name, own in self._by(_kind).items():
+            if members := [k for k in own if k not in self._slight]:
+                chosen = [self.found.components[k] for k in members]
+                places = tuple(sorted({c.where for c in chosen}))
+                effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
+                share = with_intervals(self.shares(self._of_kind(name)))[:2]
+                fall = self._reduction(members)[:2]
+                groups.append(EffectGroup(name, places, effects, *share, *fall))
         return tuple(sorted(groups, key=lambda g: -g.share))
-
-    def _group(self, name: str, members: list[int]) -> EffectGroup:
-        """At its places; what the same does at others, where it hardly shows, is in the share."""
-        chosen = [self.found.components[k] for k in members]
-        places = tuple(sorted({c.where for c in chosen}))
-        effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        share = with_intervals(self.shares(self._of_kind(name)))[:2]
-        return EffectGroup(name, places, effects, *share, *self._reduction(members)[:2])
 
     def _of_kind(self, name: str) -> list[int]:
         return [k for k, c in enumerate(self._every) if _kind(c) == name]
@@ -349,7 +329,7 @@ class SumAnswer:
     @cached_property
     def _left(self) -> Array:
         """What the draws of all components leave of the poses that are kept (rows, draws)."""
-        return np.asarray(self.moved[self._poses[0]] @ self.draws)
+        return np.asarray(self.moved[self._poses[0]] @ self._drawn[self._own :])
 
     @cached_property
     def _uncertain(self) -> Array:
@@ -372,7 +352,7 @@ class SumAnswer:
         after = self._of_new_poses(whole - estimate[:, None])
         part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
         # Draws about the mean already hold the error at the poses measured; at others it is more.
-        after = after + min(part, 1.0) * float(self._uncertain.sum()) / self._readings
+        after = after + min(part, 1.0) * float(self._uncertain.sum() / self._left_out[1].sum())
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
     # Names.

@@ -10,13 +10,27 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit
 
-from elastocal.diagnosis.baseline import from_centre, prior_deviations
+from elastocal.diagnosis.baseline import (
+    NoiseValues,
+    NoisyData,
+    from_centre,
+    posterior,
+    prior_deviations,
+    project,
+)
 from elastocal.diagnosis.component_families import (
+    FEW_POSES,
+    OrderPosterior,
     catalogue_components,
+    component_of,
     drifts,
-    family_of,
+    families_of,
     joint_curves,
+    line_families,
+    ripples,
+    sharpened,
     shorter,
+    with_scatter,
     without_a_name,
 )
 from elastocal.diagnosis.components import (
@@ -31,20 +45,10 @@ from elastocal.diagnosis.components import (
     presence_cost,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import ModelSet, about, extended, settings_of, spans_of
+from elastocal.diagnosis.effect_search import ModelSet, about, extended, spans_of
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
-from elastocal.diagnosis.lines import (
-    FEW_POSES,
-    OrderPosterior,
-    families_of,
-    line_families,
-    ripples,
-    sharpened,
-    with_scatter,
-)
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
-from elastocal.diagnosis.stated_floor import scatter_beyond
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.noise_floor import scatter_beyond
 from elastocal.engine.mixed import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -83,7 +87,7 @@ def search_components(
                  for c in catalogue_components(full))  # fmt: skip
         moving = () if ResidualField.name in without else drifts(full)
         searched = (i for i in chosen.items if i.known and len(i.settings))
-        every = [*moving, *known, *(_component(full, item) for item in searched)]
+        every = [*moving, *known, *(component_of(full, item) for item in searched)]
         curves = [] if JointCurve.name in without else list(joint_curves(full))
         # A joint's sag by itself where link weights are not one component, which hold it.
         shared = any(isinstance(c.effect, LinkWeights) for c in every)
@@ -199,12 +203,12 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
         some += [stand_out[:n] for n in range(2, min(TRIED, len(stand_out)) + 1)]
         for chosen in [stand_out] if many else some:
             noise = found.noise
-            for family in chosen:
-                noise = with_scatter(noise, index(family.component.where), family.scatter)
+            for _, component, scatter, _ in chosen:
+                noise = with_scatter(noise, index(component.where), scatter)
             fitted = exchanged(
                 replace(found, noise=noise),
-                [c for family in chosen for c in family.instead_of],
-                [family.component for family in chosen],
+                [c for *_, instead_of in chosen for c in instead_of],
+                [component for _, component, *_ in chosen],
             )  # fmt: skip
             if fitted.score > found.score + GAINED:
                 wider = fitted
@@ -259,7 +263,7 @@ SWEEPS = 2
 def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with a family of lines at each joint where the others let expect one, and a line at
     one order is more probable than all others and none together; the most probable first."""
-    while lined := {family.where for family in families_of(found)}:
+    while lined := families_of(found):
         others = (h for h in ripples(dataset) if h.where not in lined)
         each = [OrderPosterior(dataset, found, h) for h in others]
         chances = [p.probability(p.likeliest_line[0]) for p in each]
@@ -283,8 +287,8 @@ def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     for _ in range(SWEEPS):
         before = found
         for h in ripples(dataset):
-            lines_of_joints = (c for c in found.components if isinstance(c.effect, GearSpectrum))
-            own = [c for c in lines_of_joints if c.where == h.where]
+            here = (c for c in found.components if c.where == h.where)
+            own = [c for c in here if isinstance(c.effect, GearSpectrum)]
             if len(own) != 1:
                 continue
             now, lines = dict(own[0].settings)["order_1"], len(own[0].settings) // 2
@@ -375,10 +379,8 @@ def exchanged(
 ) -> FittedSum:  # fmt: skip
     """The sum with `more` components in the place of those `gone`, fitted from where it is."""
     kept = [k for k, c in enumerate(found.components) if c not in gone]
-    start, components = (
-        found.sizes.chosen(kept, more),
-        [*(found.components[k] for k in kept), *more],
-    )
+    components = [*(found.components[k] for k in kept), *more]
+    start = found.sizes.chosen(kept, more)
     return fit_sum(found.sums.data, components, found.noise, start, refit_noise, found.sums)
 
 
@@ -590,23 +592,10 @@ def _with_together(dataset: DiagnosisData, without: Container[str]) -> Diagnosis
     return replace(dataset, hypotheses=(*kept, *more))
 
 
-def _component(dataset: DiagnosisData, item: Item) -> Component:
-    h, columns = item.what, dataset.packed(item.what, item.settings)
-    if not isinstance(h, Hypothesis):
-        return Component("pose", ResidualField(), h.where, columns, follows=h.covariate)
-    family, settings = family_of(h.effect, dataset.base.model.cell), settings_of(item)
-    search = 0.0
-    if settings:
-        grid = dataset.grids[h.key]
-        search = -float(grid.log_prior[grid.nearest(item.settings)])
-    return Component(family, h.effect, h.where, columns, settings=tuple(settings.items()),
-                     hypothesis=h, search=search)  # fmt: skip
-
-
 def sum_of(dataset: DiagnosisData, chosen: ModelSet) -> FittedSum:
     """The set as a sum under its noise: its items at the sizes that it has, or at typical ones,
     where these are larger: a tie to less would make what is true smaller than what was found."""
-    sums = posed(dataset.data, [_component(dataset, i) for i in chosen.items], chosen.noise)
+    sums = posed(dataset.data, [component_of(dataset, i) for i in chosen.items], chosen.noise)
     sizes = np.log(np.maximum(chosen.scales, 1.0))
     return at_maximum(sums, Sizes(0.0, sizes, np.zeros(len(chosen.items))))
 

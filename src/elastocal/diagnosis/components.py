@@ -28,10 +28,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from scipy import linalg, special
 
-from elastocal.diagnosis.effect_search import spans_of, within_bounds
-from elastocal.diagnosis.evidence import at_scales
-from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.noise_floor import (
+from elastocal.diagnosis.baseline import (
     NoiseValues,
     NoisyData,
     Weighted,
@@ -40,6 +37,9 @@ from elastocal.diagnosis.noise_floor import (
     log_prior,
     posterior,
 )
+from elastocal.diagnosis.effect_search import spans_of, within_bounds
+from elastocal.diagnosis.evidence import at_scales
+from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.engine.mixed import Products, Standardised, beside, climb
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import Waves
@@ -352,18 +352,15 @@ class SumOfComponents:
             upper[1:] = np.concatenate([most, lengths[:, 1]])
         return Sizes.of(climb(self.objective, theta, lower, upper, enough, STEPS)[0])
 
-    def earned(self, at: Sizes) -> tuple[Array, Array]:
+    def earned(self, at: Standardised) -> tuple[Array, Array]:
         """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
-        (K,) is due to coefficients that cannot be negative.
-
-        Of coefficients that cannot be negative, by the posterior's share of that half.
+        (K,) is due to coefficients that cannot be negative, by the posterior's share of that half.
         """
-        at_sizes, _ = self.factored(at)
-        inverse, within = at_sizes.covariance, np.zeros(len(self.components))
+        inverse, within = at.covariance, np.zeros(len(self.components))
         for k, span in enumerate(self.spans):
             i = np.arange(span.start, span.stop)[self.components[k].bounded]
-            within[k] = within_bounds(at_sizes.b[i] / np.sqrt(inverse[i, i]))
-        return at_sizes.left_out(list(self.spans)) + within, within
+            within[k] = within_bounds(at.b[i] / np.sqrt(inverse[i, i]))
+        return at.left_out(list(self.spans)) + within, within
 
 
 def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
@@ -476,36 +473,30 @@ def fit_sum(
                 enough = SETTLED
         problem, at = problem.scaled(at.factor), replace(at, factor=0.0)
         if refit_noise:
-            problem = _under_own_noise(problem, at)
+            problem = posed(data, problem.components, _noise_beside(problem, at))
+            # Some of the configurations do not tell its size as all do: a sum under it would be
+            # worth less than the next one, whose factor is free.
+            if len(data.r) >= 2 * SOME:
+                problem = problem.scaled(problem.climbed(at, factor_alone=True).factor)
         if not problem.components:
             break
     return at_maximum(problem, at)
 
 
-def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
-    found = posed(problem.data, problem.components, _noise_beside(problem, at))
-    if len(problem.data.r) < 2 * SOME:
-        return found
-    # Some of the configurations do not tell its size as all do: a sum under it would be worth less
-    # than the next one, whose factor is free.
-    return found.scaled(found.climbed(replace(at, factor=0.0), factor_alone=True).factor)
-
-
 def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
-    variances = problem.variances(at)
-    value = problem.factored(at)[1]
+    found, value = problem.factored(at)
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)
-    (earned, within), own = problem.earned(at), variances[len(problem.data.precision) :]
-    score += float(within.sum())
-    return FittedSum(at, problem.noise, earned, score, problem, own)
+    earned, within = problem.earned(found)
+    own = problem.variances(at)[len(problem.data.precision) :]
+    return FittedSum(at, problem.noise, earned, score + float(within.sum()), problem, own)
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     """Components that stay: not the worst of those that do not earn their cost, nor those that are
     next to nothing; only these go where not `strict`, since under a noise that does not suit them
     the others may earn too little."""
-    earned = problem.earned(at)[0] - problem.pool.penalties(at.size)
+    earned = problem.earned(problem.factored(at)[0])[0] - problem.pool.penalties(at.size)
     spare = earned - (problem.pool.costs_of(earned) if strict else MOST_AT_ONCE)
     stays = np.array([c.given for c in problem.components], dtype=bool)
     poor = (spare < 0) & ~stays

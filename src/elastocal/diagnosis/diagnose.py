@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
-from elastocal.diagnosis.baseline import fit_baseline, thinned
+from elastocal.diagnosis.baseline import NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
@@ -35,9 +35,7 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     with_recorded_drivers,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues
-from elastocal.diagnosis.reading_faults import screen_outliers
-from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, first_steps, noise_floor
+from elastocal.diagnosis.noise_floor import FALSE_SMOOTH, first_steps, screen_outliers
 from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,
@@ -50,7 +48,7 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.scrutiny import BudgetStep
-from elastocal.identification.start import Fallen, check_table, fallen, solved_body, without_copies
+from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
@@ -86,9 +84,18 @@ def write_extended_cell(
     data = {"name": cell.name} | read_toml(source, "cell file")
     # The real folders: ".." of a link to a folder is not where the link stands.
     data = _redirected(data, source.parent, os.path.realpath(target.parent))
-    if found:
-        _switch_on(data.setdefault("model", {}), found)
-        data["model"] |= dict(model_keys or {})
+    model = data.setdefault("model", {}) if found else {}
+    for f in found:
+        effects = model.setdefault("effects", [])
+        if (entry := f"{f.effect}:{f.where}") not in effects:
+            effects.append(entry)
+        values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
+        if hints := effect_of(f.effect).hints(f.where, values):
+            model.setdefault("nominal", {}).update(hints)
+        for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
+            if found_there:
+                _join(model, {"nominal": {key: {f.where: found_there}}})
+    model |= dict(model_keys or {})
     if keys:
         data.get("design", {}).pop("choose", None)
         _join(data, keys)
@@ -110,19 +117,6 @@ def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:
             _join(data.setdefault(name, {}), value)
         else:
             data[name] = value
-
-
-def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
-    effects = model.setdefault("effects", [])
-    for f in found:
-        if (entry := f"{f.effect}:{f.where}") not in effects:
-            effects.append(entry)
-        values = {p.name.removeprefix(f"{f.where}."): p.value for p in f.parameters}
-        if hints := effect_of(f.effect).hints(f.where, values):
-            model.setdefault("nominal", {}).update(hints)
-        for key, found_there in (("settings", f.settings), ("sizes", f.sizes)):
-            if found_there:
-                _join(model, {"nominal": {key: {f.where: found_there}}})
 
 
 def _redirected(value: Any, old: Path, new: str, key: str = "") -> Any:
@@ -192,19 +186,15 @@ def diagnose(
         return replace(found, warnings=(str(lies), *found.warnings))
     progress(f"once more with {lies.axis} up")
     upright = _diagnosed(model, lies.turned(table), options, progress)
-    return replace(found, warnings=(_if_upright(lies, found, upright), *found.warnings))
-
-
-def _if_upright(lies: Fallen, found: Diagnosis, upright: Diagnosis) -> str:
-    """What is different where the readings' frame is turned so that the arm stands."""
     before, after = (1e6 * d.budget[-2].heldout_rms for d in (found, upright))
-    if after > (1 - PAYS) * before:
-        return f"{lies}. Here it makes no difference"
     names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "none"
-    return (
+    told = (
         f"{lies}. With {lies.axis} up the verdict is {upright.verdict} (effects: {names}), and the "
         f"held-out error falls to {after:.3g} µm instead of {before:.3g} µm"
     )
+    if after > (1 - PAYS) * before:
+        told = f"{lies}. Here it makes no difference"
+    return replace(found, warnings=(told, *found.warnings))
 
 
 def _diagnosed(
@@ -244,7 +234,11 @@ def _diagnosed(
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
-    p, nothing = chance_of_noise(found, nats)
+    p, nothing = found.p_value, found.slots[0].probabilities()[1]
+    if nats > 0:
+        # Of a sum that is so many nats more probable than nothing, noise alone yields as much with
+        # a chance of exp(−nats) at most (Markov's inequality).
+        p, nothing = max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
     if answers["gap"].open:
         # What is left is no noise, whatever it is.
         nothing = min(nothing, FALSE_SMOOTH)
@@ -267,18 +261,6 @@ def _diagnosed(
         data=source,
         calibrated=base,
     )
-
-
-def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
-    """p of what was found, and the probability that it is nothing.
-
-    By the flips of the forward search; of a sum that is so many `nats` more probable than nothing,
-    noise alone yields as much with a chance of exp(−nats) at most (Markov's inequality).
-    """
-    p, nothing = found.p_value, found.slots[0].probabilities()[1]
-    if nats <= 0:
-        return p, nothing
-    return max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
 
 
 def _sum_of_all(
@@ -342,7 +324,7 @@ def _pieces(
         "effects": beside_unknown(answer.effects) if gap.open else answer.effects,
         "indistinguishable": answer.indistinguishable,
         "location": location,
-        "noise": noise_floor(answer.dataset, answer.found.data, answer.found.noise),
+        "noise": answer.supported.told,
         "probability_unknown": max(answer.unnamed_probability, gap.open * (1 - FALSE_SMOOTH)),
         "curves": answer.curves(),
         "components": answer.components,

@@ -401,12 +401,9 @@ class Diagnosis(Result):
     n_readings: int = 0
     n_configurations: int = 0
     extra: ExtraPlan | None = field(default=None)
-    # Keys of [model] that the effects found rest on, beyond their own names.
     model_keys: dict[str, str] = field(default_factory=dict)
-    # What was diagnosed: the model as it was given, and the name of its measurements.
     model: Model | None = field(default=None, repr=False, compare=False)
     data: str = field(default="", compare=False)
-    # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
 
     @property
@@ -442,6 +439,40 @@ class Diagnosis(Result):
     @property
     def findings(self) -> tuple[Finding, ...]:
         return tuple(_findings(self))
+
+    def to_json(self) -> dict[str, Any]:
+        """The diagnosis as a JSON-ready dictionary (DESIGN: diagnose → JSON).
+
+        Lengths are in µm where the key says _um, everything else in the SI unit that stands beside
+        it.  A number that is not known or not finite is null, as JSON has none.
+        """
+        model = self.model
+        assert model is not None  # `diagnose` states it
+        content = {
+            "schema": SCHEMA,
+            "robot": model.chain.name,
+            "cell": model.cell.name,
+            "data": self.data,
+            **{key: getattr(self, key, None) for key in PUBLISHED},
+            "gap": _in_um(
+                self.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"
+            ),
+            "budget": [
+                {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
+                for s in self.budget
+            ],
+            "effects": [_found(effect) for effect in self.effects],
+            "components": [
+                _in_um(c, "rms", "rms_ci95") | {"effect": c.effects[0]} for c in self.components
+            ],
+            "fields": [_found(effect) for effect in self.fields],
+            "slight": [_found(effect) for effect in self.slight],
+            "location": self.location and _with_evidence(self.location),
+            "noise": _noise(self.noise, model),
+            "extra_plan": self.extra and {k: v for k, v in vars(self.extra).items() if k != "plan"},
+            "backend": model.backend_report(),
+        }
+        return {key: plain(value) for key, value in content.items()}
 
     def __repr__(self) -> str:
         found = ", ".join(f"{f.effect} at {f.where}" for f in self.effects)
@@ -518,7 +549,6 @@ UNSEEN = (
 
 
 def _remedy(verdict: Verdict) -> str:
-    """What to do after a verdict."""
     return {
         "explained": f"Identify with the cell that {option('cell_out')} writes, and check the "
         f"error on poses kept back (identify with {option('test')}).",
@@ -540,36 +570,6 @@ PUBLISHED = (
 NORMAL_95 = 1.959964
 
 
-def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
-    """The diagnosis as a JSON-ready dictionary (DESIGN: diagnose → JSON).
-
-    `model` is the arm that was diagnosed, `data` names its measurements.  Lengths are in µm where
-    the key says _um, everything else in the SI unit that stands beside it.  A number that is not
-    known or not finite is null, as JSON has none.
-    """
-    d = diagnosis
-    content = {
-        "gap": _in_um(d.gap, "nominal", "calibrated", "explained", "noise_floor", "unexplained"),
-        "budget": [
-            {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
-            for s in d.budget
-        ],
-        "effects": [_found(effect) for effect in d.effects],
-        "components": [
-            _in_um(c, "rms", "rms_ci95") | {"effect": c.effects[0]} for c in d.components
-        ],
-        "fields": [_found(effect) for effect in d.fields],
-        "slight": [_found(effect) for effect in d.slight],
-        "location": d.location and _location(d.location),
-        "noise": _noise(d.noise, model),
-        "extra_plan": d.extra and _without(vars(d.extra), "plan"),
-        "backend": model.backend_report(),
-    }
-    head = {"schema": SCHEMA, "robot": model.chain.name, "cell": model.cell.name, "data": data}
-    as_they_are = {key: getattr(d, key, None) for key in PUBLISHED}
-    return {key: plain(value) for key, value in (head | as_they_are | content).items()}
-
-
 def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:
     near, joints = noise.near_repeats, zip(noise.repeatability, model.chain.kinds, strict=True)
     return _in_um(noise, "reading_sigma", "drift", "pure_error") | {
@@ -579,9 +579,12 @@ def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:
             for i, (value, kind) in enumerate(joints, 1)
         ],
         "near_repeat_um": near and _um(near.scatter),
-        "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),
+        "near_repeats": near and {
+            "pairs": near.pairs, "independent": near.independent,
+            "soon_um": _um(near.soon), "later_um": _um(near.later),
+        },
         "faulty": [_in_um(reading, "error") for reading in noise.faulty],
-    }
+    }  # fmt: skip
 
 
 def _um(length: Any) -> Any:
@@ -599,10 +602,6 @@ def _in_um(part: Any, *lengths: str) -> dict[str, Any]:
     }
 
 
-def _without(content: dict[str, Any], key: str) -> dict[str, Any]:
-    return {name: value for name, value in content.items() if name != key}
-
-
 def _found(f: FoundEffect) -> dict[str, Any]:
     def told(p: FittedParameter) -> dict[str, Any]:
         if math.isinf(p.std):
@@ -613,7 +612,7 @@ def _found(f: FoundEffect) -> dict[str, Any]:
     return vars(f) | {"parameters": [told(p) for p in f.parameters]}
 
 
-def _location(location: Location) -> dict[str, Any]:
+def _with_evidence(location: Location) -> dict[str, Any]:
     out = dict(vars(location))
     parts = ("stages", "places", "drivers", "shares")
     return out | {"evidence": {key: out.pop(key) for key in parts}}

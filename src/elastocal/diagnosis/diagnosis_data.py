@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import Baseline, Blocks, from_centre, prior_deviations
+from elastocal.diagnosis.baseline import Baseline, Blocks, NoisyData, from_centre, prior_deviations
 from elastocal.diagnosis.hypotheses import (
     KEPT,
     NO_SETTINGS,
@@ -26,7 +26,6 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     recorded,
 )
-from elastocal.diagnosis.noise_floor import NoisyData
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
@@ -74,12 +73,6 @@ class DiagnosisData:
         return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
 
     @property
-    def common(self) -> float:
-        """The deviation in m, per axis, that the cell states as common to a configuration."""
-        shown = self.base.observed.kind in ("position", "pose")
-        return self.base.model.cell.noise.configuration if shown else 0.0
-
-    @property
     def table(self) -> Measurements:
         return self.base.observed.table
 
@@ -105,7 +98,7 @@ class DiagnosisData:
 
     def pack(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → packed (C, m, k)."""
-        return self.blocks.pack(self.columns.observed(rows))
+        return self.blocks.pack(self.base.observed.apply(rows))
 
     def entry(self, key: EntryKey) -> Array:
         """Packed columns (C, m, d) of an entry; not to be written to."""
@@ -124,7 +117,7 @@ class DiagnosisData:
 
     def sizes_in(self, h: Hypothesis, rows: Array) -> Array:
         """Its typical sizes by columns (n_rows, size, k), what is only planned not counted."""
-        return usual_sizes(h.parameters, self.columns.observed(rows)[: self.base.n_measured])
+        return usual_sizes(h.parameters, self.base.observed.apply(rows)[: self.base.n_measured])
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
@@ -247,7 +240,7 @@ def diagnosis_data_of(
     load_point = None
     for h in loads:
         keys = [k for k, p in enumerate(h.parameters) if p.key.startswith("load_point")]
-        shift = columns.observed(columns.of(h)[:, :, keys])
+        shift = observed.apply(columns.of(h)[:, :, keys])
         load_point = blocks.pack(shift)
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
         names += [h.name] * len(keys)

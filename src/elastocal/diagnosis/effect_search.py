@@ -12,21 +12,23 @@ import numpy as np
 from scipy.special import expit, log_ndtr, logsumexp, ndtr
 
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis.baseline import Baseline, fit_baseline, made_once
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
-from elastocal.diagnosis.noise_floor import (
+from elastocal.diagnosis.baseline import (
     SHARED,
+    Baseline,
     NoiseValues,
     NoisyData,
     Projection,
     Weighted,
+    fit_baseline,
     fit_noise,
     log_prior,
+    made_once,
     project,
 )
-from elastocal.diagnosis.stated_floor import left_out_square
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
+from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
+from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.evaluate import ahead
@@ -270,7 +272,7 @@ def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]
         what = item.what
         if isinstance(what, Hypothesis):
             values = chosen.at.beta[span] * dataset.sizes[what.key]
-            starts = what.effect.starts(what.where, model.chain, model.cell)
+            starts = what.starts(model)
             for p, v in zip(what.parameters, values, strict=True):
                 name = f"{what.where}.{p.key}"
                 start[name] = float(about[name]) if starts else float(v) + p.nominal
@@ -437,13 +439,12 @@ def about(
     back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
     for what in added:
         # What an effect tries from several starts has no size about any of them.
-        starts = what.effect.starts(what.where, model.chain, model.cell)
-        open_keys = {key for start in starts for key in start}
+        open_keys = {key for start in what.starts(model) for key in start}
         moved_by = [
             0.0 if p.key in open_keys else x[f"{what.where}.{p.key}"] - p.nominal
             for p in what.parameters
         ]
-        back[:, :, 0] += about_fit.columns.observed(about_fit.columns.of(what)) @ np.array(moved_by)
+        back[:, :, 0] += base.observed.apply(about_fit.columns.of(what)) @ np.array(moved_by)
     r = about_fit.data.r + about_fit.blocks.pack(back)[:, :, 0]
     shares = dataset.columns.shares | about_fit.columns.shares
     columns = replace(about_fit.columns, shares=shares)
@@ -623,10 +624,8 @@ class ForwardSelection:
         offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
         slot, best = Slot(scanned.items, scanned.scores + offset), None
         close, there = self._close(slot, behind), {id(item.what) for item in current.items}
-        scores, added = (
-            slot.scores.copy(),
-            [k for k in close if id(slot.items[k].what) not in there],
-        )
+        scores = slot.scores.copy()
+        added = [k for k in close if id(slot.items[k].what) not in there]
         scores[[k for k in close if id(slot.items[k].what) in there]] = -np.inf
         fits = self._with_each(current, [slot.items[k] for k in added])
         for k, fitted in zip(added, fits, strict=True):

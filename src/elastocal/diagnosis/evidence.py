@@ -11,11 +11,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import logsumexp
 
-from elastocal.diagnosis.baseline import Blocks
+from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
@@ -60,11 +59,8 @@ class Spectrum:
 
     def evidence(self, scales: Array = SCALES) -> Array:
         """Log evidence (V,) of the readings over the model without the group."""
-        return self.evidences(scales)[:, 0]
-
-    def evidences(self, scales: Array) -> Array:
-        """The same of every residual (V, T)."""
-        return log_sum(at_scales(self.lam, self.beta, scales), axis=1) - np.log(len(scales))
+        each = at_scales(self.lam, self.beta[..., :1], scales)[..., 0]
+        return log_sum(each, axis=1) - np.log(len(scales))
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
@@ -370,12 +366,14 @@ class Scan:
         whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
         for what, w in zip(whats, prior.tolist(), strict=True):
             grid, spectra = dataset.grids.get(what.key, NO_SETTINGS), grams.of(what)
-            each = spectra.evidences(what.scales)
-            weighed = each + grid.log_prior[:, None]
-            evidence, k = log_sum(weighed, axis=0), int(np.argmax(weighed[:, 0]))
+            each = at_scales(spectra.lam, spectra.beta, what.scales)
+            each += (grid.log_prior - np.log(len(what.scales)))[:, None, None]
+            evidence, own = log_sum(each.reshape(-1, each.shape[2]), axis=0), log_sum(each[..., 0])
+            k = int(np.argmax(own))
             rows.append(evidence)
             # What the search over settings costs stays with the item.
-            items.append(Item(what, grid.values[k], w + float(evidence[0] - each[k, 0])))
+            spent = float(evidence[0] - own[k] + grid.log_prior[k])
+            items.append(Item(what, grid.values[k], w + spent))
             distance.append(float(spectra.distance[k]))
             if isinstance(what, Generic):
                 largest = self.covariates.get(what.covariate, evidence)

@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
+from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import with_keys, with_recorded_drivers
-from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.rivals import (
     APART_AT_LAST,
     Discrimination,

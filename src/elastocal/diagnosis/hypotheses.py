@@ -119,6 +119,10 @@ class Hypothesis:
         """Scales of the size prior: wider where no typical size is known."""
         return UNSIZED_SCALES if any(p.typical is None for p in self.parameters) else SCALES
 
+    def starts(self, model: Model) -> tuple[dict[str, float], ...]:
+        """Values from which its geometry is sought; none where that is not needed."""
+        return self.effect.starts(self.where, model.chain, model.cell)
+
     def entry_key(self, model: Model) -> EntryKey:
         """The entry of the chain that a driven hypothesis acts on."""
         assert isinstance(self.effect, DrivenEffect)
@@ -373,6 +377,7 @@ class StartSearch:
     def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
         self.full, self.h, self.base, self.x = full, h, base, x
         self.own = np.flatnonzero([(p.effect, p.where) == h.key for p in full.parameters])
+        self.starts: tuple[dict[str, float], ...] = h.starts(base.model) or ({},)
         fitted, size = [full.names.index(name) for name in base.model.names], base.observed.size
         # What is only planned has no residual yet that a spring could answer for.
         last = base.n_measured - 1
@@ -389,11 +394,6 @@ class StartSearch:
         X, r = ((self.whitening @ each).reshape(rows, -1) for each in (X, r))
         self.r = np.append(r[:, 0], np.zeros(X.shape[1]))
         self.X = np.vstack([X, np.eye(X.shape[1])])
-
-    @cached_property
-    def starts(self) -> tuple[dict[str, float], ...]:
-        model = self.base.model
-        return self.h.effect.starts(self.h.where, model.chain, model.cell) or ({},)
 
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
@@ -422,7 +422,7 @@ class StartSearch:
     def screened(self) -> tuple[list[Mapping[str, float]], float]:
         """The best starts, the first of them refined, and the log of the mean likelihood over all
         relative to the best one's."""
-        starts = list(self.starts)
+        starts = self.starts
         blocks = [slice(k, k + AT_ONCE) for k in range(0, len(starts), AT_ONCE)]
         each = [self._left(starts[block]) for block in blocks]
         left = np.concatenate([one for one, _ in each])
@@ -555,10 +555,6 @@ class Columns:
     regressors: dict[tuple[str, str], RegressorDirection] = field(init=False, default_factory=dict)
     directions: dict[tuple[str, str, bytes], Array] = field(init=False, default_factory=dict)
 
-    def observed(self, rows: Array) -> Array:
-        """Per table row (n_rows, size, k) → per observation (N, size, k)."""
-        return self.base.observed.apply(rows)
-
     def of(self, hypothesis: Hypothesis) -> Array:
         """Columns (n_rows, size, k) of a hypothesis that is not driven."""
         return self.rows[:, :, self.places[hypothesis.key]]
@@ -627,13 +623,6 @@ def compute_columns(
             shares[h.key] = search.screened[1]
             x[own], B[:, :, own] = next(search.tangents())
     return Columns(base, B, places, full, x, shares)
-
-
-def cell_with(cell: Cell, where: str, settings: Mapping[str, float]) -> Cell:
-    """The cell with further constants of an effect: all that its direction asks of a model, which
-    need not be assembled for it."""
-    nominal = cell.model.nominal.at(where, settings)
-    return replace(cell, model=replace(cell.model, nominal=nominal))
 
 
 class RegressorDirection:

@@ -1,339 +1,593 @@
-"""The noise of a diagnosis: tracker, repeatability of each joint, scatter of a configuration."""
+"""The noise floor by repeats, near-repeats and neighbours; errors of what is left out of the fit;
+faulty readings, each judged against all others before anything is blamed on the arm."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
-from scipy import linalg
+import scipy  # whose `ndimage` loads where it is used, as `stats` does
+from scipy import sparse, special
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from elastocal.diagnosis.baseline import Blocks
-from elastocal.engine.mixed import (
-    LOG_2PI,
-    ROUNDING,
-    LogPrior,
-    Mixed,
-    Pack,
-    Parts,
-    Products,
-    Standardised,
-    Whitened,
-    climb,
+from elastocal.diagnosis.baseline import (
+    JOINT_SPREAD,
+    REPEATABILITY,
+    REPEATABILITY_SPREAD,
+    STATED_SPREAD,
+    NoiseValues,
+    NoisyData,
+    Projection,
+    project,
 )
-from elastocal.model.evaluate import thread_count
+from elastocal.diagnosis.diagnosis import (
+    FaultyReading,
+    Interval,
+    Location,
+    NearRepeats,
+    NoiseFloor,
+    StructureTest,
+)
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.identification.outliers import deleted
+from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
+from elastocal.identification.weighted_problem import same_size
+from elastocal.measurements import numbered
+from elastocal.model.effects.placements import BaseFrame
+from elastocal.model.observations import pure_error
 from elastocal.units import Array, BoolArray, IntArray
 
-# The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
-#
-#     V = a² Σ_stated + Σ_j s_j² g_j g_jᵀ ∘ (same visit + c_j² · same configuration)
-#
-# with g_j = ∂(reading)/∂q_j.  a, s_j and c_j maximise the marginal likelihood of the residuals
-# (below) times priors that keep what the data do not show near its usual size.
 
-# Logarithms' prior standard deviations.  Stated tracker noise is rarely wrong by more than 1.6
-# times; a joint repeats to some 5 µrad on a heavy arm and to 50 on a light one; the joints of an
-# arm differ by a factor of two.  What a joint does at a configuration, whenever it comes there, is
-# mostly an error of its angle that is not modelled yet: that of one says nothing of another's.
-STATED_SPREAD, UNSTATED_SPREAD = 0.5, 3.0
-REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
-JOINT_SPREAD = 0.7
-SHARED, SHARED_SPREAD = 0.2, 1.5
-SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact, and one that is loose
-FARTHEST = 17.0  # logarithms from a start, from an exact joint to a loose one
-LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
+def _left_over(data: NoisyData, at: Projection) -> Array:
+    """r − Xβ̂ (N, size) of each observation."""
+    return data.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
 
 
-@dataclass(frozen=True)
-class NoiseValues:
-    """`factor` a of the stated noise, `joint` s (joints,) in rad or m, `shared` c (joints,)."""
+def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int]:
+    """Sum of squares (m²) per axis among repeats of pose, load and marker, and degrees of freedom.
 
-    factor: float
-    joint: Array
-    shared: Array
-
-    @classmethod
-    def usual(cls, joints: int) -> NoiseValues:
-        """What one expects before any reading: noise as stated, joints as good as usual."""
-        return cls(1.0, np.full(joints, REPEATABILITY), np.full(joints, SHARED))
-
-    def of_instrument(self) -> NoiseValues:
-        """The instrument's part alone: joints that repeat exactly."""
-        exact = np.full_like(self.joint, SMALLEST_NOISE)
-        return replace(self, joint=exact, shared=np.full_like(exact, SHARED))
-
-    @property
-    def shared_by_all(self) -> float:
-        """c of all joints together: rms of what a configuration has over that of a visit."""
-        return float(np.linalg.norm(self.shared * self.joint) / np.linalg.norm(self.joint))
-
-    @property
-    def theta(self) -> Array:
-        """The variances (1 + 2 joints,) of the data's `model`: the instrument's, of each joint at a
-        configuration, of each at a visit."""
-        return np.concatenate([[self.factor**2], (self.joint * self.shared) ** 2, self.joint**2])
-
-    @classmethod
-    def of(cls, theta: Array) -> NoiseValues:
-        deviation, J = np.sqrt(theta), len(theta) // 2
-        joint = deviation[1 + J :]
-        return cls(float(deviation[0]), joint, deviation[1 : 1 + J] / joint)
-
-    def logs(self) -> Array:
-        return np.log(self.theta)
-
-
-@dataclass(frozen=True)
-class NoisyData:
-    """Packed residual r (C, m), nuisance X (C, m, p) with prior precision Λ (p,), and what noise
-    is made of: stated covariance (C, m, m), joint columns G (C, m, joints).
-
-    `stated` says whether the covariance is stated or only a shape; `left_out` (C, m) rows do not
-    count (padding, faulty readings).
+    `come_back`: of those for which the arm was elsewhere in between, in the order of times or rows.
+    Readings one after the other, the arm standing still, show the tracker's noise alone.
     """
-
-    blocks: Blocks
-    r: Array
-    X: Array
-    precision: Array
-    covariance: Array
-    G: Array
-    left_out: BoolArray
-    stated: bool
-
-    def with_columns(self, extra: Array, precision: Array) -> NoisyData:
-        """The same with further columns (C, m, k) and their prior precisions (k,)."""
-        X = np.concatenate([self.X, extra], axis=2)
-        return replace(self, X=X, precision=np.concatenate([self.precision, precision]))
-
-    def without(self, faulty: BoolArray) -> NoisyData:
-        padded = np.concatenate([faulty, [True]])[self.blocks.member]
-        return replace(self, left_out=np.repeat(padded, self.blocks.size, axis=1))
-
-    def every(self, step: int) -> NoisyData:
-        per_row = ("r", "X", "covariance", "G", "left_out")
-        blocks = replace(self.blocks, member=self.blocks.member[::step])
-        return replace(self, blocks=blocks, **{k: getattr(self, k)[::step] for k in per_row})
-
-    @property
-    def faulty(self) -> BoolArray:
-        """Observations (N,) that are left out."""
-        return self.blocks.unpack(self.left_out[..., None].astype(float))[:, 0, 0] > 0
-
-    @cached_property
-    def noise(self) -> NoiseValues:
-        return fit_noise(self)
-
-    @property
-    def n_rows(self) -> int:
-        return int((~self.left_out).sum())
-
-    @property
-    def threads(self) -> int:
-        """How many work on it: products of large matrices let other threads run."""
-        return thread_count() if self.X.size > LARGE else 1
-
-    def masked(self, packed: Array) -> Array:
-        """Rows that do not count set to zero (C, m, …)."""
-        if not self.left_out.any():
-            return packed
-        keep = ~self.left_out
-        return packed * keep.reshape(keep.shape + (1,) * (packed.ndim - 2))
-
-    def V(self, noise: NoiseValues) -> Array:
-        """V (C, m, m); rows left out have unit variance of their own."""
-        return self.model.packs[0].V(noise.theta)
-
-    @cached_property
-    def model(self) -> Mixed:
-        """Of the variances `NoiseValues.theta`, with their prior."""
-        (C, _, J), visit = self.G.shape, self.blocks.in_visit
-        G = np.ascontiguousarray(self.G.transpose(0, 2, 1))[..., None]  # (C, joints, m, 1)
-
-        def numbers(first: int, k: int) -> IntArray:
-            return np.tile(np.arange(first, first + k), (C, 1))
-
-        absent = self.blocks.absent[:, None] * np.eye(self.r.shape[1])
-        stated = np.asarray(np.linalg.cholesky(self.covariance + absent), dtype=np.float64)
-        parts = (
-            Parts(numbers(0, 1), stated[:, None]),
-            Parts(numbers(1, J), G), Parts(numbers(1 + J, J), G * visit[:, None]),
-        )  # fmt: skip
-        pack = Pack(self.X, self.r, parts, self.left_out)
-        return Mixed((pack,), 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
+    good, observed = ~dataset.data.faulty, dataset.base.observed
+    values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
+    group = observed.place[good]
+    if come_back:
+        order = np.argsort(dataset.moment[good], kind="stable")
+        moved = np.diff(dataset.table.configuration[dataset.lead[good]][order], prepend=-1) != 0
+        stay = np.empty(len(order), dtype=np.int64)
+        stay[order] = np.cumsum(moved)
+        first = np.unique(np.column_stack([group, stay]), axis=0, return_index=True)[1]
+        group, values = group[first], values[first]
+    return pure_error(group, values)
 
 
-@cache
-def log_prior_of(stated: bool, joints: int) -> LogPrior:
-    """Prior of the logarithms of θ (1 + 2 joints,), from that of a, c and s.
+# Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
+#
+# Two readings i, j whose joints all differ by less than NEAR see the same arm.  A Gaussian process
+# of length ℓ and variance A² (squared exponential) has half the mean square difference
+#
+#     γ(d) = A² (1 − exp(−d²/2ℓ²)),
+#
+# 0.5 % of A² at d = NEAR and ℓ = 10 NEAR = 0.05 rad, half the length of the roughest error curve
+# of a joint that is common; the fitted model's own difference is subtracted.  What is rougher
+# only makes the scatter larger: near-repeats bound the noise from above.
 
-    The joints' own have a common mean that is itself uncertain.
+NEAR = 5e-3  # rad, or m
+SOON = 0.1  # share of the campaign within which two visits follow each other soon
+ENOUGH_PAIRS = 8  # that are stated by themselves
+
+
+def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> NearRepeats | None:
+    """Scatter in m per axis among near-repeats, beside the model of `data` at `at`; None without.
+
+    Half the mean square of e_i − e_j over pairs of nearest neighbours, e = r − Xβ̂.
     """
-    own = (
-        _precision(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
-        _precision(joints, SHARED_SPREAD, 0.0),
-        _precision(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
-    )
-    back = np.linalg.inv(doubled(joints))
-    return LogPrior(NoiseValues.usual(joints).logs(), back.T @ linalg.block_diag(*own) @ back)
+    pairs = near_pairs(dataset, ~data.faulty)
+    if not len(pairs):
+        return None
+    e = _left_over(data, at)[:, :3]
+    squares = ((e[pairs[:, 0]] - e[pairs[:, 1]]) ** 2).mean(axis=1) / 2
+    moment = dataset.moment
+    apart = np.abs(moment[pairs[:, 0]] - moment[pairs[:, 1]]) > SOON * np.ptp(moment)
+
+    def scatter(chosen: BoolArray) -> float | None:
+        if min(chosen.sum(), (~chosen).sum()) < ENOUGH_PAIRS:
+            return None
+        return float(np.sqrt(squares[chosen].mean()))
+
+    return NearRepeats(
+        float(np.sqrt(squares.mean())), len(pairs), _independent(pairs), scatter(~apart),
+        scatter(apart),
+    )  # fmt: skip
 
 
-def doubled(joints: int) -> Array:
-    """log θ = 2 (log a, log c + log s, log s) as a product with log a, log c and log s."""
-    out = 2 * np.eye(1 + 2 * joints)
-    out[1 : 1 + joints, 1 + joints :] = 2 * np.eye(joints)
+def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
+    """Pairs (k, 2) of `good` (N,) observations of one marker and load in different configurations,
+    each with its nearest neighbour in the joints, all within NEAR."""
+    table, lead = dataset.table, dataset.lead
+    # One reading of each configuration: the others are repeats.
+    same, some = np.column_stack([table.configuration[lead], dataset.kind]), np.flatnonzero(good)
+    some = some[np.unique(same[some], axis=0, return_index=True)[1]]
+    # Of another marker or load no reading is near.
+    place = np.column_stack([table.q[lead[some]], dataset.kind[some]])
+    pairs, distance = nearest(place, np.inf)
+    return _unordered(some[pairs[distance <= NEAR]])
+
+
+def nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
+    """Each of the points x (n, d) beside the nearest other one (n, 2), and how far that is (n,)."""
+    distance, near = cKDTree(x).query(x, k=2, p=norm)
+    own = np.arange(len(x))
+    # Of a point that stands there twice, either one may come first.
+    other = (near[:, 0] == own).astype(int)
+    return np.column_stack([own, near[own, other]]), distance[own, other]
+
+
+def _unordered(pairs: IntArray) -> IntArray:
+    return np.unique(np.sort(pairs, axis=1), axis=0)
+
+
+def _independent(pairs: IntArray) -> int:
+    """Number of differences between paired readings that do not follow from each other: of a
+    group of k that hang together k − 1."""
+    known, at = np.unique(pairs, return_inverse=True)
+    n, (i, j) = len(known), at.reshape(pairs.shape).T
+    return n - int(connected_components(sparse.csr_array((np.ones(len(i)), (i, j)), (n, n)))[0])
+
+
+# Scatter of a joint that goes with pose or time is no scatter.
+#
+# The best estimate of joint j's deviation in configuration c is in proportion to
+# z = gᵀPr / √(gᵀPg), standard normal under the noise model and independent from configuration to
+# configuration.  Neighbours in the order of an angle q_k, in the order of measuring, and nearest in
+# all joints then have no correlation: √n ρ̂ ~ N(0, 1).  Where they have, ρ̂ is the share of z that is
+# a function of what they are neighbours in (one less the nugget of its semivariogram over the
+# sill), or less where neighbours are far; and ρ̂ / (gᵀPg) the variance of the deviation that is.
+
+FEWEST_NEIGHBOURS = 30  # configurations, from which the normal approximation holds
+FALSE_SMOOTH = 0.01  # chance that any joint of an arm whose joints only scatter seems smooth
+
+
+def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Array:
+    """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.
+
+    Functions of several angles add up; what goes with all joints or with the order of measuring
+    holds them.
+    """
+    G = data.masked(data.G)
+    J = G.shape[2]
+    out = np.zeros(J)
+    first = dataset.lead[dataset.blocks.member[:, 0]]
+    q, moment = dataset.table.q[first], dataset.moment[dataset.blocks.member[:, 0]]
+    limit = -float(special.ndtri(FALSE_SMOOTH / (J * (J + 2))))
+    h = np.einsum("cmj,cmj->cj", G, at.P @ G)
+    a = np.einsum("cmj,cm->cj", G, at.u)
+    for j in range(J):
+        known = np.flatnonzero(h[:, j] > 1e-9 * h[:, j].max(initial=1e-300))
+        if len(known) < FEWEST_NEIGHBOURS:
+            continue
+        z = a[known, j] / np.sqrt(h[known, j])
+        pairs = [*(_next_to(q[known, k]) for k in range(J)), _next_to(moment[known])]
+        scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
+        one, other = _unordered(nearest(scaled)[0]).T
+        pairs.append((one, other))
+        rho = np.array([(z[i] * z[k]).mean() for i, k in pairs]) / (z**2).mean()
+        rho[rho * np.sqrt([len(i) for i, _ in pairs]) <= limit] = 0.0  # no more than chance
+        share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)
+        out[j] = share * float((z**2).mean()) / float(h[known, j].mean())
     return out
 
 
-def log_prior(stated: bool, noise: NoiseValues) -> float:
-    """−2 log prior of the noise, but for its constant."""
-    return log_prior_of(stated, len(noise.joint)).penalty(noise.logs())[0]
+def _next_to(x: Array) -> tuple[IntArray, IntArray]:
+    """Neighbours in the order of x (n,); among equal ones they are drawn."""
+    drawn = np.random.default_rng(len(x)).permutation(len(x))
+    order = drawn[np.argsort(x[drawn], kind="stable")]
+    return order[:-1], order[1:]
 
 
-def _precision(n: int, apart: float, common: float) -> Array:
-    """Inverse of apart² 1 + common² (n, n)."""
-    share = common**2 / (apart**2 + n * common**2)
-    return np.asarray((np.eye(n) - share) / apart**2)
+# The floor that is supported: by repeats where there are some, else by what neighbours do not
+# share and joints and instruments may have.  The rest of what the fit takes for noise is
+# unexplained.
+
+CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted noise were noise
+# What the prior of the noise exceeds in 2.5 % of cases: the scatter of a joint (rad, or m), and
+# the instrument's over the stated one.  Beyond them only repeats show that scatter is noise.
+UPPER = 1.96
+MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREAD, JOINT_SPREAD)))
+MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
 
 
-# Data under one noise: what is left of the residual, and how probable the noise is.
-#
-# With V the noise's covariance and the fitted parameters β ~ N(0, Λ⁻¹) integrated out,
-#
-#     −2 ℓ = log|V| + rᵀPr + log|XᵀV⁻¹X + Λ| − log|Λ| + n log 2π,
-#     P = V⁻¹ − V⁻¹X (XᵀV⁻¹X + Λ)⁻¹ XᵀV⁻¹,
-#
-# (restricted likelihood where Λ → 0; Patterson and Thompson 1971).
+def scatter_beyond(noise: NoiseValues) -> Array:
+    """Variance (joints,) of each joint's scatter beyond what the others let expect.
+
+    The logarithms of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its
+    own spread, so that the others tell what one is to be expected of; beyond its limit any joint of
+    an arm is with a chance of FALSE_SMOOTH.
+    """
+    J, usual = len(noise.joint), np.log(REPEATABILITY)
+    off = np.log(noise.joint) - usual
+    told = (J - 1) / JOINT_SPREAD**2
+    known = told + 1 / REPEATABILITY_SPREAD**2
+    others = (off.sum() - off) / JOINT_SPREAD**2 / known
+    spread = np.sqrt(JOINT_SPREAD**2 + 1 / known)
+    limit = np.exp(usual + others - float(special.ndtri(FALSE_SMOOTH / J)) * spread)
+    scatter = noise.joint**2 * (1 + noise.shared**2)
+    return np.maximum(scatter - np.minimum(limit, MOST_SCATTER) ** 2, 0.0)
 
 
-class Projection:
-    """The data under one noise, their coefficients under a prior of precision Λ (p,): V⁻¹ (C, m, m)
-    and H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
+class SupportedFloor:
+    """How much of the fitted noise is noise: 3-D rms (m) that is `noise`, and the rest of it, which
+    is `unexplained`; the mean squares (m²) of it that each of the `joints` and the `instrument`
+    has.  `stands_out`: whether a joint scatters more than the others let expect.
 
-    P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
-    likelihood ℓ; `beta_deviation` L⁻¹ (p, p), so that the posterior covariance of β is L⁻ᵀL⁻¹.
+    `best` (m) is the smallest error left at held-out poses, which no noise exceeds.  Repeats and
+    near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted variance σ²
+    where νs²/σ² is below the χ² quantile; they are then the floor themselves, with what
+    is stated as common to a configuration, which its repeats do not show.
     """
 
-    def __init__(self, weighted: Weighted, precision: Array) -> None:
-        at, self.marginal = weighted.factored(precision)
-        back, self.beta_deviation = weighted.root.transpose(0, 2, 1), at.inverse * at.root
-        # As one product: a small one for each configuration waits for memory.
-        flat = weighted.X.reshape(-1, len(at.L))
-        turned = linalg.blas.dtrmm(1.0, self.beta_deviation, flat.T, lower=1).T
-        self.H = back @ turned.reshape(weighted.X.shape)
-        self.u = (back @ weighted.r[..., None])[..., 0] - self.H @ (at.L.T @ at.b)
-        self.beta, self.inverse = at.root * at.b, back @ weighted.root
-        # What does not count has a unit variance of its own.
-        diagonal = np.einsum("cii->ci", self.inverse)
-        diagonal[diagonal == 0] = 1.0
+    def __init__(
+        self, dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
+    ) -> None:
+        self.of, self.at = (dataset, data, noise), project(data, noise)
+        fitted = min(noise_rms(data, noise), best)
+        size = min(data.blocks.size, 3)
+        scatter = noise.joint**2 * (1 + noise.shared**2)
+        smooth = np.minimum(smooth_scatter(dataset, data, self.at), scatter)
+        above, excess = 0.0, np.zeros_like(scatter)
+        if data.stated:  # else what joints do and what the instrument does are not to be told apart
+            excess = scatter_beyond(noise)
+            smooth = np.maximum(smooth, excess)
+            above = max(noise.factor**2 - MOST_STATED**2, 0.0)
+        stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
+        moved = np.moveaxis(data.G * np.sqrt(smooth), 2, 0)
+        self.joints = np.array([mean_square(data, g) for g in moved])
+        self.instrument = above * mean_square(data, stated)
+        variance = max(fitted**2 - self.joints.sum() - self.instrument, 0.0)
+        total, dof = repeats(dataset, come_back=True)
+        # What the cell states as common to a configuration, per axis.
+        seen = dataset.base.observed.kind in ("position", "pose")
+        alike = dataset.base.model.cell.noise.configuration**2 if seen else 0.0
+        self.near_repeats = near_repeats(dataset, data, self.at)
+        common = min(size * alike, variance)
+        if near := self.near_repeats:
+            total += max(near.scatter**2 - alike, 0.0) * near.independent * size
+            dof += near.independent * size
+        if dof:
+            shown = size * total / dof
+            low = float(special.chdtri(dof, 1 - CONTRADICTED)) / dof
+            high = float(special.chdtri(dof, CONTRADICTED)) / dof
+            if shown < low * (fitted**2 - common) or shown > high * (variance - common):
+                variance = shown + common
+        self.noise, self.stands_out = min(float(np.sqrt(variance)), fitted), bool(excess.any())
+        self.unexplained = float(np.sqrt(max(fitted**2 - self.noise**2, 0.0)))
 
-    @cached_property
-    def P(self) -> Array:
-        """P (C, m, m) of each configuration by itself."""
-        return self.inverse - self.H @ self.H.transpose(0, 2, 1)
+    @property
+    def told(self) -> NoiseFloor:
+        """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
+        (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
+        variance = np.diagonal(data.covariance, axis1=1, axis2=2)
+        ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
+        variance = variance[~data.left_out]
+        # Those left out have their error against the fit to the others.
+        e, stated = _left_over(data, self.at), data.blocks.unpack_square(data.covariance)
+        sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
+        table, gone = dataset.table, np.flatnonzero(data.faulty)
+        faulty = tuple(
+            FaultyReading(
+                int(table.row[row]),
+                table.configuration_labels[table.configuration[row]],
+                table.marker_names[table.marker[row]],
+                float(np.linalg.norm(e[k, :3])),
+                float(np.linalg.norm(e[k] / sigma[k])),
+            )
+            for k, row in zip(gone, dataset.lead[gone], strict=True)
+        )
+        return NoiseFloor(
+            data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
+            tuple(noise.joint.tolist()), noise.shared_by_all,
+            float(np.sqrt(square / dof)) if dof else None,
+            tuple(noise.shared.tolist()), faulty, self.near_repeats, dataset.drift,
+        )  # fmt: skip
 
-    @cached_property
-    def scattered(self) -> Array:
-        """Residuals e (C, m) that scatter as the noise does.
+    @property
+    def open(self) -> bool:
+        """Whether more is unexplained than is noise, or a joint stands out and repeats do not."""
+        return self.unexplained > (0.0 if self.stands_out else self.noise)
 
-        The fit's own residuals are too small, its leverage less than V: u_c has the covariance
-        P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
-        """
-        e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
-        return np.asarray(e[..., 0])
-
-
-def _power(blocks: Array, exponent: float) -> Array:
-    """Symmetric powers of positive definite matrices (C, m, m)."""
-    values, vectors = np.linalg.eigh(blocks)
-    values = np.maximum(values, ROUNDING * values[:, -1:]) ** exponent
-    return np.asarray((vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1))
-
-
-@dataclass(frozen=True)
-class Weighted:
-    """The data whitened by one noise V = KKᵀ, whatever the prior of the coefficients: K⁻¹
-    (C, m, m), K⁻¹X (C, m, p), K⁻¹r (C, m), the products of these, and what of −2ℓ no coefficient
-    changes, log|V| + n log 2π."""
-
-    root: Array
-    X: Array
-    r: Array
-    products: Products
-    constant: float
-
-    @classmethod
-    def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        white, n = Whitened(data.model.packs[0], noise.theta), data.n_rows
-        flat, r = white.B.reshape(-1, white.B.shape[2]), white.e
-        products = Products(flat.T @ flat, flat.T @ r.ravel(), float(np.vdot(r, r)), n)
-        return cls(white.root, white.B, r, products, white.log_det + n * LOG_2PI)
-
-    def prior(self, precision: Array) -> Array:
-        """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
-        must not drown in rounding.  By each column's own size: a prior must not tighten because
-        another column is large."""
-        return precision + ROUNDING * np.diag(self.products.M)
-
-    def factored(self, precision: Array) -> tuple[Standardised, float]:
-        """The coefficients under a prior of precision Λ (p,), and ℓ."""
-        least = self.prior(precision)
-        at, spared = self.products.at(1 / least), float(np.log(least / precision).sum())
-        return at, -0.5 * (self.constant + self.products.value(at) + spared)
-
-    def marginal(self, precision: Array) -> float:
-        return self.factored(precision)[1]
-
-
-def project(data: NoisyData, noise: NoiseValues) -> Projection:
-    return Projection(Weighted.of(data, noise), data.precision)
-
-
-def posterior(data: NoisyData, noise: NoiseValues) -> float:
-    """−2 log of marginal likelihood times prior of the noise."""
-    return -2 * Weighted.of(data, noise).marginal(data.precision) + log_prior(data.stated, noise)
-
-
-STEPS = 200  # a few of them do mostly
-SOME = 250  # configurations that show where the optimum is
-ENOUGH = 1e-3  # change of −2ℓ at which a search ends
+    def location(self, tests: Sequence[StructureTest]) -> Location | None:
+        """Where what is unexplained lies, each joint by its share; None where not in joints."""
+        if self.joints.sum() <= self.instrument:
+            return None
+        share = self.joints / (self.joints.sum() + self.instrument)
+        places = {f"joint{j + 1}": float(p) for j, p in enumerate(share) if p > 0}
+        where = max(places, key=lambda name: places[name])
+        return Location.of(
+            "transmission", where, {"transmission": float(share.sum())}, places, tests
+        )
 
 
-def fit_noise(
-    data: NoisyData, start: NoiseValues | None = None, enough: float = ENOUGH
-) -> NoiseValues:
-    """The most probable noise values.
+def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
+    """3-D rms in m that the noise alone gives a reading."""
+    variance = np.diagonal(data.V(noise), axis1=1, axis2=2)
+    return float(np.sqrt(mean_square(data, np.sqrt(variance))))
 
-    Where nothing is stated it starts from two ends, unless a start is given; with many
-    configurations it comes from some of them to all.  The search ends where −2ℓ changes by less
-    than `enough`.
+
+def mean_square(data: NoisyData, packed: Array) -> float:
+    """Mean over the readings of the squared 3-D length of `packed` (C, m)."""
+    squares, count = squared_lengths(data, packed)
+    return float(squares.sum() / count.sum())
+
+
+# Errors on configurations, or blocks of time, left out of the fit, in closed form.
+
+
+def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
+    """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
+
+    `together` (C,) numbers the group that each is left out with; by itself where None.  For a
+    group, with V and H of its configurations,
+
+        P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
     """
-    if start is None and len(data.r) >= 2 * SOME:
-        start = fit_noise(data.every(len(data.r) // SOME))
-    if start is None:
-        starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [balanced(data)])]
-        ends = [fit_noise(data, one, enough) for one in starts]
-        return min(ends, key=lambda end: posterior(data, end))
-    # By steps in log a, log c and log s: the latter are known apart from each other.
-    to = doubled(data.G.shape[2])
-
-    def objective(logs: Array) -> tuple[float, Array, Array]:
-        value, slope, information = data.model.objective(to @ logs)
-        return value, to.T @ slope, to.T @ information @ to
-
-    begin: Array = linalg.solve(to, start.logs())
-    found = climb(objective, begin, begin - FARTHEST, begin + FARTHEST, enough, STEPS)[0]
-    return NoiseValues.of(np.exp(to @ found))
+    if together is None:
+        return each_left_out(at.P, at.u)
+    Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
+    out = Vu[..., 0]
+    for g in np.unique(together):
+        own = together == g
+        H = at.H[own]
+        inner = np.eye(H.shape[2]) - np.einsum("cmp,cmq->pq", H, VH[own])
+        z = np.linalg.solve(inner, np.einsum("cmp,cm->p", H, Vu[own, :, 0]))
+        out[own] += VH[own] @ z
+    return np.asarray(out)
 
 
-def balanced(data: NoisyData) -> NoiseValues:
-    """Instrument and joints share the scatter of the data equally.
+def each_left_out(P: Array, u: Array) -> Array:
+    """The same of each configuration by itself, from P (C, m, m) and u (C, m)."""
+    return np.asarray(np.linalg.solve(P, u[..., None])[..., 0])
 
-    From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
+
+def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
+    """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
+
+    Of a pose the position counts, of a distance its one component.
     """
-    used = ~data.left_out
-    square = float((data.r[used] ** 2).mean())
-    shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
-    moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
-    joint = np.clip(np.sqrt(0.5 * square / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
-    return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, np.full_like(joint, SHARED))
+    C, M = data.blocks.member.shape
+    size = data.blocks.size
+    used = ~data.left_out.reshape(C, M, size)[:, :, 0]
+    part = packed.reshape(C, M, size)[:, :, : min(size, 3)]
+    return ((part**2).sum(axis=2) * used).sum(axis=1), used.sum(axis=1)
+
+
+def left_out_square(data: NoisyData, noise: NoiseValues, together: IntArray | None = None) -> float:
+    """Mean square (m²) of the 3-D error of a reading whose configuration was left out."""
+    return mean_square(data, left_out_residual(project(data, noise), together))
+
+
+# How the error at poses left out of the fit falls, step by step, and how sure that is.
+
+NEW_POSES = 100  # in the set that the intervals of a reduction are for
+
+
+def rms_with_interval(
+    data: NoisyData, packed: Array, rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """3-D rms in m of residuals (C, m) and its 95 % interval by resampling configurations."""
+    return resampled_rms(*squared_lengths(data, packed), rng)
+
+
+def first_steps(
+    dataset: DiagnosisData, noise: NoiseValues, rng: np.random.Generator
+) -> list[BudgetStep]:
+    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.
+
+    By the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
+    effect is that effect, and weights by it would spare it.
+    """
+    placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
+    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
+    # Stage by stage, effects of the later step held at nominal.
+    data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
+    stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
+    for k, name in ((1, "geometry"), (2, "compliance")):
+        if (stage == k).any():
+            free = stage <= k
+            part = replace(data, X=data.X[:, :, free], precision=data.precision[free])
+            left = left_out_residual(project(part, noise.of_instrument()))
+            steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
+    return steps
+
+
+def with_intervals(drawn: Array) -> tuple[float, Interval, Interval]:
+    """The median of draws (n,), and the 90 and 95 % intervals."""
+    ends = np.quantile(drawn, [0.025, 0.05, 0.5, 0.95, 0.975])
+    low95, low90, middle, high90, high95 = ends.tolist()
+    return middle, (low90, high90), (low95, high95)
+
+
+# Faulty readings.
+#
+# A reading i left out has an error d whose square dᵀP_ii d follows χ², if the model is right.
+# Where it is not, an arm's own error is larger than any χ² allows, and only what no arm can do is
+# a fault.  That others show beside which the arm's error is a part of the noise, as large as need
+# be:
+#
+#   - the other markers of the same visit: the flange may be anywhere;
+#   - repeats of the same pose, marker and load: the place may be anywhere;
+#   - without either, neighbours in the joints: an error that they share is the arm's.
+#
+# An error that one of the first two would have shown and does not is none of the reading's.
+
+ROUNDS = 20
+LEVEL = 0.01  # chance that any of all good readings is taken for faulty
+MOST = 0.1  # share of readings from which on "faulty" is no accident of measuring
+RUN = 3  # so many neighbours in a row, of one marker, are no accident either
+ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
+TINY = 1e-300
+TAILS = np.geomspace(2.0, 1e3, 200)  # degrees of freedom that a tail may have
+NEIGHBOURS = 3  # poses whose errors a reading's is compared with
+APART = 1e6  # deviations of a joint, between those that are no neighbours
+SEEN = 0.02  # share of an error's square below which the flange's own motion hides it
+
+
+def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray, BoolArray]:
+    """The faulty ones (N,) among the readings of `data`, those of `dataset` with what was found
+    beside, and suspects (N,) that were kept: too many, or too near each other to be accidents.
+
+    The noise is the usual one and not the fitted one, which faulty readings swell; the median of
+    all sets its scale and their spread its tail, so that an effect still missing from the model
+    does not make readings faulty.  Of each visit, and of each pose's repeats, the worst goes
+    first, for beside it the others look wrong too.  Runs of one marker's readings are kept:
+    something happened to it; and where suspects prefer one marker, load state or half of the
+    campaign, all are kept, for the same reason.
+    """
+    blocks = dataset.blocks
+    faulty = np.zeros(blocks.n, dtype=bool)
+    conspicuous = faulty.copy()
+    for _ in range(ROUNDS):
+        excess = excess_of(dataset, data.without(faulty))
+        suspect = excess > 1
+        conspicuous |= suspect
+        suspect &= ~in_a_run(dataset, suspect)
+        now = suspect.copy()
+        for group in (blocks.visit, dataset.base.observed.place):
+            worst = np.zeros(int(group.max()) + 1)
+            np.maximum.at(worst, group, np.where(suspect, excess, 0.0))
+            now &= excess == worst[group]
+        if not now.any() or faulty.mean() > MOST:
+            break
+        faulty |= now
+    for k in np.flatnonzero(faulty):
+        # A good reading may have looked wrong beside a faulty one that was still there.
+        others = faulty.copy()
+        others[k] = False
+        faulty[k] = excess_of(dataset, data.without(others))[k] > 1
+    if faulty.mean() > MOST or not accidental(dataset, faulty):
+        faulty[:] = False
+    return faulty, conspicuous & ~faulty
+
+
+def excess_of(dataset: DiagnosisData, data: NoisyData) -> Array:
+    """Squared error (N,) of every reading over what is allowed; 0 where it is left out.
+
+    By the model, or less where visit or repeats, else neighbours, speak for the reading.
+    """
+    blocks, used = dataset.blocks, np.flatnonzero(~data.faulty)
+    size, level, out = blocks.size, LEVEL / blocks.n, np.zeros(blocks.n)
+    at = project(data, NoiseValues.usual(data.G.shape[2]))
+    P, own = blocks.unpack_square(at.P)[used], blocks.unpack_square(data.covariance)[used]
+    error = deleted(P, blocks.unpack(at.u[..., None])[used, :, 0], own, np.zeros(len(used)))[0]
+    squared = np.einsum("ni,nij,nj->n", error, P, error)
+    half, limit = special.chdtri(size, [0.5, level])
+    out[used] = squared / (limit / half * max(float(np.median(squared)), TINY))
+    if not (out > 1).any():
+        return out
+    root = np.linalg.inv(np.linalg.cholesky(own))
+    e = root @ blocks.unpack((data.r - data.X @ at.beta)[..., None])[used]
+    last = f"link{dataset.base.model.chain.n_joints}"
+    moved = root @ blocks.unpack(dataset.entry(("link_frame", (last,))))[used]
+    told = np.full(len(used), np.nan)
+    for group, shared in ((blocks.visit, moved), (dataset.base.observed.place, root)):
+        found, would, dof = _beside(group[used], shared, e, root @ error[..., None])
+        for k in np.unique(dof[dof > 0]):
+            mine = dof == k
+            half, limit = special.chdtri(k, [0.5, level])
+            # Readings better than stated are not faulty yet.
+            least = 1.0 if data.stated else TINY
+            limit *= max(float(np.median(found[mine]) / half), least)
+            told = np.where(mine & (would > limit), np.fmax(told, found / limit), told)
+    alone = np.minimum(squared, _unlike_neighbours(dataset, used, error, P))
+    alone /= _tail(squared, size, level)
+    told = np.where(np.isnan(told), alone, np.minimum(told, out[used]))
+    out[used] = np.where(out[used] > 1, told, out[used])
+    return out
+
+
+def _unlike_neighbours(dataset: DiagnosisData, used: IntArray, error: Array, P: Array) -> Array:
+    """Squared difference (n,) of the errors (n, size) of the readings `used` from the mean error of
+    the nearest poses, of the same marker and load, as if that were exact."""
+    q = dataset.table.q[dataset.lead[used]]
+    place = np.column_stack([q / np.maximum(q.std(axis=0), 1e-12), APART * dataset.kind[used]])
+    first = np.unique(dataset.base.observed.place[used], return_index=True)[1]
+    if len(first) <= NEIGHBOURS:
+        return np.full(len(used), np.inf)
+    distance, near = cKDTree(place[first]).query(place, k=NEIGHBOURS + 1)
+    off = error - error[first[near[:, 1:]]].mean(axis=1)  # the first is its own pose
+    squared = np.einsum("ni,nij,nj->n", off, P, off) / (1 + 1 / NEIGHBOURS)
+    return np.where(distance[:, -1] < APART / 2, squared, np.inf)
+
+
+def _tail(squared: Array, size: int, level: float) -> float:
+    """Limit at this `level` of statistics (n,) that follow a scaled F(size, ν), χ² where ν → ∞.
+
+    The scale is set by the median.  Where more lie beyond the ninth decile of χ² than chance
+    allows, ν is the one whose ninth decile is theirs: errors of a model that is not right have
+    heavy tails, and what lies in a tail that begins among the good ones is no fault.
+    """
+    median, ninth = np.maximum(np.quantile(squared, [0.5, 0.9]), TINY)
+    tenth, half, limit = special.chdtri(size, [0.1, 0.5, level])
+    beyond = int((squared > tenth * median / half).sum())
+    if special.bdtrc(beyond - 1, len(squared), 0.1) <= ACCIDENT:
+        ratio = special.fdtri(size, TAILS, 0.9) / special.fdtri(size, TAILS, 0.5)
+        nu = np.exp(np.interp(-ninth / median, -ratio, np.log(TAILS)))
+        half, limit = special.fdtri(size, nu, [0.5, 1 - level])
+    return float(limit / half * median)
+
+
+def _beside(
+    group: IntArray, shared: Array, e: Array, error: Array
+) -> tuple[Array, Array, IntArray]:
+    """What the others of a reading's group make of it, of whitened residuals `e` (n, size, 1) and
+    motions `shared` (n, size, k) that a group has in common: its squared error (n,), what that
+    would be of its `error` (n, size, 1), and the directions (n,) that they show.
+
+    With A the motions of a group and Q = I − AA⁺, w = Q e: wᵢᵀQ_ii⁺wᵢ and errorᵀQ_ii error.
+    """
+    (n, size, k), dof = shared.shape, np.zeros(len(e), dtype=np.int64)
+    squared, would = np.zeros(n), np.zeros(n)
+    for rows in same_size(group):
+        if rows.shape[1] < 2:
+            continue
+        U, s, _ = np.linalg.svd(shared[rows].reshape(len(rows), -1, k), full_matrices=False)
+        U = U * (s > 1e-6 * s[:, :1])[:, None]
+        w = e[rows].reshape(len(rows), -1, 1)
+        w = (w - U @ (U.transpose(0, 2, 1) @ w)).reshape(*rows.shape, size, 1)
+        U = U.reshape(*rows.shape, size, -1)
+        Q = np.eye(size) - U @ U.swapaxes(2, 3)
+        values, vectors = np.linalg.eigh(Q)
+        seen = values > SEEN
+        along = (vectors.swapaxes(2, 3) @ w)[..., 0] ** 2
+        squared[rows] = np.where(seen, along / np.where(seen, values, 1.0), 0.0).sum(axis=2)
+        would[rows] = (error[rows].swapaxes(2, 3) @ Q @ error[rows])[..., 0, 0]
+        dof[rows] = seen.sum(axis=2)
+    return squared, would, dof
+
+
+def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
+    if not faulty.any():
+        return True
+    table, lead, moment = dataset.table, dataset.lead, dataset.moment
+    loaded = np.any(table.force != 0, axis=1)[lead]
+    for label in (table.marker[lead], loaded, moment > np.median(moment)):
+        group = numbered(label)
+        found, size = np.bincount(group, faulty), np.bincount(group)
+        # Each group's count given the total is hypergeometric; the most conspicuous one decides.
+        p = scipy.stats.hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(size)
+        if len(size) > 1 and p < ACCIDENT:
+            return False
+    return True
+
+
+def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
+    """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
+    marker_of, out = dataset.table.marker[dataset.lead], np.zeros(len(suspect), dtype=bool)
+    for marker in np.unique(marker_of):
+        mine = np.flatnonzero(marker_of == marker)
+        mine = mine[np.argsort(dataset.moment[mine], kind="stable")]
+        if suspect[mine].sum() >= RUN:
+            out[mine] = scipy.ndimage.binary_opening(suspect[mine], np.ones(RUN))
+    return out

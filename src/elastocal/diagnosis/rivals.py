@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 from scipy.sparse.csgraph import connected_components
 
-from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.baseline import SMALLEST_NOISE, Baseline, NoiseValues, project
 from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
 from elastocal.diagnosis.diagnosis_data import (
     UNKNOWN_EFFECT,
@@ -28,7 +28,6 @@ from elastocal.diagnosis.effect_search import (
 )
 from elastocal.diagnosis.evidence import Grams, Item, at_scales
 from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
-from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
@@ -244,10 +243,8 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
 
 def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
     """Columns (C, m, k) of an item about each of its starts, per typical size; none without."""
-    what, model, of = item.what, dataset.base.model, dataset.columns
-    if not isinstance(what, Hypothesis) or not what.effect.starts(
-        what.where, model.chain, model.cell
-    ):
+    what, of = item.what, dataset.columns
+    if not isinstance(what, Hypothesis) or not what.starts(dataset.base.model):
         return []
     starts = StartSearch(of.full, what, of.base, of.x, of.rows).tangents()
     return [dataset.pack(C) * dataset.sizes_in(what, C) for _, C in starts]

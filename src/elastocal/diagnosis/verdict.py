@@ -10,7 +10,8 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.diagnosis.component_answer import DRAWS, SumAnswer
+from elastocal.diagnosis.baseline import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer
 from elastocal.diagnosis.component_search import sum_of
 from elastocal.diagnosis.diagnosis import (
     Candidate,
@@ -34,8 +35,7 @@ from elastocal.diagnosis.effect_search import (
 )
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
-from elastocal.diagnosis.stated_floor import NEW_POSES, each_left_out, mean_square, with_intervals
+from elastocal.diagnosis.noise_floor import NEW_POSES, each_left_out, mean_square, with_intervals
 from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
@@ -43,7 +43,6 @@ from elastocal.units import Array, BoolArray
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
-NAMED = 0.9  # probability from which an effect is named
 SET = 0.95  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
@@ -184,10 +183,7 @@ class FewAnswer(SumAnswer):
 
     def _is_sought(self, what: Hypothesis | Generic) -> bool:
         """Whether its geometry was looked for from many starts."""
-        model = self.dataset.base.model
-        if not isinstance(what, Hypothesis):
-            return False
-        return bool(what.effect.starts(what.where, model.chain, model.cell))
+        return isinstance(what, Hypothesis) and bool(what.starts(self.dataset.base.model))
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls by these components.
@@ -262,13 +258,6 @@ class FewAnswer(SumAnswer):
         estimates = grams.estimates(item.what, tried, chosen.scales[k])
         return tried, special.softmax(evidence), estimates
 
-    def _by_constants(self, k: int) -> Array:
-        """Variance (width,) of item k's coefficients because its constants are estimated, too."""
-        chosen, out = self.selected.chosen, np.zeros(1)
-        for _, p, estimates in self._constants[k]:
-            out = out + p @ (estimates - chosen.at.beta[chosen.spans[k]]) ** 2
-        return out
-
     @cached_property
     def _true(self) -> Array:
         """Readings without noise (rows, draws), θ* drawn, as uncertain of each configuration as
@@ -302,7 +291,10 @@ class FewAnswer(SumAnswer):
         size = self.dataset.sizes[c.hypothesis.key]
         each = size * [self._fitted.beta[span], self.at.beta[span]]
         D = self.at.beta_deviation[:, span]
-        std = np.sqrt((D**2).sum(axis=0) + self._by_constants(k))
+        variance, chosen = (D**2).sum(axis=0), self.selected.chosen
+        for _, p, estimates in self._constants[k]:  # which are estimated, too
+            variance += p @ (estimates - chosen.at.beta[chosen.spans[k]]) ** 2
+        std = np.sqrt(variance)
         if self._is_sought(c.hypothesis):
             # The prior is about one of many geometries: what is known by it alone is not known.
             without = np.linalg.inv(D.T @ D) - (1 - WEAKER) * np.diag(self._wide.precision[span])
