@@ -338,7 +338,17 @@ def _left_open(arm: CalibratedArm) -> Iterator[tuple[str, Array, float]]:
 def _difference(
     old: CalibratedArm, new: CalibratedArm, own: list[str]
 ) -> tuple[list[str], Array, Array, list[str]]:
-    """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows."""
+    """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows.
+
+    Raises InputError where users held a parameter at two values, or a covariance has no numbers.
+    """
+    said = [{*arm.determined, *(name for name, _, _ in _left_open(arm))} for arm in (old, new)]
+    for name in (n for n in own if n not in said[0] | said[1]):
+        require(
+            bool(np.isclose(old.values[name], new.values[name], rtol=1e-9)),
+            f"{name} is held at {old.values[name]:.6g} in {old.source} and at "
+            f"{new.values[name]:.6g} in {new.source}; identify both with the same value",
+        )
     (first, y1, A1, V1), (second, y2, A2, V2) = (_estimates(arm, own) for arm in (old, new))
     both, alone = np.intersect1d(first, second), np.setxor1d(first, second)
     # What both determined drops out of the differences, whatever it is: T of all estimates.
