@@ -14,7 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
-from elastocal import ROOMS
 from elastocal.above import checked_arguments, later, shown, whole
 from elastocal.errors import InputError, option, options_given, require
 from elastocal.text import quoted
@@ -40,17 +39,23 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 else:
     globals().update(later(
-        *(f"elastocal.{room} {names}" for room, names in ROOMS.items()),
         "numpy.typing ArrayLike",
         "pandas DataFrame",
         "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.compensation.compensate Targets",
-        "elastocal.identification.knowledge Constraints GaussianPrior",
+        "elastocal.cell.work_cell Cell",
+        "elastocal.compensation.compensate Compensation Targets",
+        "elastocal.diagnosis.diagnosis Diagnosis",
+        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
         "elastocal.identification.options FaultyReadings IntervalKind Method",
+        "elastocal.identification.result Calibration",
         "elastocal.identification.weighted_problem WeightKind",
+        "elastocal.measurements Measurements",
+        "elastocal.model.calibrated CalibratedArm",
+        "elastocal.model.manipulator Model",
         "elastocal.planning.design Effort",
+        "elastocal.planning.plan Plan",
         "numpy.random Generator",
-    ) | globals())  # fmt: skip
+    ))  # fmt: skip
 
 # Each verb imports what it calls: one should not load another, and --help none of them.
 
