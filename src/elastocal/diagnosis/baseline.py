@@ -525,9 +525,6 @@ class Weighted:
         at, spared = self.products.at(1 / least), float(np.log(least / precision).sum())
         return at, -0.5 * (self.constant + self.products.value(at) + spared)
 
-    def marginal(self, precision: Array) -> float:
-        return self.factored(precision)[1]
-
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
     return Projection(Weighted.of(data, noise), data.precision)
@@ -535,7 +532,7 @@ def project(data: NoisyData, noise: NoiseValues) -> Projection:
 
 def posterior(data: NoisyData, noise: NoiseValues) -> float:
     """−2 log of marginal likelihood times prior of the noise."""
-    return -2 * Weighted.of(data, noise).marginal(data.precision) + log_prior(data.stated, noise)
+    return -2 * Weighted.of(data, noise).factored(data.precision)[1] + log_prior(data.stated, noise)
 
 
 STEPS = 200  # a few of them do mostly

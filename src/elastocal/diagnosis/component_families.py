@@ -31,7 +31,7 @@ from elastocal.diagnosis.hypotheses import (
     recorded,
 )
 from elastocal.identification.start import as_placed
-from elastocal.measurements import Measurements, first_of_visit, with_moves
+from elastocal.measurements import first_of_visit, with_moves
 from elastocal.model.effects.base import Effect, JointMotion, Stage, index, turning_joints
 from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.gears import BY_ORDER, MOST_LINES, GearRipple, GearSpectrum
@@ -162,19 +162,14 @@ def beside(
 FIELD = ResidualField()
 
 
-def _followed(table: Measurements, name: str) -> Array:
-    """What a field follows in each row (n_rows,): the angle of a joint, or the time."""
-    x = table.time if name == "time" else table.q[:, index(name)]
-    assert x is not None  # a field follows what is recorded
-    return x
-
-
 def field_component(
     dataset: DiagnosisData, where: str, name: str, shortest: float = FIELD_LENGTHS[0]
 ) -> Component:
     """A smooth motion of a place with what it follows, of lengths from the `shortest` share of its
     range: the same waves in each component of the motion."""
-    x, entry = _followed(dataset.table, name), FIELD.entry_at(where)
+    x = dataset.table.time if name == "time" else dataset.table.q[:, index(name)]
+    assert x is not None  # a field follows what is recorded: the time, or the angle of a joint
+    entry = FIELD.entry_at(where)
     low, high, span = float(x.min()), float(x.max()), float(np.ptp(x))
     waves = Waves.over(low, high, shortest * span, turns=name != "time")
     D = np.asarray(np.kron(np.eye(entry.size), waves.at(x)[:, None, :] * MOTION), dtype=float)

@@ -429,11 +429,10 @@ class Beside:
         prior = np.concatenate([found.sums.data.precision, 1 / found.variances])
         self.sum = Standardised.of(M, z, (prior + ROUNDING * np.diag(M)) ** -0.5)
         self.left, self.moved = list[tuple[Array, Array]](), list[Array]()
-        for t in found.sums.across(columns):
-            scaled = self.sum.root[:, None] * t.beside
+        for across, own, z in found.sums.across(columns):
+            scaled = self.sum.root[:, None] * across
             self.moved.append(linalg.cho_solve((self.sum.L, True), scaled))
-            left = t.own - scaled.T @ self.moved[-1], t.z - scaled.T @ self.sum.b
-            self.left.append(left)
+            self.left.append((own - scaled.T @ self.moved[-1], z - scaled.T @ self.sum.b))
 
     def evidence_instead(self, gone: slice) -> list[float]:
         """Over none, of what is `gone` beside all others of the sum and of each of the columns."""

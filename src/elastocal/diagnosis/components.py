@@ -23,7 +23,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy import linalg, special
@@ -227,14 +227,9 @@ def log_odds(components: Sequence[Component], another: Component) -> float:
     return presence_cost(n, k - 1) - presence_cost(n, k) - another.sought
 
 
-class Across(NamedTuple):
-    """Of columns C (C, m, k) under a noise: XᵀV⁻¹C (p, k) of those that they stand beside, CᵀV⁻¹C
-    (k, k) and CᵀV⁻¹r (k,)."""
-
-    beside: Array
-    own: Array
-    z: Array
-
+# Of columns C (C, m, k) under a noise: XᵀV⁻¹C (p, k) of those that they stand beside, CᵀV⁻¹C (k, k)
+# and CᵀV⁻¹r (k,).
+Across = tuple[Array, Array, Array]
 
 # Change of −2ℓ at which sizes are settled, and at which they tell what is of no use; steps to it.
 SETTLED, ROUGHLY, STEPS = 2e-3, 0.1, 30
@@ -285,22 +280,22 @@ class SumOfComponents:
         white = _rows(self.inverse @ columns)
         others = (self.data.X, *(c.columns for c in self.components))
         across = np.concatenate([_rows(C).T @ white for C in others])
-        return Across(across, _rows(columns).T @ white, white.T @ self.data.r.ravel())
+        return across, _rows(columns).T @ white, white.T @ self.data.r.ravel()
 
     def across(self, columns: Sequence[Array]) -> Iterator[Across]:
         """Of each of these columns."""
         for some in (columns[k : k + BUNDLE] for k in range(0, len(columns), BUNDLE)):
-            each = self._beside(side_by_side(self.data, some))
-            for at in spans_of([c.shape[2] for c in some], len(each.z)):
-                yield Across(each.beside[:, at], each.own[at, at], each.z[at])
+            cross, own, z = self._beside(side_by_side(self.data, some))
+            for at in spans_of([c.shape[2] for c in some], len(z)):
+                yield cross[:, at], own[at, at], z[at]
 
     def joined(self, more: Sequence[Component]) -> SumOfComponents:
         """The sum with these as well."""
         out = self
         for some in (more[k : k + BUNDLE] for k in range(0, len(more), BUNDLE)):
-            new = out._beside(side_by_side(self.data, [c.columns for c in some]))
-            M = np.block([[out.products.M, new.beside], [new.beside.T, new.own]])
-            products = replace(out.products, M=M, z=np.append(out.products.z, new.z))
+            cross, own, z = out._beside(side_by_side(self.data, [c.columns for c in some]))
+            M = np.block([[out.products.M, cross], [cross.T, own]])
+            products = replace(out.products, M=M, z=np.append(out.products.z, z))
             out = replace(out, components=(*out.components, *some), products=products)
         return out
 

@@ -96,6 +96,11 @@ class DiagnosisData:
         """Which of the visits' places (C, v) hold one."""
         return self.blocks.example >= 0
 
+    @cached_property
+    def visits(self) -> Measurements:
+        """The same of the visits that there are."""
+        return self.visit_table.take(self.present.ravel())
+
     def pack(self, rows: Array) -> Array:
         """Per table row (n_rows, size, k) → packed (C, m, k)."""
         return self.blocks.pack(self.base.observed.apply(rows))
@@ -130,8 +135,7 @@ class DiagnosisData:
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
-        table = self.visit_table.take(self.present.ravel())
-        grids = {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
+        grids = {h.key: grid_of(h, self.visits) for h in self.hypotheses if h.driven}
         for key, share in self.columns.shares.items():
             grids[key] = replace(NO_SETTINGS, log_prior=np.array([share]))
         return grids
@@ -140,8 +144,8 @@ class DiagnosisData:
     def moments(self) -> Array:
         """Every moment at which something may have changed between two visits; none without
         times."""
-        time = self.visit_table.time
-        return np.zeros(0) if time is None else moments_between(time[self.present.ravel()])
+        time = self.visits.time
+        return np.zeros(0) if time is None else moments_between(time)
 
     def direction(self, h: Hypothesis, settings: Array) -> Array:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)

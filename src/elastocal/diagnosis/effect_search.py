@@ -140,11 +140,11 @@ def _mixed_scales(
     data with the items' columns, stays.
     """
     if not items:
-        return scales, weighted.marginal(data.precision)
+        return scales, weighted.factored(data.precision)[1]
     spent = 0.0
     for k, item in enumerate(items):
         trials = [(*scales[:k], float(s), *scales[k + 1 :]) for s in item.what.scales]
-        each = np.array([weighted.marginal(_precision(data, items, t)) for t in trials])
+        each = np.array([weighted.factored(_precision(data, items, t))[1] for t in trials])
         scales, top = trials[int(np.argmax(each))], float(each.max())
         spent += float(logsumexp(each)) - np.log(len(each)) - top
     return scales, top + spent

@@ -410,7 +410,7 @@ def _chosen(
     # More poses may make up for a small doubt whether the right one is among the rivals.
     enough = ENOUGH / covered if covered * MOST_CERTAIN >= ENOUGH else ENOUGH
     # Where what can be told apart is told apart already, only what cannot be is left.
-    worthwhile = any(c.open for c in tasks) and expected(tasks, ()) < enough
+    worthwhile = any(np.ptp(c.classes) > 0 for c in tasks) and expected(tasks, ()) < enough
     progress("extra poses: choosing")
     chosen = fewest(tasks, most, enough) if worthwhile else []
     after = expected(tasks, chosen)

@@ -98,10 +98,13 @@ def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Nea
             return None
         return float(np.sqrt(squares[chosen].mean()))
 
-    return NearRepeats(
-        float(np.sqrt(squares.mean())), len(pairs), _independent(pairs), scatter(~apart),
-        scatter(apart),
-    )  # fmt: skip
+    # Of a group of k that hang together k − 1 differences do not follow from each other.
+    known, at_ends = np.unique(pairs, return_inverse=True)
+    n, ends = len(known), at_ends.reshape(pairs.shape).T
+    links = sparse.csr_array((np.ones(len(pairs)), tuple(ends)), (n, n))
+    independent = n - int(connected_components(links)[0])
+    of_all = float(np.sqrt(squares.mean()))
+    return NearRepeats(of_all, len(pairs), independent, scatter(~apart), scatter(apart))
 
 
 def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
@@ -128,14 +131,6 @@ def nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
 
 def _unordered(pairs: IntArray) -> IntArray:
     return np.unique(np.sort(pairs, axis=1), axis=0)
-
-
-def _independent(pairs: IntArray) -> int:
-    """Number of differences between paired readings that do not follow from each other: of a
-    group of k that hang together k − 1."""
-    known, at = np.unique(pairs, return_inverse=True)
-    n, (i, j) = len(known), at.reshape(pairs.shape).T
-    return n - int(connected_components(sparse.csr_array((np.ones(len(i)), (i, j)), (n, n)))[0])
 
 
 # Scatter of a joint that goes with pose or time is no scatter.

@@ -368,10 +368,6 @@ class Discrimination:
         self.draws = _posterior_draws(rivals, self.groups, S, rng)
         self.before, self.classes = self._apart(S[:-1, :-1]), np.arange(n)
 
-    @property
-    def open(self) -> bool:
-        return bool(np.any(self.classes != self.classes[0]))
-
     def _gram(self, chosen: Sequence[int]) -> Array:
         """Gram matrix (w, w) of the data so far and the chosen candidates."""
         H = self.pool[list(chosen)].reshape(-1, len(self.known))
@@ -436,13 +432,7 @@ class Discrimination:
             strongest = beaten[..., self.classes == k, :].max(axis=-2)
             lost += strongest * (self.classes != k)[:, None]
         named = (np.maximum(1 - lost, 0.0).mean(axis=-1) * p).sum(axis=-1)
-        return np.maximum(named, self.so_far)
-
-    @property
-    def so_far(self) -> float:
-        """Probability that the class of the likeliest rival is right."""
-        p = self.rivals.probability
-        return float(p[self.classes == self.classes[int(np.argmax(p))]].sum())
+        return np.maximum(named, p[self.classes == self.classes[np.argmax(p)]].sum())
 
     def distances(self, squared: Array) -> Array:
         """d (rivals, rivals) of each unordered pair: the median size's, the nearer way round."""

@@ -204,7 +204,7 @@ class FewAnswer(SumAnswer):
     def _mistimed(self, k: int) -> Array:
         """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
         moment at which item k changes and the one at which it was found to."""
-        chosen, every = self.selected.chosen, self._times
+        chosen, every = self.selected.chosen, times_of(self.dataset.visits)
         item, time = chosen.items[k], np.unique(every)
         kinds = [setting.kind for setting in item.what.settings]
         if "change_time" not in kinds or len(time) < 4:
@@ -219,11 +219,6 @@ class FewAnswer(SumAnswer):
         changed = (every > item.settings[s]).mean()
         step = mean_square(chosen.data, chosen.signal(k)) / changed
         return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
-
-    @property
-    def _times(self) -> Array:
-        """Of every visit, or its row."""
-        return times_of(self.dataset.visit_table.take(self.dataset.present.ravel()))
 
     @cached_property
     def _constants(self) -> list[list[tuple[Array, Array, Array]]]:
@@ -242,7 +237,7 @@ class FewAnswer(SumAnswer):
         found, setting = item.settings[s], item.what.settings[s]
         grid = dataset.grids[item.what.key]
         if setting.kind == "change_time":
-            values = moments_between(np.unique(self._times))
+            values = moments_between(np.unique(times_of(self.dataset.visits)))
             values = values[np.argsort(np.abs(values - found))[:CHANGE_TIMES]]
         elif setting.kind == "time_constant":  # as probable from here to twice it as to half of it
             ends = grid.values[:, s]
