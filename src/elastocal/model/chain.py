@@ -113,6 +113,10 @@ def finite_ranges(
     return low, np.where(np.isfinite(upper), upper, low + 2 * half)
 
 
+def told(chain: Chain, j: int, value: float) -> str:
+    return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"
+
+
 def joint_index(name: str) -> int:
     """0-based index of "joint3", as of "link3"."""
     return int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1

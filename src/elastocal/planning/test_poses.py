@@ -16,13 +16,13 @@ from elastocal.errors import InputError, InsufficientDataError, require, wish
 from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
-from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.planning.bodies import data_base
-from elastocal.planning.candidates import sobol, told
+from elastocal.planning.candidates import sobol
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
