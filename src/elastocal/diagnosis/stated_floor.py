@@ -61,6 +61,7 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
         tuple(noise.joint.tolist()), noise.shared_by_all,
         float(np.sqrt(square / dof)) if dof else None,
         tuple(noise.shared.tolist()), faulty, near_repeats(dataset, data, at), dataset.drift,
+        dataset.common,
     )  # fmt: skip
 
 

@@ -36,7 +36,12 @@ from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.stated_floor import NEW_POSES, each_left_out, mean_square, with_intervals
-from elastocal.identification.noise_summary import BEYOND, single_readings
+from elastocal.identification.noise_summary import (
+    BEYOND,
+    TOO_LARGE_IN_COMMON,
+    less_in_common,
+    single_readings,
+)
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray
@@ -428,12 +433,9 @@ def warnings(
     dataset: DiagnosisData, found: SelectedEffects, suspects: BoolArray, noise: NoiseValues
 ) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
-    out, data = [], found.chosen.data
-    if data.stated and _stated_wrong(dataset, data, noise.factor):
-        out.append(
-            f"the readings scatter {noise.factor:.2g} times as much as cell or table state; "
-            "correct [tracker], the stated noise"
-        )
+    out, data = list[str](), found.chosen.data
+    if data.stated:
+        out += _stated_wrong(dataset, data, noise.factor)
     faulty = (data.left_out & ~dataset.blocks.absent).sum() / max((~dataset.blocks.absent).sum(), 1)
     if faulty > FAULTY_SHARE:
         out.append(
@@ -465,18 +467,23 @@ def warnings(
     return tuple(out)
 
 
-def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> bool:
-    """Whether the tracker's noise is beyond what chance makes of the stated one, and repeats or
-    markers of one pose, where they tell, say so too; or stated far too large."""
-    if factor < STATED_LOW:
-        return True
+def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Iterator[str]:
+    """Where the tracker's noise is beyond what chance makes of the stated one, and repeats or
+    markers of one pose, where they tell, say so too; or what is stated is far too large."""
     base, good, dof = dataset.base, ~data.faulty, max(data.n_rows - data.X.shape[2], 1)
-    if factor**2 * dof < special.chdtri(dof, BEYOND) or base.stated is None:
-        return False
-    if base.observed.kind != "position":
-        return factor > STATED_HIGH
-    residual = base.residual.reshape(len(good), -1)[good].ravel()
-    single = single_readings(
-        subset(base.observed, good), residual, base.stated[good], len(base.x)
-    )  # fmt: skip
-    return single is None or single.above
+    observed, residual = subset(base.observed, good), base.residual.reshape(len(good), -1)[good]
+    common = less_in_common(observed, residual.ravel(), base.model.cell, len(base.x))
+    if common is not None:
+        yield TOO_LARGE_IN_COMMON.format(common)
+        return
+    wrong = factor**2 * dof >= special.chdtri(dof, BEYOND) and base.stated is not None
+    if wrong and observed.kind != "position":
+        wrong = factor > STATED_HIGH
+    elif wrong and base.stated is not None:
+        single = single_readings(observed, residual.ravel(), base.stated[good], len(base.x))
+        wrong = single is None or single.above
+    if wrong or factor < STATED_LOW:
+        yield (
+            f"the readings scatter {factor:.2g} times as much as cell or table state; "
+            "correct [tracker], the stated noise"
+        )

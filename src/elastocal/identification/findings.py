@@ -13,7 +13,11 @@ from scipy import linalg, special
 from elastocal.errors import option
 from elastocal.identification.mistakes import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
-from elastocal.identification.noise_summary import NoiseSize
+from elastocal.identification.noise_summary import (
+    TOO_LARGE_IN_COMMON,
+    NoiseSize,
+    less_in_common,
+)
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
@@ -418,7 +422,13 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
             "stated_noise_too_small", remedy,
             ratio=single.ratio, dof=single.dof, by=single.by, p_rest=single.rest,
         )  # fmt: skip
-    say, kind, doing = _good, "residual_agrees_with_stated_noise", None
+    observed, doing = result.observations, None
+    spent = len(observed.value) - result.dof
+    share = less_in_common(observed, result.residual, result.model.cell, spent)
+    if share is not None:
+        say, doing = _care if share < FAR_TOO_LARGE else _note, ""
+        yield say("common_noise_too_large", TOO_LARGE_IN_COMMON.format(share), ratio=share)
+    say, kind = _good, "residual_agrees_with_stated_noise"
     if ratio > high and not (single is not None and single.explains):
         say, kind, doing = _care, "residual_above_stated_noise", _lacking(result)
     elif ratio > high:

@@ -129,6 +129,12 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
     if noise.drift > 0:
         drift = say.length(noise.drift)
         yield f"The drift of {drift} that [noise] of the cell states counts as noise."
+    if noise.configuration > 0:
+        common = say.length(noise.configuration)
+        yield (
+            f"The deviation of {common} per axis that [noise] of the cell states as common to a "
+            "configuration counts as noise."
+        )
     if noise.pure_error is None:
         yield "No repeats: the noise is estimated from residuals only."
     else:

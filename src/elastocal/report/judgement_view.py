@@ -85,6 +85,10 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         "the stated noise is too large (the residual is {ratio} times it), so a missing effect "
         "would not show"
     ),
+    "common_noise_too_large": (
+        "what is stated as common to a configuration is too large (configurations scatter {ratio} "
+        "times as much), so a missing effect would not show"
+    ),
     "residuals_heavy_tailed": lambda f: (
         "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
