@@ -551,17 +551,17 @@ def curve_span(curve: Curve) -> str:
 
 
 def _corrections(d: Diagnosis) -> Iterator[say.Block]:
-    if d.slight:
-        yield say.Sentence(
-            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each. "
-            "They correct the arm and are not findings."
-        )
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
     yield say.ShownTable(heads, rows, (0, 1), title="Corrections without a name", note=(
         "Functions without a physical name; they hold where the arm was measured: size (standard "
         "deviation) and the length over which smooth ones change."
     ))  # fmt: skip
+    if d.slight:
+        yield say.Sentence(
+            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each. "
+            "They correct the arm and are not findings."
+        )
 
 
 # What corrections that are no smooth functions follow, by the setting that is their size.
