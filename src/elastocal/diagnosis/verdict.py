@@ -392,7 +392,8 @@ OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the re
 
 
 def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
-    """Every hypothesis with its probability: in the slot where it is likeliest."""
+    """Every hypothesis with its probability: in the slot where it is likeliest.  Last those that
+    the data do not show at their typical size and do not ask for: they have their prior alone."""
     found = few.selected
     best: dict[tuple[str, str], Candidate] = {}
     alone = zip(dataset.hypotheses, found.alone.distance.tolist(), strict=False)
@@ -411,7 +412,11 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
             )
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
-    return tuple(sorted(best.values(), key=lambda c: (-c.probability, -c.score)))
+
+    def order(c: Candidate) -> tuple[bool, float, float]:
+        return c.detectable < DETECTABLE and c.score <= 0, -c.probability, -c.score
+
+    return tuple(sorted(best.values(), key=order))
 
 
 def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
