@@ -340,9 +340,8 @@ def does_noise_explain_it(result: Calibration) -> str:
         elif stated or result.noise.kind == "covariance":
             text = "The residual was not compared with the stated noise"
         if result.noise.sigma is not None and method_of(result) == "ols":
-            return (
-                f"{text}; the residual amounts to {say.length(result.noise.sigma)} per coordinate."
-            )
+            of = "reading" if observed.kind == "distance" else "coordinate"
+            return f"{text}; the residual amounts to {say.length(result.noise.sigma)} per {of}."
         level = "; the noise level was estimated from the readings"
         return f"{text}{level * estimated}."
     size = (
