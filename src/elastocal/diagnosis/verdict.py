@@ -44,6 +44,7 @@ from elastocal.identification.noise_summary import (
 )
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
+from elastocal.text import rounded
 from elastocal.units import Array, BoolArray
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
@@ -489,6 +490,6 @@ def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Ite
         wrong = single is None or single.above
     if wrong or factor < STATED_LOW:
         yield (
-            f"the readings scatter {factor:.2g} times as much as cell or table state; "
+            f"the readings scatter {rounded(factor, 2)} times as much as cell or table state; "
             "correct [tracker], the stated noise"
         )

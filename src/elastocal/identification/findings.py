@@ -39,7 +39,7 @@ from elastocal.model.effects.compliances import (
 )
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
-from elastocal.text import counted, listed
+from elastocal.text import counted, listed, rounded
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.
@@ -214,8 +214,9 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
         else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
     )
     remedy = (
-        f"Check the unit of the loads: the compliances are {ratio:.2g} times those expected from "
-        f"{by}, as where {cause}. If so, {undo} force_x_N, force_y_N and force_z_N by 9.81."
+        f"Check the unit of the loads: the compliances are {rounded(ratio, 2)} times those "
+        f"expected from {by}, as where {cause}. If so, {undo} force_x_N, force_y_N "
+        "and force_z_N by 9.81."
     )
     yield (_care if given else _note)("load_unit", remedy, ratio=ratio, by=by, unit=unit)
 
@@ -309,7 +310,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
             "scale bar is wrong by so much."
             if other
             else "Look for what scales the readings: the size stated of a tag or scale bar, or a "
-            f"unit. Multiplied by {1 / scale:.4g} they have the lengths of the robot's file."
+            f"unit. Multiplied by {rounded(1 / scale, 4)} they have the robot's file's lengths."
         )
         yield _care("scale", remedy, readings_over_file=scale, likely=likely)
         return
@@ -415,8 +416,8 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     if single is not None and single.above:
         times = ratio if single.explains else single.ratio
         remedy = (
-            f"Correct [tracker]: by {single.by} single readings scatter {times:.2g} times as much "
-            "as cell or table state."
+            f"Correct [tracker]: by {single.by} single readings scatter {rounded(times, 2)} times "
+            "as much as cell or table state."
         )
         yield _note(
             "stated_noise_too_small", remedy,
@@ -551,7 +552,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
 
 def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -> str:
     """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
-    said = listed([f"{1e6 * size:.3g}" for _, size in found if size])
+    said = listed([f"{rounded(1e6 * size)}" for _, size in found if size])
     if not said:
         return f"State it as [noise] {key} in the cell for design and simulate."
     if all(size.agrees_with(stated) for size, stated in found):

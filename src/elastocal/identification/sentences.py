@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from string import Formatter
 from typing import Any
 
 from elastocal.errors import option
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
-from elastocal.text import counted, gathered, listed
+from elastocal.text import counted, gathered, listed, rounded
 
 # What to do about a finding.
 
@@ -81,6 +82,15 @@ def made(severity: Severity, kind: str, remedy: str | None = None, /, **numbers:
     return Finding(kind, severity, numbers, remedy)
 
 
+class Words(Formatter):
+    """Numbers of so many digits (".3g") are `rounded`."""
+
+    def format_field(self, value: Any, spec: str) -> str:
+        if spec[:1] == "." and spec[2:] == "g":
+            return rounded(value, int(spec[1]))
+        return str(super().format_field(value, spec))
+
+
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
     "copied_readings": (
@@ -102,7 +112,7 @@ SENTENCES = {
         "it. Measure more configurations."
     ),
     "ill_conditioned": (
-        "Ill-conditioned (condition number {condition_number:.1e} after scaling): the data barely "
+        "Ill-conditioned (condition number {condition_number:.2g} after scaling): the data barely "
         "separate {parameters}. {remedy}"
     ),
     "residual_above_stated_noise": (
@@ -167,7 +177,7 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
             )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
-            k: ", ".join(one if isinstance(one, str) else f"{one:.3g}" for one in v)
+            k: ", ".join(one if isinstance(one, str) else f"{rounded(one)}" for one in v)
             if isinstance(v, tuple) else v
             for k, v in f.numbers.items()
         }  # fmt: skip
@@ -180,11 +190,14 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if f.kind == "copied_readings":
             words["lines"] = _runs(result.copies)
         if len(same) == 1:
-            yield SENTENCES[f.kind].format(**words)
+            yield Words().format(SENTENCES[f.kind], **words)
             return
-        pairs = (f"{o.numbers.get('value', 0):.3g} ± {o.numbers.get('std', 0):.2g}" for o in same)
+        pairs = (
+            f"{rounded(o.numbers.get('value', 0))} ± {rounded(o.numbers.get('std', 0), 2)}"
+            for o in same
+        )
         words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
-        yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
+        yield Words().format(OF_SEVERAL[f.kind], **words, values=listed(pairs, 4))
 
 
 def _runs(lines: Iterable[int]) -> str:

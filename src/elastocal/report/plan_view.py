@@ -14,7 +14,7 @@ from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name
 from elastocal.report import blocks as say
 from elastocal.report.figures import NO_ENDS, plan_curve, rows_of_dots
-from elastocal.text import listed, printable, some
+from elastocal.text import listed, printable, rounded, some
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
@@ -297,7 +297,7 @@ def _everywhere_lines(plan: Plan) -> Told:
     )
     if drift := plan.model.cell.noise.drift:
         text += (
-            f"; with the drift of {drift * 1e6:.3g} µm that [noise] states "
+            f"; with the drift of {rounded(drift * 1e6)} µm that [noise] states "
             f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
         )
     if e.share:
