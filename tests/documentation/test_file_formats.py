@@ -105,8 +105,10 @@ def test_every_key_of_a_diagnosis_is_on_the_page():
         ("compensate cell.toml result.json targets.csv", "Targets and commands of `compensate`"),
         ("export cell.toml result.json -o arm.urdf --load 0 0 -98", "Answer of `export`"),
         ("effects cell.toml", "Effects of `effects`"),
-        (f"import {EXPORTS}/points.txt {EXPORTS}/poses.dat --preset spatialanalyzer --preset kuka",
-         "Answer of `import`"),
+        (
+            f"import {EXPORTS}/points.txt {EXPORTS}/poses.dat --preset spatialanalyzer --preset kuka",
+            "Answer of `import`",
+        ),
     ],
 )
 def test_every_key_of_plans_and_of_what_is_done_with_a_result_is_on_the_page(
