@@ -65,5 +65,7 @@ def test_on_an_arm_that_only_scatters_nothing_is_unexplained(shake: float, commo
     why, true = diagnosed(curves=False, again=0, shake=shake, common=common)
     assert why.gap.unexplained == 0.0 and why.verdict == "nothing_significant"
     told = "\n".join((*why.warnings, *noise_floor_lines(why.noise, ["revolute"] * 6)))
-    assert ("deviation of 80.0 µm per axis" in told) == (common > 0) and "correct" not in told
+    assert ("common to a configuration of 80.0 µm" in told) == (
+        common > 0
+    ) and "correct" not in told
     assert why.gap.noise_floor == pytest.approx(true, rel=0.15)

@@ -36,12 +36,7 @@ from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.stated_floor import NEW_POSES, each_left_out, mean_square, with_intervals
-from elastocal.identification.noise_summary import (
-    BEYOND,
-    TOO_LARGE_IN_COMMON,
-    less_in_common,
-    single_readings,
-)
+from elastocal.identification import noise_summary
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
 from elastocal.text import rounded
@@ -477,18 +472,17 @@ def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Ite
     """Where the tracker's noise is beyond what chance makes of the stated one, and repeats or
     markers of one pose, where they tell, say so too; or what is stated is far too large."""
     base, good, dof = dataset.base, ~data.faulty, max(data.n_rows - data.X.shape[2], 1)
-    observed, residual = subset(base.observed, good), base.residual.reshape(len(good), -1)[good]
-    common = less_in_common(observed, residual.ravel(), base.model.cell, len(base.x))
+    readings = subset(base.observed, good), base.residual.reshape(len(good), -1)[good].ravel()
+    common = noise_summary.less_in_common(*readings, base.model.cell, len(base.x))
     if common is not None:
-        yield TOO_LARGE_IN_COMMON.format(common)
+        yield noise_summary.TOO_LARGE_IN_COMMON.format(common)
         return
-    wrong = factor**2 * dof >= special.chdtri(dof, BEYOND) and base.stated is not None
-    if wrong and observed.kind != "position":
-        wrong = factor > STATED_HIGH
-    elif wrong and base.stated is not None:
-        single = single_readings(observed, residual.ravel(), base.stated[good], len(base.x))
-        wrong = single is None or single.above
-    if wrong or factor < STATED_LOW:
+    wrong, beyond = factor < STATED_LOW, special.chdtri(dof, noise_summary.BEYOND)
+    if base.stated is not None and factor**2 * dof >= beyond:
+        single = noise_summary.single_readings(*readings, base.stated[good], len(base.x))
+        positions = base.observed.kind == "position"
+        wrong = single is None or single.above if positions else factor > STATED_HIGH
+    if wrong:
         yield (
             f"the readings scatter {rounded(factor, 2)} times as much as cell or table state; "
             "correct [tracker], the stated noise"

@@ -11,13 +11,9 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import option
+from elastocal.identification import noise_summary
 from elastocal.identification.mistakes import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
-from elastocal.identification.noise_summary import (
-    TOO_LARGE_IN_COMMON,
-    NoiseSize,
-    less_in_common,
-)
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
@@ -423,13 +419,13 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
             "stated_noise_too_small", remedy,
             ratio=single.ratio, dof=single.dof, by=single.by, p_rest=single.rest,
         )  # fmt: skip
-    observed, doing = result.observations, None
-    spent = len(observed.value) - result.dof
-    share = less_in_common(observed, result.residual, result.model.cell, spent)
-    if share is not None:
-        say, doing = _care if share < FAR_TOO_LARGE else _note, ""
-        yield say("common_noise_too_large", TOO_LARGE_IN_COMMON.format(share), ratio=share)
-    say, kind = _good, "residual_agrees_with_stated_noise"
+    say, kind, doing = _good, "residual_agrees_with_stated_noise", None
+    readings = result.observations, result.residual
+    spent = len(result.residual) - result.dof
+    if (share := noise_summary.less_in_common(*readings, result.model.cell, spent)) is not None:
+        doing, remedy = "", noise_summary.TOO_LARGE_IN_COMMON.format(share)
+        far = _care if share < FAR_TOO_LARGE else _note
+        yield far("common_noise_too_large", remedy, ratio=share)
     if ratio > high and not (single is not None and single.explains):
         say, kind, doing = _care, "residual_above_stated_noise", _lacking(result)
     elif ratio > high:
@@ -550,7 +546,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
             yield _care("scatter_not_counted", remedy, part=test.part, p=test.p)
 
 
-def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -> str:
+def _beside_stated(key: str, found: list[tuple[noise_summary.NoiseSize, float]], fits: bool) -> str:
     """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
     said = listed([f"{rounded(1e6 * size)}" for _, size in found if size])
     if not said:

@@ -129,15 +129,11 @@ def noise_floor_lines(
     if noise.shared > 0:
         times = say.significant(noise.shared, 2)
         yield f"Visits of a configuration have a common scatter of {times} times that."
-    if noise.drift > 0:
-        drift = say.length(noise.drift)
-        yield f"The drift of {drift} that [noise] of the cell states counts as noise."
-    if noise.configuration > 0:
-        common = say.length(noise.configuration)
-        yield (
-            f"The deviation of {common} per axis that [noise] of the cell states as common to a "
-            "configuration counts as noise."
-        )
+    common = "deviation common to a configuration"
+    for what, size in (("drift", noise.drift), (common, noise.configuration)):
+        if size > 0:
+            told = f"The {what} of {say.length(size)} that [noise] of the cell states"
+            yield f"{told} counts as noise."
     if noise.pure_error is None:
         yield "No repeats: the noise is estimated from residuals only."
     else:
