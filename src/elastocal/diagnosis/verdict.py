@@ -408,11 +408,8 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
             )
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
-
-    def order(c: Candidate) -> tuple[bool, float, float]:
-        return c.detectable < DETECTABLE and c.score <= 0, -c.probability, -c.score
-
-    return tuple(sorted(best.values(), key=order))
+    likeliest = sorted(best.values(), key=lambda c: (-c.probability, -c.score))
+    return tuple(sorted(likeliest, key=lambda c: c.detectable < DETECTABLE and c.score <= 0))
 
 
 def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:

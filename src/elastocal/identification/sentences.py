@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from string import Formatter
 from typing import Any
 
 from elastocal.errors import option
@@ -82,15 +81,6 @@ def made(severity: Severity, kind: str, remedy: str | None = None, /, **numbers:
     return Finding(kind, severity, numbers, remedy)
 
 
-class Words(Formatter):
-    """Numbers of so many digits (".3g") are `rounded`."""
-
-    def format_field(self, value: Any, spec: str) -> str:
-        if spec[:1] == "." and spec[2:] == "g":
-            return rounded(value, int(spec[1]))
-        return str(super().format_field(value, spec))
-
-
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
     "copied_readings": (
@@ -112,7 +102,7 @@ SENTENCES = {
         "it. Measure more configurations."
     ),
     "ill_conditioned": (
-        "Ill-conditioned (condition number {condition_number:.2g} after scaling): the data barely "
+        "Ill-conditioned (condition number {condition_number} after scaling): the data barely "
         "separate {parameters}. {remedy}"
     ),
     "residual_above_stated_noise": (
@@ -126,7 +116,7 @@ SENTENCES = {
         "use {count}intervals by cr2; measure more configurations rather than more repeats."
     ),
     "drift": (
-        "Base or tracker drift during the session ({sigma_um:.3g} µm in each direction, by the "
+        "Base or tracker drift during the session ({sigma_um} µm in each direction, by the "
         "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
         "held out. {remedy}"
     ),
@@ -135,14 +125,14 @@ SENTENCES = {
         "p = {p:.1g}). Weights and intervals account for it. {remedy}"
     ),
     "beyond_bound": (
-        "{parameter} = {value:.3g} ± {std:.2g} {unit} lies beyond its physical bound {bound:g}: "
-        "{remedy}"
+        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound:g}: {remedy}"
     ),
     "many_faulty_readings": (
         "Too many for reading errors: a shifted block of readings, or a missing effect in some "
         "load state, marker or region. {remedy}"
     ),
 }
+DIGITS = {"condition_number": 2, "sigma_um": 3, "value": 3, "std": 2}  # of numbers in them
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
     "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
@@ -178,7 +168,7 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
             k: ", ".join(one if isinstance(one, str) else f"{rounded(one)}" for one in v)
-            if isinstance(v, tuple) else v
+            if isinstance(v, tuple) else rounded(v, DIGITS[k]) if k in DIGITS else v
             for k, v in f.numbers.items()
         }  # fmt: skip
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
@@ -190,14 +180,14 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if f.kind == "copied_readings":
             words["lines"] = _runs(result.copies)
         if len(same) == 1:
-            yield Words().format(SENTENCES[f.kind], **words)
+            yield SENTENCES[f.kind].format(**words)
             return
         pairs = (
             f"{rounded(o.numbers.get('value', 0))} ± {rounded(o.numbers.get('std', 0), 2)}"
             for o in same
         )
         words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
-        yield Words().format(OF_SEVERAL[f.kind], **words, values=listed(pairs, 4))
+        yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
 
 
 def _runs(lines: Iterable[int]) -> str:

@@ -12,14 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import (
-    InputError,
-    InsufficientDataError,
-    check_known,
-    option,
-    require,
-    wish,
-)
+from elastocal.errors import InputError, InsufficientDataError, check_known, option, require, wish
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
 from elastocal.model.manipulator import Model

@@ -331,18 +331,16 @@ class Moves:
         return f" (in the way: {', '.join(names)})" if names else ""
 
 
-def approach_signs(
-    chain: Chain, q: Array, lower: Array, upper: Array, overshoot: float
-) -> IntArray:
-    """Directions (N, 2, n) of the last motion of each joint, from q − sign · overshoot: first
+def approach_signs(chain: Chain, q: Array, lower: Array, upper: Array, by: float) -> IntArray:
+    """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first
     upwards (+1), then down (−1), so that backlash and hysteresis show; both times from the same
     side where the other is beyond the limits [lower, upper] (n,)."""
-    below, above = q - overshoot >= lower, q + overshoot <= upper
+    below, above = q - by >= lower, q + by <= upper
     if not (below | above).all():
         i, j = (int(v) for v in np.argwhere(~(below | above))[0])
         raise InputError(
             f"pose {i + 1}: joint {j + 1} has no room on either side of {told(chain, j, q[i, j])} "
-            f"for an overshoot of {told(chain, j, overshoot)}; lower overshoot_deg in "
+            f"for an overshoot of {told(chain, j, by)}; lower overshoot_deg in "
             "[design.motion], or widen its limits"
         )
     return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)

@@ -421,10 +421,8 @@ def next_lines(found: NextPoses) -> Told:
         now = f"≤ {position_error(found.reached)} rms at new poses (95 %){limit}"
         alone = None if found.calibration is None else found.calibration.verdict.at
         if alone is not None and alone > APART * found.reached:
-            now += (
-                f"; identify says ≤ {position_error(alone)}, as it takes all scatter beyond the "
-                "noise for what the model may lack, and diagnose finds that improbable"
-            )
+            now += f"; identify says ≤ {position_error(alone)}, as it takes all scatter beyond the "
+            now += "noise for what the model may lack, and diagnose finds that improbable"
 
     def both(before: float, after: float) -> str:
         begun = position_error(before) if math.isfinite(before) else "an unknown error"
