@@ -50,6 +50,12 @@ def counted(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
+def rounded(value: float, digits: int = 3) -> str:
+    """A number of so many digits as people write it: 1830, not 1.83e+03."""
+    told = f"{value:.{digits}g}"
+    return f"{float(told):.0f}" if "e+0" in told else told
+
+
 def gathered(names: Iterable[str]) -> str:
     """Parameters by their places: "compliance of joints 1, 2 and 5, dx of link 3"."""
     found: dict[tuple[str, str], list[str]] = {}

@@ -13,6 +13,7 @@ import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.model.manipulator import Model
+from elastocal.report.diagnosis_view import noise_floor_lines
 
 AMPLITUDE, LENGTH = 1e-4, 0.07  # rad: an error curve of joints 2 and 3
 
@@ -63,4 +64,8 @@ def test_an_error_curve_is_no_scatter() -> None:
 def test_on_an_arm_that_only_scatters_nothing_is_unexplained(shake: float, common: float) -> None:
     why, true = diagnosed(curves=False, again=0, shake=shake, common=common)
     assert why.gap.unexplained == 0.0 and why.verdict == "nothing_significant"
+    told = "\n".join((*why.warnings, *noise_floor_lines(why.noise, ["revolute"] * 6)))
+    assert ("common to a configuration of 80.0 µm" in told) == (
+        common > 0
+    ) and "correct" not in told
     assert why.gap.noise_floor == pytest.approx(true, rel=0.15)

@@ -18,6 +18,8 @@ from elastocal.measurements import families
 from elastocal.model.dh import DH_FAMILIES
 
 ROOT = Path(__file__).parents[2]
+CAMPAIGN = ROOT / "tests" / "golden" / "inputs" / "campaign"
+IMPORT = f"import {CAMPAIGN}/points.txt {CAMPAIGN}/poses.dat --preset spatialanalyzer --preset kuka"
 PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")
 # Their keys are names of parameters, places, drivers or settings of the arm at hand.
 NAMED_BY_THE_ARM = (
@@ -103,6 +105,8 @@ def test_every_key_of_a_diagnosis_is_on_the_page():
         ("", "Plan of `design`: `plan.json`"),
         ("compensate cell.toml result.json targets.csv", "Targets and commands of `compensate`"),
         ("export cell.toml result.json -o arm.urdf --load 0 0 -98", "Answer of `export`"),
+        ("effects cell.toml", "Effects of `effects`"),
+        (IMPORT, "Answer of `import`"),
     ],
 )
 def test_every_key_of_plans_and_of_what_is_done_with_a_result_is_on_the_page(
@@ -111,7 +115,7 @@ def test_every_key_of_plans_and_of_what_is_done_with_a_result_is_on_the_page(
     monkeypatch.chdir(course.folder)
     answer = Path("extra.json").read_text(encoding="utf-8")
     if command:
-        done = elastocal(*command.split(), "--json", "--quiet")
+        done = elastocal(*command.split(), "--json")
         assert done.exit_code == 0, done.output
         answer = done.stdout
     assert not missing(keys(json.loads(answer)), section(heading))

@@ -10,7 +10,7 @@ import pytest
 from support.calibration import SPRINGS, cell_of, measured, random_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker, Unsteadiness
 from elastocal.errors import InputError
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
@@ -123,6 +123,10 @@ def test_noise_stated_far_too_large_is_no_noise_that_explains_the_residual(clean
     assert "stated noise is too large" in judgement(result).sentence
     slightly = judged(replace(result, noise=replace(result.noise, ratio_to_stated=0.8)))
     assert slightly.finding("residual_below_stated_noise").severity == "note"
+    shared = replace(arm(stated=SIGMA)[0].cell, noise=Unsteadiness(configuration=20 * SIGMA))
+    result = identify(Model.assembled(model.chain, shared), table)
+    assert result.finding("common_noise_too_large").severity == "care"
+    assert "common to a configuration is too large" in judgement(result).sentence
 
 
 # A second look at a fit

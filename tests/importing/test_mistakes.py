@@ -145,7 +145,7 @@ def test_units_mistaken_for_others(tmp_path, readings, length, angle, scale, tur
 @pytest.mark.parametrize(
     ("force", "sigma", "words"),
     [
-        (-2e6, 10, ["forces reach 2e+06 N"]),
+        (-2e6, 10, ["forces reach 2000000 N"]),
         (2600, 10, ["some forces point up"]),
         (-2600, 6000, ["standard deviations reach 6 mm"]),
         (-2600, 10, []),

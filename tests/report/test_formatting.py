@@ -16,6 +16,7 @@ from elastocal.report.blocks import (
     with_ends,
     with_uncertainty,
 )
+from elastocal.text import rounded
 
 
 @pytest.mark.parametrize(
@@ -72,5 +73,5 @@ def test_other_numbers() -> None:
     assert significant(0.00062449) == "0.000624"
     assert significant(53.44, 2) == "53"
     assert significant(4e-9) == "4e-09"
-    assert plain(-0.0) == "0"
+    assert (plain(-0.0), rounded(1834.0, 2), rounded(18.0)) == ("0", "1800", "18")
     assert plain(math.nan) == "–"

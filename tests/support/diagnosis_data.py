@@ -51,44 +51,23 @@ class Fault:
         return self.effect, self.where
 
 
-FAULTS = {
-    f"{f.effect}:{f.where}": f
-    for f in (
-        Fault("encoder_scale", "joint3", {"encoder_scale": 2e-4}),
-        Fault(
-            "gear_eccentricity", "joint2", {"eccentricity_sin": 1e-4, "eccentricity_cos": -1.2e-4}
-        ),
-        Fault(
-            "gear_eccentricity", "joint4", {"eccentricity_sin": 1.5e-4, "eccentricity_cos": -1e-4}
-        ),
-        Fault(
-            "gear_ripple",
-            "joint5",
-            {"ripple_sin": 1e-4, "ripple_cos": 5e-5},
-            {"ripple_order": 81.3},
-        ),
-        Fault("hysteresis", "joint3", {"hysteresis": 1e-4}),
-        Fault("encoder_jump", "joint4", {"jump": 2e-4}, {"jump_time_s": JUMP_TIME}),
-        Fault(
-            "marker_slip",
-            "marker:M2",
-            {"slip_x": 1.5e-4, "slip_y": -1e-4, "slip_z": 8e-5},
-            {"slip_time_s": JUMP_TIME},
-        ),
-        Fault("payload_error", "load", {"payload_scale": 0.05}),
-        Fault(
-            "off_axis_compliance",
-            "joint3",
-            {"off_axis_compliance_x": 1.5e-7, "off_axis_compliance_y": 1e-7},
-        ),
-        Fault(
-            "tracker_distortion",
-            "tracker",
-            {"azimuth_sin": 5e-5, "azimuth_cos": -4e-5, "elevation_sin": 5e-5},
-        ),
-        Fault("thermal_expansion", "link2", {"expansion": 2e-4}, {"time_constant_s": 1200.0}),
-    )
-}
+FAULTS = {f"{f.effect}:{f.where}": f for f in (
+    Fault("encoder_scale", "joint3", {"encoder_scale": 2e-4}),
+    Fault("gear_eccentricity", "joint2", {"eccentricity_sin": 1e-4, "eccentricity_cos": -1.2e-4}),
+    Fault("gear_eccentricity", "joint4", {"eccentricity_sin": 1.5e-4, "eccentricity_cos": -1e-4}),
+    Fault("gear_ripple", "joint5", {"ripple_sin": 1e-4, "ripple_cos": 5e-5},
+          {"ripple_order": 81.3}),
+    Fault("hysteresis", "joint3", {"hysteresis": 1e-4}),
+    Fault("encoder_jump", "joint4", {"jump": 2e-4}, {"jump_time_s": JUMP_TIME}),
+    Fault("marker_slip", "marker:M2", {"slip_x": 1.5e-4, "slip_y": -1e-4, "slip_z": 8e-5},
+          {"slip_time_s": JUMP_TIME}),
+    Fault("payload_error", "load", {"payload_scale": 0.05}),
+    Fault("off_axis_compliance", "joint3",
+          {"off_axis_compliance_x": 1.5e-7, "off_axis_compliance_y": 1e-7}),
+    Fault("tracker_distortion", "tracker",
+          {"azimuth_sin": 5e-5, "azimuth_cos": -4e-5, "elevation_sin": 5e-5}),
+    Fault("thermal_expansion", "link2", {"expansion": 2e-4}, {"time_constant_s": 1200.0}),
+)}  # fmt: skip
 
 
 def cell(

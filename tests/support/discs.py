@@ -1,6 +1,7 @@
 """A stand-in for the cell: round obstacles in a plane of two joints, and brute force over it."""
 
 from itertools import pairwise, permutations
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -9,10 +10,10 @@ class Discs:
     """Moves are free where they stay out of discs (k, 3) of x, y, radius; the load adds `grow`
     to the radii.  Counts what it is asked."""
 
-    named = ()  # what it says is in the way
+    chain = SimpleNamespace(kinds=("revolute", "revolute"))
 
-    def __init__(self, discs=(), grow=0.0):
-        self.discs, self.grow, self.asked = np.reshape(discs, (-1, 3)), grow, []
+    def __init__(self, discs=(), grow=0.0, named=()):  # what it says is in the way
+        self.discs, self.grow, self.named, self.asked = np.reshape(discs, (-1, 3)), grow, named, []
 
     def paths_free(self, q_from, q_to, loaded):
         self.asked += [(tuple(a), tuple(b), loaded) for a, b in zip(q_from, q_to, strict=True)]

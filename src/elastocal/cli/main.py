@@ -40,8 +40,7 @@ def options(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
     ] = False,
     backend: Annotated[
-        str | None,
-        typer.Option(help="What evaluates the model: auto or numpy; default: auto."),
+        str | None, typer.Option(help="What evaluates the model: auto or numpy; default: auto.")
     ] = None,
 ) -> None:
     """Calibrate industrial robot arms and explain what is left over."""

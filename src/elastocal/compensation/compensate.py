@@ -46,7 +46,7 @@ from elastocal.model.rigid import (
 )
 from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.tables import column, csv_text
-from elastocal.text import listed, plain, some
+from elastocal.text import listed, plain, rounded, some
 from elastocal.units import Array, BoolArray, IntArray
 
 # Targets: where the tool is to be, and in which frame that is stated.
@@ -456,8 +456,9 @@ def _check_unit(targets: Targets, position: Array, chain: Chain, T: Array) -> No
         if far.any() and (out & (np.linalg.norm(meant, axis=1) < 2 * reach)).all():
             raise InputError(
                 f"{targets.table.source}: wrong unit? All targets ({len(far)}) lie up to "
-                f"{1e3 * far.max():.4g} mm from the origin of the {targets.frame} frame, and the "
-                f"arm reaches {1e3 * reach:.4g} mm: the numbers seem 1000 times too {told}"
+                f"{rounded(1e3 * far.max(), 4)} mm from the origin of the {targets.frame} frame, "
+                f"and the arm reaches {rounded(1e3 * reach, 4)} mm: the numbers seem 1000 times "
+                f"too {told}"
             )
 
 
@@ -579,7 +580,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     unknown, std = sure.unknown[reached], sure.std[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
     if len(unknown) and rms > max(WORTH_TELLING, float(np.sqrt(np.mean(std**2)))):
-        size = f"{rms * 1e6:.0f} µm" if rms < 0.9995e-3 else f"{rms * 1e3:.4g} mm"
+        size = f"{rms * 1e6:.0f} µm" if rms < 0.9995e-3 else f"{rounded(rms * 1e3, 4)} mm"
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
             f"this point depends: typical deviations of them would move it by {size} rms, which "

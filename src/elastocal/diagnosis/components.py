@@ -201,10 +201,6 @@ class Pool:
         slope = self.precision @ sizes
         return float(sizes @ slope), 2 * slope
 
-    def penalties(self, sizes: Array) -> Array:
-        """By how much (K,) −log prior falls where a component is left out."""
-        return np.asarray((self.precision @ sizes) ** 2 / np.diag(self.precision) / 2)
-
 
 def _cost(n: int, k: int) -> float:
     """Nats of k components at n places, and of the search for their sizes."""
@@ -491,7 +487,9 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     """Components that stay: not the worst of those that do not earn their cost, nor those that are
     next to nothing; only these go where not `strict`, since under a noise that does not suit them
     the others may earn too little."""
-    earned = problem.earned(problem.factored(at)[0])[0] - problem.pool.penalties(at.size)
+    prior = problem.pool.precision  # −log prior falls where a component is left out
+    earned = problem.earned(problem.factored(at)[0])[0]
+    earned = earned - (prior @ at.size) ** 2 / np.diag(prior) / 2
     spare = earned - (problem.pool.costs_of(earned) if strict else MOST_AT_ONCE)
     stays = np.array([c.given for c in problem.components], dtype=bool)
     poor = (spare < 0) & ~stays

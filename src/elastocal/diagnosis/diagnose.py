@@ -53,7 +53,7 @@ from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
 from elastocal.plugin_loader import is_plugin_file
-from elastocal.text import did_you_mean, listed
+from elastocal.text import did_you_mean, listed, rounded
 from elastocal.units import BoolArray, Progress
 
 # Keys of the cell file, in whatever table, whose texts are paths.
@@ -190,7 +190,7 @@ def diagnose(
     names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "none"
     told = (
         f"{lies}. With {lies.axis} up the verdict is {upright.verdict} (effects: {names}), and the "
-        f"held-out error falls to {after:.3g} µm instead of {before:.3g} µm"
+        f"held-out error falls to {rounded(after)} µm instead of {rounded(before)} µm"
     )
     if after > (1 - PAYS) * before:
         told = f"{lies}. Here it makes no difference"

@@ -322,8 +322,9 @@ class NoiseFloor:
     single reading.  `repeatability` (joints,) in rad or m: scatter of each joint from visit to
     visit.  `shared`: scatter common to all visits of a configuration, as a multiple of it,
     `shared_by_joint` (joints,) that of each joint.  `pure_error` (m): rms per axis within repeats,
-    `near_repeats`: what readings at nearly the same pose differ by, None without.  `drift` (m):
-    what the cell states of it and nobody has to find.
+    `near_repeats`: what readings at nearly the same pose differ by, None without.  `drift` (m)
+    and `configuration` (m per axis, common to one): what the cell states of them and nobody has to
+    find.
     """
 
     stated: bool
@@ -337,6 +338,7 @@ class NoiseFloor:
     faulty: tuple[FaultyReading, ...] = ()
     near_repeats: NearRepeats | None = None
     drift: float = 0.0
+    configuration: float = 0.0
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -572,7 +574,7 @@ NORMAL_95 = 1.959964
 
 def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:
     near, joints = noise.near_repeats, zip(noise.repeatability, model.chain.kinds, strict=True)
-    return _in_um(noise, "reading_sigma", "drift", "pure_error") | {
+    return _in_um(noise, "reading_sigma", "drift", "configuration", "pure_error") | {
         "ratio_to_stated": noise.ratio_to_stated if noise.stated else None,
         "repeatability": [
             {"where": f"joint{i}", "value": value, "unit": "rad" if kind == "revolute" else "m"}

@@ -73,6 +73,12 @@ class DiagnosisData:
         return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
 
     @property
+    def common(self) -> float:
+        """The deviation in m, per axis, that the cell states as common to a configuration."""
+        shown = self.base.observed.kind in ("position", "pose")
+        return self.base.model.cell.noise.configuration if shown else 0.0
+
+    @property
     def table(self) -> Measurements:
         return self.base.observed.table
 

@@ -36,7 +36,7 @@ from elastocal.planning.execution import nearest_first
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import travel_times
 from elastocal.simulation import simulate
-from elastocal.text import counted
+from elastocal.text import counted, rounded
 from elastocal.units import Array, BoolArray, Progress
 
 # What may be measured next: poses in all load states, from either side, at once or later.
@@ -474,7 +474,7 @@ def _pull_notes(
     )  # fmt: skip
     if apart:
         notes.append(
-            f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a "
+            f"a horizontal pull of {rounded(newton)} N along x and along y, e.g. by a rope over a "
             f"pulley, would separate {apart}: measure poses under it, too"
         )
     if pulled and n:
@@ -486,7 +486,7 @@ def _pull_notes(
         if reached > max(after, as_many) + GAIN:
             poses = counted(len(chosen), "pose")
             notes.append(
-                f"pull horizontally: {poses}, measured also under {newton:.3g} N along x and "
+                f"pull horizontally: {poses}, measured also under {rounded(newton)} N along x and "
                 "along y, e.g. by a rope over a pulley, would raise the probability from "
                 f"{suspects.covered * after:.2f} to {suspects.covered * reached:.2f}"
             )

@@ -243,10 +243,7 @@ class SupportedFloor:
         self.instrument = above * mean_square(data, stated)
         variance = max(fitted**2 - self.joints.sum() - self.instrument, 0.0)
         total, dof = repeats(dataset, come_back=True)
-        # What the cell states as common to a configuration, per axis.
-        seen = dataset.base.observed.kind in ("position", "pose")
-        alike = dataset.base.model.cell.noise.configuration**2 if seen else 0.0
-        self.near_repeats = near_repeats(dataset, data, self.at)
+        self.near_repeats, alike = near_repeats(dataset, data, self.at), dataset.common**2
         common = min(size * alike, variance)
         if near := self.near_repeats:
             total += max(near.scatter**2 - alike, 0.0) * near.independent * size
@@ -286,6 +283,7 @@ class SupportedFloor:
             tuple(noise.joint.tolist()), noise.shared_by_all,
             float(np.sqrt(square / dof)) if dof else None,
             tuple(noise.shared.tolist()), faulty, self.near_repeats, dataset.drift,
+            dataset.common,
         )  # fmt: skip
 
     @property

@@ -36,9 +36,10 @@ from elastocal.diagnosis.effect_search import (
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
 from elastocal.diagnosis.noise_floor import NEW_POSES, each_left_out, mean_square, with_intervals
-from elastocal.identification.noise_summary import BEYOND, single_readings
+from elastocal.identification import noise_summary
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
+from elastocal.text import rounded
 from elastocal.units import Array, BoolArray
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
@@ -374,7 +375,8 @@ OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the re
 
 
 def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
-    """Every hypothesis with its probability: in the slot where it is likeliest."""
+    """Every hypothesis with its probability: in the slot where it is likeliest.  Last those that
+    the data do not show at their typical size and do not ask for: they have their prior alone."""
     found = few.selected
     best: dict[tuple[str, str], Candidate] = {}
     alone = zip(dataset.hypotheses, found.alone.distance.tolist(), strict=False)
@@ -393,7 +395,8 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
             )
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
-    return tuple(sorted(best.values(), key=lambda c: (-c.probability, -c.score)))
+    likeliest = sorted(best.values(), key=lambda c: (-c.probability, -c.score))
+    return tuple(sorted(likeliest, key=lambda c: c.detectable < DETECTABLE and c.score <= 0))
 
 
 def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
@@ -415,12 +418,9 @@ def warnings(
     dataset: DiagnosisData, found: SelectedEffects, suspects: BoolArray, noise: NoiseValues
 ) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
-    out, data = [], found.chosen.data
-    if data.stated and _stated_wrong(dataset, data, noise.factor):
-        out.append(
-            f"the readings scatter {noise.factor:.2g} times as much as cell or table state; "
-            "correct [tracker], the stated noise"
-        )
+    out, data = list[str](), found.chosen.data
+    if data.stated:
+        out += _stated_wrong(dataset, data, noise.factor)
     faulty = (data.left_out & ~dataset.blocks.absent).sum() / max((~dataset.blocks.absent).sum(), 1)
     if faulty > FAULTY_SHARE:
         out.append(
@@ -452,18 +452,22 @@ def warnings(
     return tuple(out)
 
 
-def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> bool:
-    """Whether the tracker's noise is beyond what chance makes of the stated one, and repeats or
-    markers of one pose, where they tell, say so too; or stated far too large."""
-    if factor < STATED_LOW:
-        return True
+def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Iterator[str]:
+    """Where the tracker's noise is beyond what chance makes of the stated one, and repeats or
+    markers of one pose, where they tell, say so too; or what is stated is far too large."""
     base, good, dof = dataset.base, ~data.faulty, max(data.n_rows - data.X.shape[2], 1)
-    if factor**2 * dof < special.chdtri(dof, BEYOND) or base.stated is None:
-        return False
-    if base.observed.kind != "position":
-        return factor > STATED_HIGH
-    residual = base.residual.reshape(len(good), -1)[good].ravel()
-    single = single_readings(
-        subset(base.observed, good), residual, base.stated[good], len(base.x)
-    )  # fmt: skip
-    return single is None or single.above
+    readings = subset(base.observed, good), base.residual.reshape(len(good), -1)[good].ravel()
+    common = noise_summary.less_in_common(*readings, base.model.cell, len(base.x))
+    if common is not None:
+        yield noise_summary.TOO_LARGE_IN_COMMON.format(common)
+        return
+    wrong, beyond = factor < STATED_LOW, special.chdtri(dof, noise_summary.BEYOND)
+    if base.stated is not None and factor**2 * dof >= beyond:
+        single = noise_summary.single_readings(*readings, base.stated[good], len(base.x))
+        positions = base.observed.kind == "position"
+        wrong = single is None or single.above if positions else factor > STATED_HIGH
+    if wrong:
+        yield (
+            f"the readings scatter {rounded(factor, 2)} times as much as cell or table state; "
+            "correct [tracker], the stated noise"
+        )

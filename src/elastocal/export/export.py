@@ -34,7 +34,7 @@ from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import XmlFile, check_urdf, tree_of
 from elastocal.tables import csv_text
-from elastocal.text import did_you_mean, json_text, listed, plain
+from elastocal.text import did_you_mean, json_text, listed, plain, rounded
 from elastocal.units import Array, microns, pose_at, rpy_from_rotation
 
 ENDINGS = {
@@ -349,7 +349,7 @@ class _Writing:
             told += f", at {conditions.time:g} s"
         if self.kept.fitted and conditions.visits is not None:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
-            low, high = f"{sizes.min():.4g}", f"{sizes.max():.4g}"
+            low, high = f"{rounded(sizes.min(), 4)}", f"{rounded(sizes.max(), 4)}"
             span = high if low == high else f"{low} to {high}"
             told += f", fitted where it was measured, under {span} N, {self.done.base_told}"
         return told
@@ -481,12 +481,12 @@ class _Writing:
         apart, beta = checked(dh_csv(lines)), None
         comments = [
             f"{self.note}; {convention} convention: {FORMULA[convention]}",
-            f"rounding of this table: {apart * 1e6:.2g} um at the flange",
+            f"rounding of this table: {rounded(apart * 1e6, 2)} um at the flange",
         ]
         if any(row[4] for _, _, row in lines):
             four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
             beta = checked(dh_csv(four), largest=np.inf)
-            comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
+            comments.append(f"without the column beta_rad: {rounded(beta * 1e6)} um")
         text = dh_csv(lines, comments)
         checked(text)
         done = replace(self.done, without_beta=beta)
@@ -503,8 +503,8 @@ def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
 def _accepted(distance: float, largest: float) -> float:
     if not distance <= largest:
         raise ElastocalError(
-            f"the written file, read back, is {distance * 1e6:.3g} µm from the model and was not "
-            "kept; please report this robot description"
+            f"the written file, read back, is {rounded(distance * 1e6)} µm from the model and was "
+            "not kept; please report this robot description"
         )
     return distance
 

@@ -11,9 +11,9 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import option
+from elastocal.identification import noise_summary
 from elastocal.identification.mistakes import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
-from elastocal.identification.noise_summary import NoiseSize
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
@@ -35,7 +35,7 @@ from elastocal.model.effects.compliances import (
 )
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
-from elastocal.text import counted, listed
+from elastocal.text import counted, listed, rounded
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.
@@ -210,8 +210,9 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
         else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
     )
     remedy = (
-        f"Check the unit of the loads: the compliances are {ratio:.2g} times those expected from "
-        f"{by}, as where {cause}. If so, {undo} force_x_N, force_y_N and force_z_N by 9.81."
+        f"Check the unit of the loads: the compliances are {rounded(ratio, 2)} times those "
+        f"expected from {by}, as where {cause}. If so, {undo} force_x_N, force_y_N "
+        "and force_z_N by 9.81."
     )
     yield (_care if given else _note)("load_unit", remedy, ratio=ratio, by=by, unit=unit)
 
@@ -305,7 +306,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
             "scale bar is wrong by so much."
             if other
             else "Look for what scales the readings: the size stated of a tag or scale bar, or a "
-            f"unit. Multiplied by {1 / scale:.4g} they have the lengths of the robot's file."
+            f"unit. Multiplied by {rounded(1 / scale, 4)} they have the robot's file's lengths."
         )
         yield _care("scale", remedy, readings_over_file=scale, likely=likely)
         return
@@ -411,14 +412,20 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     if single is not None and single.above:
         times = ratio if single.explains else single.ratio
         remedy = (
-            f"Correct [tracker]: by {single.by} single readings scatter {times:.2g} times as much "
-            "as cell or table state."
+            f"Correct [tracker]: by {single.by} single readings scatter {rounded(times, 2)} times "
+            "as much as cell or table state."
         )
         yield _note(
             "stated_noise_too_small", remedy,
             ratio=single.ratio, dof=single.dof, by=single.by, p_rest=single.rest,
         )  # fmt: skip
     say, kind, doing = _good, "residual_agrees_with_stated_noise", None
+    readings = result.observations, result.residual
+    spent = len(result.residual) - result.dof
+    if (share := noise_summary.less_in_common(*readings, result.model.cell, spent)) is not None:
+        doing, remedy = "", noise_summary.TOO_LARGE_IN_COMMON.format(share)
+        far = _care if share < FAR_TOO_LARGE else _note
+        yield far("common_noise_too_large", remedy, ratio=share)
     if ratio > high and not (single is not None and single.explains):
         say, kind, doing = _care, "residual_above_stated_noise", _lacking(result)
     elif ratio > high:
@@ -539,9 +546,9 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
             yield _care("scatter_not_counted", remedy, part=test.part, p=test.p)
 
 
-def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -> str:
+def _beside_stated(key: str, found: list[tuple[noise_summary.NoiseSize, float]], fits: bool) -> str:
     """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
-    said = listed([f"{1e6 * size:.3g}" for _, size in found if size])
+    said = listed([f"{rounded(1e6 * size)}" for _, size in found if size])
     if not said:
         return f"State it as [noise] {key} in the cell for design and simulate."
     if all(size.agrees_with(stated) for size, stated in found):

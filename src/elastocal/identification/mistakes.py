@@ -27,7 +27,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.text import listed
+from elastocal.text import listed, rounded
 from elastocal.units import Array, IntArray
 
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
@@ -83,7 +83,7 @@ def nominal_fit(
     for words, other in chain_of(of_columns, _of_rows(rigid, table)):
         left = _errors(rigid, other)[1]
         if left < near:
-            near, best = left, words.format(f"{left * 1e3:.3g} mm")
+            near, best = left, words.format(f"{rounded(left * 1e3)} mm")
         if near <= POOR:
             break
     better = near < far / BETTER
@@ -93,8 +93,8 @@ def nominal_fit(
             "columns, one or two of them, nor rows that have shifted mend that: check the robot of "
             "the cell, offsets of joints, and which joint values belong to which point"
         )
-    said = f"the readings fit the nominal arm only to {far * 1e3:.3g} mm{';' if better else ','}"
-    return NominalFit(error, f"{said} {best}", better and near <= POOR)
+    said = f"the readings fit the nominal arm only to {rounded(far * 1e3)} mm"
+    return NominalFit(error, f"{said}{';' if better else ','} {best}", better and near <= POOR)
 
 
 def _some(table: Measurements) -> Measurements:
@@ -134,9 +134,9 @@ def rotations_off(angles: Array, of: str) -> str:
     if angle <= POOREST:
         return ""
     return (
-        f"the rotations are {np.degrees(angle):.3g}° (median) from {of}; check the order of qw, "
-        "qx, qy, qz (rx, ry, rz are a rotation vector, not Euler angles), and that they turn the "
-        "target's axes into the tracker's"
+        f"the rotations are {rounded(np.degrees(angle))}° (median) from {of}; check the order of "
+        "qw, qx, qy, qz (rx, ry, rz are a rotation vector, not Euler angles), and that they turn "
+        "the target's axes into the tracker's"
     )
 
 
@@ -262,7 +262,7 @@ def _of_positions(
         return position * unit[0], [f"if positions were {unit[1]}", *words]
     if abs(scale - 1) > SCALED:
         cause = ANOTHER if abs(scale - 1) > OF_A_TARGET else SCALE
-        words.append(f"with all positions {scale:.4g} times as far apart ({cause})")
+        words.append(f"with all positions {rounded(scale, 4)} times as far apart ({cause})")
         return position * scale, words
     return position, words
 
@@ -448,12 +448,13 @@ def refuse_nonsense(
         return
     # Of those set apart too: beside them the few that fit say nothing.
     error, rms = every_off
-    most = f", {share:.0%} of them more than {POOREST * length:.2g} m," if share > FEW else ""
-    value = f", whose {beyond[0][0]} is {beyond[0][1]:.3g} m" if beyond else ""
+    beyond_all = f", {share:.0%} of them more than {rounded(POOREST * length, 2)} m,"
+    most = beyond_all if share > FEW else ""
+    value = f", whose {beyond[0][0]} is {rounded(beyond[0][1])} m" if beyond else ""
     raise InsufficientDataError(
-        f"{table.source}: after the fit the readings are {error:.3g} m (median) and {rms:.3g} m "
-        f"(rms){most} from the model{value}, which no arm of {length:.3g} m could be; "
-        f"{_cause(every, fit)}"
+        f"{table.source}: after the fit the readings are {rounded(error)} m (median) and "
+        f"{rounded(rms)} m (rms){most} from the model{value}, which no arm of {rounded(length)} m "
+        f"could be; {_cause(every, fit)}"
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.noise_choice import (
     NoiseFit,
@@ -109,6 +110,34 @@ def _of_bodies(observed: Observations, root: Array, e: Array, visit: IntArray) -
         dof += len(own) - Q.shape[1]
     markers = len(np.unique(table.marker[lead]))
     return square, dof - max(3 * markers - 6, min(markers - 1, 1))
+
+
+TOO_LARGE_IN_COMMON = (
+    "Configurations scatter {:.2g} times as much as [noise] configuration_um of the cell states: "
+    "correct it, for behind noise stated too large a missing effect does not show."
+)
+
+
+def less_in_common(observed: Observations, residual: Array, cell: Cell, spent: int) -> float | None:
+    """Scatter of the mean residual of each configuration in units of what the cell states of it;
+    None where chance makes it as little, or what is stated is mostly that of single readings.
+
+    The `spent` parameters are taken to have followed these means alone.
+    """
+    common, stated = cell.noise.configuration, stated_by_observation(observed, cell.tracker)
+    if stated is None or not common or observed.kind not in ("position", "pose"):
+        return None
+    of = numbered(observed.configuration)
+    count = np.bincount(of)[:, None]
+    mean, own = np.zeros((len(count), 3)), np.zeros((len(count), 3, 3))
+    np.add.at(mean, of, residual.reshape(len(of), -1)[:, :3])
+    np.add.at(own, of, stated[:, :3, :3])
+    own, dof = own / count[:, None] ** 2, mean.size - spent
+    if dof < 1 or common**2 < np.trace(own, axis1=1, axis2=2).mean() / 3:
+        return None
+    e = inverse_factor(own + common**2 * np.eye(3)) @ (mean / count)[..., None]
+    square = float((e**2).sum())
+    return math.sqrt(square / dof) if square < special.chdtri(dof, 1 - BEYOND) else None
 
 
 # Lack of fit: do configurations scatter more than repeats of one configuration?

@@ -45,7 +45,7 @@ from elastocal.model.calibrated import (
     tool_point,
 )
 from elastocal.model.observations import COMPONENTS, observe
-from elastocal.text import plain
+from elastocal.text import plain, rounded
 from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
@@ -133,7 +133,7 @@ class Combination:
         first, *rest = self.terms.items()
         text = first[0]
         for name, factor in rest:
-            number = f"{abs(factor):.4g}"
+            number = f"{rounded(abs(factor), 4)}"
             size = "" if number == "1" else f"{number}·"
             text += f" {'-' if factor < 0 else '+'} {size}{deviation(name, self.held.get(name))}"
         return text
@@ -391,8 +391,9 @@ class Calibration(scrutiny.FoundFit, Result):
             if name not in found:
                 raise UnknownNameError.of("limit", name, found)
             if most is not None and not found[name] <= most:
-                value = f"{found[name] * 1e6:.3g} µm" if math.isfinite(found[name]) else "not known"
-                told.append(f"{name}: {value} where at most {most * 1e6:.3g} µm is required")
+                finite = math.isfinite(found[name])
+                value = f"{rounded(found[name] * 1e6)} µm" if finite else "not known"
+                told.append(f"{name}: {value} where at most {rounded(most * 1e6)} µm is required")
         return tuple(told)
 
     def certificate(

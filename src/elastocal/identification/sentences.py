@@ -8,7 +8,7 @@ from typing import Any
 from elastocal.errors import option
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
-from elastocal.text import counted, gathered, listed
+from elastocal.text import counted, gathered, listed, rounded
 
 # What to do about a finding.
 
@@ -102,7 +102,7 @@ SENTENCES = {
         "it. Measure more configurations."
     ),
     "ill_conditioned": (
-        "Ill-conditioned (condition number {condition_number:.1e} after scaling): the data barely "
+        "Ill-conditioned (condition number {condition_number} after scaling): the data barely "
         "separate {parameters}. {remedy}"
     ),
     "residual_above_stated_noise": (
@@ -116,7 +116,7 @@ SENTENCES = {
         "use {count}intervals by cr2; measure more configurations rather than more repeats."
     ),
     "drift": (
-        "Base or tracker drift during the session ({sigma_um:.3g} µm in each direction, by the "
+        "Base or tracker drift during the session ({sigma_um} µm in each direction, by the "
         "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
         "held out. {remedy}"
     ),
@@ -125,14 +125,14 @@ SENTENCES = {
         "p = {p:.1g}). Weights and intervals account for it. {remedy}"
     ),
     "beyond_bound": (
-        "{parameter} = {value:.3g} ± {std:.2g} {unit} lies beyond its physical bound {bound:g}: "
-        "{remedy}"
+        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound:g}: {remedy}"
     ),
     "many_faulty_readings": (
         "Too many for reading errors: a shifted block of readings, or a missing effect in some "
         "load state, marker or region. {remedy}"
     ),
 }
+DIGITS = {"condition_number": 2, "sigma_um": 3, "value": 3, "std": 2}  # of numbers in them
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
     "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
@@ -167,8 +167,8 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
             )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
-            k: ", ".join(one if isinstance(one, str) else f"{one:.3g}" for one in v)
-            if isinstance(v, tuple) else v
+            k: ", ".join(one if isinstance(one, str) else f"{rounded(one)}" for one in v)
+            if isinstance(v, tuple) else rounded(v, DIGITS[k]) if k in DIGITS else v
             for k, v in f.numbers.items()
         }  # fmt: skip
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
@@ -182,7 +182,10 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if len(same) == 1:
             yield SENTENCES[f.kind].format(**words)
             return
-        pairs = (f"{o.numbers.get('value', 0):.3g} ± {o.numbers.get('std', 0):.2g}" for o in same)
+        pairs = (
+            f"{rounded(o.numbers.get('value', 0))} ± {rounded(o.numbers.get('std', 0), 2)}"
+            for o in same
+        )
         words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
         yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
 

@@ -17,7 +17,7 @@ from elastocal.model.chain import joint_limits
 from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.text import did_you_mean, listed
+from elastocal.text import did_you_mean, listed, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 # The linear map of readings onto the nominal arm.  With G_i m + t_i the nominal place of a marker
@@ -344,7 +344,7 @@ def check_limits(model: Model, table: Measurements) -> None:
         i = int(np.flatnonzero(wound.any(axis=1))[0])
         raise InputError(
             f"{table.source}, line {table.row[i]}: a joint stands at "
-            f"{np.abs(table.q[i]).max():.4g} rad, more than two turns "
+            f"{rounded(np.abs(table.q[i]).max(), 4)} rad, more than two turns "
             f"({int(wound.any(axis=1).sum())} lines); these are probably degrees in a column "
             "named …_rad: rename it to …_deg"
         )
@@ -362,8 +362,8 @@ def check_limits(model: Model, table: Measurements) -> None:
         )
         raise InputError(
             f"{table.source}, line {table.row[i]}: joint{j + 1} ({model.chain.joints[j].name}) at "
-            f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
-            f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} "
+            f"{rounded(table.q[i, j] * factor, 4)}{unit} is beyond its limits "
+            f"[{rounded(lower[j] * factor, 4)}, {rounded(upper[j] * factor, 4)}]{unit} "
             f"({int(beyond.any(axis=1).sum())} of {len(table)} lines){hint}"
         )
 
@@ -392,8 +392,8 @@ def _check_units(model: Model, table: Measurements) -> None:
     else:
         return
     raise InputError(
-        f"{table.source}: the readings extend over {extent * 1e3:.4g} mm, but the nominal arm's "
-        f"flange moves over {reach * 1e3:.4g} mm at these joint values; {cause}"
+        f"{table.source}: the readings extend over {rounded(extent * 1e3, 4)} mm, but the nominal "
+        f"arm's flange moves over {rounded(reach * 1e3, 4)} mm at these joint values; {cause}"
     )
 
 
@@ -538,7 +538,7 @@ def solved_body(table: Measurements, error: float) -> str | None:
     names = [table.marker_names[m] for m in np.unique(pairs[used])]
     within = max(scatter * 1e6, 0.01)
     return (
-        f"markers {listed(names)} keep their distances to within {within:.2g} µm: they are "
+        f"markers {listed(names)} keep their distances to within {rounded(within, 2)} µm: they are "
         "points of one solved rigid body. A visit carries its pose, six independent "
         f"numbers and not {3 * len(names)}: import the body's pose and set [model] observe = "
         '"pose", or keep one marker'

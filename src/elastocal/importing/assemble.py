@@ -32,7 +32,7 @@ from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted, rounded
 from elastocal.units import Array, IntArray
 
 UNLOADED = ("none", "unloaded", "0")
@@ -217,7 +217,7 @@ def _configurations(points: Records, spread: Array) -> tuple[list[str], list[str
     which = [known.names[c] for c in np.flatnonzero(np.any(span > spread, axis=1))]
     return names, [
         f"{len(which)} configurations have rows whose joint values differ by up to "
-        f"{span.max():.3g} (in the columns' unit): {listed(which, 8)}; if these are "
+        f"{rounded(span.max())} (in the columns' unit): {listed(which, 8)}; if these are "
         "different poses, name them apart"
     ] if which else []  # fmt: skip
 
@@ -272,24 +272,24 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
     # Of each row the first that is so.
     doubts = (
         (
-            (turned > LARGEST_TURN_DEG, f"a joint stands at {turned:.4g}°, more than two turns: "
-             "degrees read as radians? Map q#_deg"),
+            (turned > LARGEST_TURN_DEG, f"a joint stands at {rounded(turned, 4)}°, more than two "
+             "turns: degrees read as radians? Map q#_deg"),
             (several and "q1_deg" in columns and span < SMALLEST_SPREAD_DEG,
-             f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"),
+             f"no joint moves by more than {rounded(span)}°: radians read as degrees? Map q#_rad"),
             (several and still, f"{listed(still)} never moved; is it mapped to the right column?"),
         ),
         (
             (far > FARTHEST_M or spread > LARGEST_SPREAD_M,
-             f"points lie up to {far:.3g} m from the tracker and span {spread:.3g} m: mm read as "
-             "m? Map x_mm, y_mm, z_mm"),
+             f"points lie up to {rounded(far)} m from the tracker and span {rounded(spread)} m: mm "
+             "read as m? Map x_mm, y_mm, z_mm"),
             (table.position is not None and moved > 0.3 and spread < LEAST_SPREAD_M,
-             f"all points lie within {spread * 1e3:.3g} mm although the arm moved: m read as mm? "
-             "Map x_m, y_m, z_m"),
+             f"all points lie within {rounded(spread * 1e3)} mm although the arm moved: m read as "
+             "mm? Map x_m, y_m, z_m"),
         ),
         ((force > LARGEST_FORCE_N,
-          f"forces reach {force:.3g} N, more than any arm carries; check [loads]"),),
+          f"forces reach {rounded(force)} N, more than any arm carries; check [loads]"),),
         ((sigma > LARGEST_SIGMA_M,
-          f"standard deviations reach {sigma * 1e3:.3g} mm; are they in µm?"),),
+          f"standard deviations reach {rounded(sigma * 1e3)} mm; are they in µm?"),),
         ((table.position is not None and bool(np.any(table.force[:, 2] > 0)),
           "some forces point up (+z of the tracker's frame); a hanging load is negative"),),
         ((observe == "deflection" and lonely,
@@ -313,8 +313,8 @@ def beyond_limits(cell: Cell, chain: Chain, table: Measurements, columns: Column
     factor, unit = (180 / np.pi, "°") if chain.kinds[j] == "revolute" else (1e3, " mm")
     return (
         f"{columns['note_source'][i]}: joint{j + 1} ({chain.joints[j].name}) at "
-        f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
-        f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} ({len(rows)} of "
+        f"{rounded(table.q[i, j] * factor, 4)}{unit} is beyond its limits "
+        f"[{rounded(lower[j] * factor, 4)}, {rounded(upper[j] * factor, 4)}]{unit} ({len(rows)} of "
         f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
         "the limits of the cell"
     )

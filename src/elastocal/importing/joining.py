@@ -14,7 +14,7 @@ from elastocal.errors import InputError
 from elastocal.importing import exports
 from elastocal.importing.exports import Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, NamesTable
-from elastocal.text import is_label, listed, quoted
+from elastocal.text import is_label, listed, quoted, rounded
 from elastocal.units import Array, IntArray
 
 HEIGHT = ("zenith", "elevation")
@@ -561,8 +561,8 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
         before, after = (np.where(near, k, stop) for near, k in zip(soon, ends, strict=True))
         moving = np.flatnonzero(good & (np.abs(q[after] - q[before]) > still).any(axis=1))
         if good.any():
-            remarks += [f"clocks differ by {apart[good].max():.3g} s at most, "
-                        f"{np.median(apart[good]):.3g} s in the median"]  # fmt: skip
+            remarks += [f"clocks differ by {rounded(apart[good].max())} s at most, "
+                        f"{rounded(np.median(apart[good]))} s in the median"]  # fmt: skip
         if len(moving):
             warnings.append(
                 f"the arm moved while {len(moving)} points were measured: "
@@ -571,7 +571,7 @@ def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> J
             )
     what = " standstill" * (how == "standstill")
     left_out = tuple(
-        f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest{what}"
+        f"{points.shown(int(i))}, {rounded(apart[i])} s from the nearest{what}"
         for i in np.flatnonzero(~good)
     )
     row = np.where(good, order[first[stop]], -1)

@@ -28,7 +28,7 @@ from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.model.symbolic import SymbolicArm, Total
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted, rounded
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"
@@ -403,7 +403,7 @@ def _check_same(
         off = np.linalg.norm(here[:, 3] - there[:, 3])
         told = [
             "the nominal robot is another one (with every joint at 0.5 rad the flange is "
-            f"{off * 1e3:.4g} mm away)"
+            f"{rounded(float(off) * 1e3, 4)} mm away)"
         ]
     remedy = "" if absent or surplus else ", or identify anew"
     require(

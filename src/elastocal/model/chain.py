@@ -13,7 +13,7 @@ import numpy as np
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
-from elastocal.text import did_you_mean, listed, printable
+from elastocal.text import did_you_mean, listed, printable, rounded
 from elastocal.units import Array
 
 JointKind = Literal["revolute", "prismatic"]
@@ -113,6 +113,10 @@ def finite_ranges(
     return low, np.where(np.isfinite(upper), upper, low + 2 * half)
 
 
+def told(chain: Chain, j: int, value: float) -> str:
+    return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"
+
+
 def joint_index(name: str) -> int:
     """0-based index of "joint3", as of "link3"."""
     return int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
@@ -158,7 +162,7 @@ def plausible(chain: Chain, source: object) -> Chain:
     )
     require(
         whole >= MIN_LENGTH,
-        f"{source}: the links are {whole * 1e3:.3g} mm long together, which no arm is; if its "
+        f"{source}: the links are {rounded(whole * 1e3)} mm long together, which no arm is; if its "
         "lengths are metres, state them so (DH table: d_m, a_m)",
     )
     for i, body in enumerate(chain.masses, start=1):

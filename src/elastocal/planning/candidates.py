@@ -12,16 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import (
-    InputError,
-    InsufficientDataError,
-    check_known,
-    option,
-    require,
-    wish,
-)
+from elastocal.errors import InputError, InsufficientDataError, check_known, option, require, wish
 from elastocal.measurements import Measurements, read_measurements
-from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
 from elastocal.model.manipulator import Model
 from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import plan_forces
@@ -233,10 +226,6 @@ def _checked(
         while True:
             wave = islice(chunks, PER_TASK * effective_n_jobs(jobs))
             yield from pool([delayed(_check)(rules, forces, group, q) for q in wave])
-
-
-def told(chain: Chain, j: int, value: float) -> str:
-    return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"
 
 
 # How many poses a plan has at each level.

@@ -75,7 +75,7 @@ from elastocal.planning.search import (
 )
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
-from elastocal.text import listed, quoted
+from elastocal.text import listed, quoted, rounded
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
@@ -252,7 +252,7 @@ class _Design:
             told = (
                 "with the smooth functions, which stay uncertain, the error at the test poses is "
             )
-            told += f"{gain.after * 1e6:.3g} µm rms"
+            told += f"{rounded(gain.after * 1e6)} µm rms"
             plan = replace(plan, gain=gain, warnings=(*plan.warnings, told))
         if self.conditions is None:
             return plan
@@ -444,8 +444,9 @@ class _Design:
             last = tried[max(tried)]
             raise InsufficientDataError(
                 f"{self.cell.source}: no plan of up to {last.poses} poses meets "
-                f"the target of {wanted * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
-                "ask for less, measure more repeats, or take a better tracker"
+                f"the target of {wanted * 1e6:g} µm; the best found reaches "
+                f"{rounded(last.value, 4)} µm: ask for less, measure more repeats, or take a "
+                "better tracker"
             )
         return best, tuple(tried.values())
 

@@ -14,6 +14,7 @@ from scipy.sparse import csgraph
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
+from elastocal.model.chain import Chain, told
 from elastocal.planning.feasibility import Feasibility
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -165,7 +166,7 @@ class Moves:
         between, signs, sides = np.zeros((0, n)), None, leave[:, None]
         if motion.both_directions:
             assert limits is not None
-            signs = approach_signs(q, *limits, motion.overshoot)
+            signs = approach_signs(checker.chain, q, *limits, motion.overshoot)
             between = (q[:, None] - signs * motion.overshoot).reshape(-1, n)
             sides = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
         points = np.vstack([start, q, between, np.zeros((0, n)) if via is None else via])
@@ -318,7 +319,8 @@ class Moves:
         )
 
     def _name(self, point: int) -> str:
-        joints = ", ".join(f"{value:.3f}" for value in self.points[point])
+        chain = self.maps[0].checker.chain
+        joints = ", ".join(told(chain, j, value) for j, value in enumerate(self.points[point]))
         if point == self.home:
             return f"home (joints {joints})"
         return f"pose {point + (self.home is None)} (joints {joints})"
@@ -329,16 +331,16 @@ class Moves:
         return f" (in the way: {', '.join(names)})" if names else ""
 
 
-def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:
-    """Directions (N, 2, n) of the last motion of each joint, from q − sign · overshoot: first
+def approach_signs(chain: Chain, q: Array, lower: Array, upper: Array, by: float) -> IntArray:
+    """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first
     upwards (+1), then down (−1), so that backlash and hysteresis show; both times from the same
     side where the other is beyond the limits [lower, upper] (n,)."""
-    below, above = q - overshoot >= lower, q + overshoot <= upper
+    below, above = q - by >= lower, q + by <= upper
     if not (below | above).all():
         i, j = (int(v) for v in np.argwhere(~(below | above))[0])
         raise InputError(
-            f"pose {i + 1}: joint {j + 1} has no room on either side of {q[i, j]:.4g} for an "
-            f"overshoot of {overshoot:g}; lower overshoot_deg in [design.motion], or widen its "
-            "limits"
+            f"pose {i + 1}: joint {j + 1} has no room on either side of {told(chain, j, q[i, j])} "
+            f"for an overshoot of {told(chain, j, by)}; lower overshoot_deg in "
+            "[design.motion], or widen its limits"
         )
     return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)

@@ -16,17 +16,17 @@ from elastocal.errors import InputError, InsufficientDataError, require, wish
 from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
-from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.planning.bodies import data_base
-from elastocal.planning.candidates import sobol, told
+from elastocal.planning.candidates import sobol
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
-from elastocal.text import listed, quoted
+from elastocal.text import listed, quoted, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 # Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
@@ -321,8 +321,8 @@ class _Sources:
     def _far(self, found: Postures, t: int, at: str, remedy: str) -> str:
         distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])
         # A place missed by this much is given in another unit than its column says.
-        near = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
-        also = f" and {turn:.3g}° from its rotation" if turn > 0.01 else ""
+        near = f"{rounded(distance, 4)} mm" + ", wrong unit?" * bool(distance >= WRONG_UNIT)
+        also = f" and {rounded(turn)}° from its rotation" if turn > 0.01 else ""
         check = "check base_position_m and base_rpy_deg of [model.nominal], and [limits]"
         if self.cell.model.nominal.base_position is None:
             check = (

@@ -22,7 +22,7 @@ from elastocal.errors import InputError
 from elastocal.measurements import in_file_units
 from elastocal.model.chain import numbered
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of
-from elastocal.model.manipulator import load_chain
+from elastocal.model.manipulator import Model, load_chain
 from elastocal.text import counted as counted
 from elastocal.text import printable
 from elastocal.units import Array
@@ -311,11 +311,15 @@ def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> lis
 # Steps (name, held-out rms in m, its 95 % interval), and name and size of what noise leaves.
 Steps = Sequence[tuple[str, float, tuple[float, float]]]
 Floor = tuple[str, float] | None
-Budget = tuple[Steps, Floor]
+Budget = tuple[Steps, Floor, str]
 
 
-def budget_table(steps: Steps, floor: Floor) -> ShownTable:
-    """Steps and what each changes; `floor` last."""
+def rms(model: Model | None) -> str:
+    return "rms" if model is not None and model.observe == "distance" else "3-D rms"
+
+
+def budget_table(steps: Steps, floor: Floor, of: str) -> ShownTable:
+    """Steps and what each changes; `floor` last; `of`: which rms."""
     rows: list[tuple[str, ...]] = []
     for k, (name, rms, ci95) in enumerate(steps):
         change = signed(rms - steps[k - 1][1], length) if k else ""
@@ -323,7 +327,7 @@ def budget_table(steps: Steps, floor: Floor) -> ShownTable:
     if floor is not None:
         rows.append((floor[0], length(floor[1]), "", ""))
     heads = ("model", "held-out rms", "95 %", "change")
-    return ShownTable(heads, rows, title="Error budget (3-D rms error at held-out poses)")
+    return ShownTable(heads, rows, title=f"Error budget ({of} error at held-out poses)")
 
 
 def joint_heads(kinds: Sequence[str]) -> list[str]:

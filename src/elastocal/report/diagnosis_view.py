@@ -78,7 +78,8 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     yield say.Fold("Not tested", lambda: [untested_table(d)], printed=True)
     revolute = ("revolute",) * len(d.noise.repeatability)
     kinds = revolute if d.model is None else d.model.chain.kinds
-    noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
+    along = "" if say.rms(d.model) == "rms" else " per axis"
+    noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds, along)]
     yield say.Fold("Noise", lambda: [say.Lines(noise)], printed=True)
     if d.noise.faulty:
         faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
@@ -109,14 +110,16 @@ def _residuals(d: Diagnosis) -> Iterator[say.Block]:
     yield residuals.table()
 
 
-def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
+def noise_floor_lines(
+    noise: NoiseFloor, kinds: Iterable[str], along: str = " per axis"
+) -> Iterator[str]:
     text = "; nothing was stated"
     if noise.stated:
         text = (
             f", {say.significant(noise.stated_factor, 2)} times what is stated, and "
             f"{say.significant(noise.ratio_to_stated)} times with the scatter of the joints"
         )
-    yield f"A reading scatters by {say.length(noise.reading_sigma)} rms per axis{text}."
+    yield f"A reading scatters by {say.length(noise.reading_sigma)} rms{along}{text}."
     joints = [
         f"joint {i + 1} {say.significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
         for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
@@ -126,13 +129,15 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
     if noise.shared > 0:
         times = say.significant(noise.shared, 2)
         yield f"Visits of a configuration have a common scatter of {times} times that."
-    if noise.drift > 0:
-        drift = say.length(noise.drift)
-        yield f"The drift of {drift} that [noise] of the cell states counts as noise."
+    common = "deviation common to a configuration"
+    for what, size in (("drift", noise.drift), (common, noise.configuration)):
+        if size > 0:
+            told = f"The {what} of {say.length(size)} that [noise] of the cell states"
+            yield f"{told} counts as noise."
     if noise.pure_error is None:
         yield "No repeats: the noise is estimated from residuals only."
     else:
-        yield f"Repeats scatter by {say.length(noise.pure_error)} rms per axis."
+        yield f"Repeats scatter by {say.length(noise.pure_error)} rms{along}."
     if (near := noise.near_repeats) is not None:
         times = ""
         if near.soon is not None and near.later is not None:
@@ -142,7 +147,7 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
             )
         yield (
             f"Readings at nearly the same pose ({say.counted(near.pairs, 'pair')}) scatter by "
-            f"{say.length(near.scatter)} rms per axis{times}."
+            f"{say.length(near.scatter)} rms{along}{times}."
         )
     if n := len(noise.faulty):
         worst = say.length(max(f.error for f in noise.faulty))
@@ -340,7 +345,7 @@ def alike(d: Diagnosis) -> list[str]:
 def _budget(d: Diagnosis) -> say.Budget:
     steps = [step for step in d.budget if step.step != "noise_floor"]
     named = [(say.name_of(step.step), step.heldout_rms, step.ci95) for step in steps]
-    return named, ("noise alone", d.gap.noise_floor)
+    return named, ("noise alone", d.gap.noise_floor), say.rms(d.model)
 
 
 def candidate_table(d: Diagnosis) -> say.ShownTable:
@@ -545,17 +550,17 @@ def curve_span(curve: Curve) -> str:
 
 
 def _corrections(d: Diagnosis) -> Iterator[say.Block]:
-    if d.slight:
-        yield say.Sentence(
-            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each. "
-            "They correct the arm and are not findings."
-        )
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
     yield say.ShownTable(heads, rows, (0, 1), title="Corrections without a name", note=(
         "Functions without a physical name; they hold where the arm was measured: size (standard "
         "deviation) and the length over which smooth ones change."
     ))  # fmt: skip
+    if d.slight:
+        yield say.Sentence(
+            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each. "
+            "They correct the arm and are not findings."
+        )
 
 
 # What corrections that are no smooth functions follow, by the setting that is their size.

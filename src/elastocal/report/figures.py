@@ -209,10 +209,9 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
         axes.xaxis.set_minor_formatter(lambda x, _: "")
 
 
-def waterfall(name: str, steps: say.Steps, floor: say.Floor) -> say.Figure:
+def waterfall(name: str, steps: say.Steps, floor: say.Floor, of: str) -> say.Figure:
     caption = (
-        "Held-out 3-D rms error with its 95 % interval, as the model gains one part after the "
-        "other. "
+        f"Held-out {of} error with its 95 % interval, as the model gains one part after the other. "
     )
     caption += "The noise level is unknown." if floor is None else "Dashed: the noise level."
     title = "Error budget, step by step"
@@ -430,7 +429,7 @@ MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice
 MOST_LABELS = 20
 MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
 OF_RESIDUALS = (
-    "Of a direction, mean and largest are signed. Of all others the length of the 3-D residual is "
+    "Of a direction, mean and largest are signed. Of all others the length of the residual is "
     "given, and the mean is the length of the mean vector: near the rms, the residual is a common "
     "shift; near zero, it is scatter."
 )

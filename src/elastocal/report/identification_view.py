@@ -289,7 +289,8 @@ def nominal_held_out(result: Calibration) -> str:
 def budget_steps(result: Calibration, budget: ErrorBudget) -> say.Budget:
     named = {"nominal_arm": nominal_held_out(result)}
     steps = [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
-    return steps, None if budget.floor is None else (budget.floor_name, budget.floor)
+    floor = None if budget.floor is None else (budget.floor_name, budget.floor)
+    return steps, floor, say.rms(result.model)
 
 
 def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[str, Array]:

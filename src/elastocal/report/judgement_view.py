@@ -85,6 +85,10 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         "the stated noise is too large (the residual is {ratio} times it), so a missing effect "
         "would not show"
     ),
+    "common_noise_too_large": (
+        "what is stated as common to a configuration is too large (configurations scatter {ratio} "
+        "times as much), so a missing effect would not show"
+    ),
     "residuals_heavy_tailed": lambda f: (
         "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
@@ -336,9 +340,8 @@ def does_noise_explain_it(result: Calibration) -> str:
         elif stated or result.noise.kind == "covariance":
             text = "The residual was not compared with the stated noise"
         if result.noise.sigma is not None and method_of(result) == "ols":
-            return (
-                f"{text}; the residual amounts to {say.length(result.noise.sigma)} per coordinate."
-            )
+            of = "reading" if observed.kind == "distance" else "coordinate"
+            return f"{text}; the residual amounts to {say.length(result.noise.sigma)} per {of}."
         level = "; the noise level was estimated from the readings"
         return f"{text}{level * estimated}."
     size = (

@@ -14,7 +14,7 @@ from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name
 from elastocal.report import blocks as say
 from elastocal.report.figures import NO_ENDS, plan_curve, rows_of_dots
-from elastocal.text import listed, printable, some
+from elastocal.text import listed, printable, rounded, some
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
@@ -297,7 +297,7 @@ def _everywhere_lines(plan: Plan) -> Told:
     )
     if drift := plan.model.cell.noise.drift:
         text += (
-            f"; with the drift of {drift * 1e6:.3g} µm that [noise] states "
+            f"; with the drift of {rounded(drift * 1e6)} µm that [noise] states "
             f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
         )
     if e.share:
@@ -403,6 +403,9 @@ def _execution_lines(plan: Plan) -> Told:
     yield "Drift", f"{text}{f' (in the shortest order {other})' * (d.bias < d.shortest)}."
 
 
+APART = 1.25  # more than the bound of 97.5 % is above that of 95 %
+
+
 def next_lines(found: NextPoses) -> Told:
     g, n = found.gain, say.counted(found.batch, "pose")
     limit = "" if found.required is None else f" (required: {position_error(found.required)})"
@@ -416,6 +419,10 @@ def next_lines(found: NextPoses) -> Told:
     now = "not known yet, as some parameters are undetermined"
     if math.isfinite(found.reached):
         now = f"≤ {position_error(found.reached)} rms at new poses (95 %){limit}"
+        alone = None if found.calibration is None else found.calibration.verdict.at
+        if alone is not None and alone > APART * found.reached:
+            now += f"; identify says ≤ {position_error(alone)}, as it takes all scatter beyond the "
+            now += "noise for what the model may lack, and diagnose finds that improbable"
 
     def both(before: float, after: float) -> str:
         begun = position_error(before) if math.isfinite(before) else "an unknown error"
@@ -425,8 +432,8 @@ def next_lines(found: NextPoses) -> Told:
     yield "Error now", f"{now}."
     yield (
         "Gain",
-        f"{n} lower the rms error at the test poses from {both(g.before, g.after)} with what "
-        f"the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
+        f"{n} lower the expected rms error at the test poses from {both(g.before, g.after)} with "
+        f"what the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
     )
     named = [f"{say.effect_at(f)} ({say.probability(f.probability)})" for f in found.found]
     if named:

@@ -113,7 +113,8 @@ def _needs(heading: str, block: say.Block) -> bool:
     told = block.title if isinstance(block, say.ShownTable) else ""
     if isinstance(block, say.Lines):
         told = block.items[0][0]
-    return not (told and heading.startswith(told.partition(" (")[0].partition(",")[0]))
+    first = told.partition(" (")[0].partition(",")[0]
+    return not (told and (told.startswith(heading) or heading.startswith(first)))
 
 
 def _shown(console: Console, block: say.Block) -> Iterable[RenderableType]:

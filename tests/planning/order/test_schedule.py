@@ -124,17 +124,16 @@ def test_a_side_that_is_blocked_is_left_out_and_told():
     execution = schedule(q, Motion(both_directions=True), near, limits=LIMITS)
     assert execution.one_sided == (0,)
     assert [s.side for s in execution.stops if s.pose == 0] == [1]
-    boxed = Discs([(0.0, 0.0, 0.5), (0.72, 0.72, 0.5)])
-    boxed.named = ["the post"]
+    boxed = Discs([(0.0, 0.0, 0.5), (0.72, 0.72, 0.5)], named=["the post"])
     with pytest.raises(InsufficientDataError, match=r"pose 1 .*neither from below .*post"):
         schedule(q, Motion(both_directions=True), boxed, limits=LIMITS)
 
 
 def test_an_unreachable_pose_is_named_with_what_is_in_the_way():
-    ring = Discs([(np.cos(a), np.sin(a), 0.3) for a in np.arange(0, 2 * np.pi, 0.3)])
-    ring.named = ["link3 and fence"]
+    circle = [(np.cos(a), np.sin(a), 0.3) for a in np.arange(0, 2 * np.pi, 0.3)]
+    ring = Discs(circle, named=["link3 and fence"])
     q = np.array([[2.0, 0.0], [0.05, 0.1], [0.0, 2.0], [-2.0, 0.0]])
-    with pytest.raises(InsufficientDataError, match=r"pose 2 .*0\.050.*link3 and fence"):
+    with pytest.raises(InsufficientDataError, match=r"pose 2 .*2\.86479°.*link3 and fence"):
         schedule(q, Motion(), ring)
     with pytest.raises(InsufficientDataError, match="pose 2"):
         schedule(q[:2], Motion(home=np.array([2.0, 2.0])), ring)

@@ -22,54 +22,22 @@ from elastocal.model.effects.base import Effect, check
 from elastocal.plugin_loader import load_installed, load_named, same_class
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
-CATALOGUE: dict[str, Effect] = {
-    effect.name: effect
-    for effect in (
-        placements.BaseFrame(),
-        gears.JointOffset(),
-        gears.EncoderScale(),
-        gears.GearEccentricity(),
-        gears.GearSecondHarmonic(),
-        gears.GearRipple(),
-        gears.GearSpectrum(),
-        smooth.JointCurve(),
-        gears.WristCoupling(),
-        placements.JointDrift(),
-        placements.EncoderJump(),
-        gears.MoveLag(),
-        gears.MoveHysteresis(),
-        loads.GravitySag(),
-        compliances.TorqueCoupling(),
-        placements.LinkGeometry(),
-        compliances.TorqueTilt(),
-        placements.ThermalExpansion(),
-        compliances.JointCompliance(),
-        compliances.JointHardening(),
-        gears.Backlash(),
-        gears.Hysteresis(),
-        smooth.TorqueResponse(),
-        smooth.ApproachResponse(),
-        compliances.OffAxisCompliance(),
-        compliances.LinkBending(),
-        compliances.BaseCompliance(),
-        smooth.LoadResponse(),
-        loads.GravityCompensator(),
-        loads.LinkGravity(),
-        loads.LinkMassError(),
-        loads.LinkWeights(),
-        loads.Payload(),
-        loads.PayloadError(),
-        placements.MarkerPosition(),
-        placements.MarkerSlip(),
-        smooth.ResidualField(),
-        smooth.ResidualStep(),
-        placements.MarkerOrientation(),
-        placements.BaseDrift(),
-        placements.FrameJump(),
-        placements.DistanceSensor(),
-        placements.TrackerDistortion(),
-    )
-}
+CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
+    placements.BaseFrame(), gears.JointOffset(), gears.EncoderScale(),
+    gears.GearEccentricity(), gears.GearSecondHarmonic(), gears.GearRipple(),
+    gears.GearSpectrum(), smooth.JointCurve(), gears.WristCoupling(), placements.JointDrift(),
+    placements.EncoderJump(), gears.MoveLag(), gears.MoveHysteresis(), loads.GravitySag(),
+    compliances.TorqueCoupling(), placements.LinkGeometry(), compliances.TorqueTilt(),
+    placements.ThermalExpansion(), compliances.JointCompliance(),
+    compliances.JointHardening(), gears.Backlash(), gears.Hysteresis(),
+    smooth.TorqueResponse(), smooth.ApproachResponse(), compliances.OffAxisCompliance(),
+    compliances.LinkBending(), compliances.BaseCompliance(), smooth.LoadResponse(),
+    loads.GravityCompensator(), loads.LinkGravity(), loads.LinkMassError(),
+    loads.LinkWeights(), loads.Payload(), loads.PayloadError(), placements.MarkerPosition(),
+    placements.MarkerSlip(), smooth.ResidualField(), smooth.ResidualStep(),
+    placements.MarkerOrientation(), placements.BaseDrift(), placements.FrameJump(),
+    placements.DistanceSensor(), placements.TrackerDistortion(),
+)}  # fmt: skip
 BUILT_IN = frozenset(CATALOGUE)
 # Probability that an effect is missing; in equal shares it is each of them, at each of its places.
 SOMETHING = 0.5
