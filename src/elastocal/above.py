@@ -213,9 +213,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 Check = Callable[[Any], bool]
 
 
-def _array(value: Any, finite: bool = True) -> bool:
-    """Numbers, or what numpy makes numbers of, of any shape; not what it reads of a text.  Whether
-    those that may be not `finite` can be computed with is for what computes with them."""
+def _array(value: Any) -> bool:
+    """Numbers, or what numpy makes numbers of, of any shape; not what it reads of a text."""
     import numpy as np
 
     try:
@@ -224,7 +223,18 @@ def _array(value: Any, finite: bool = True) -> bool:
             numbers = np.asarray(value, dtype=float)
     except (TypeError, ValueError):
         return False
-    return numbers.dtype.kind in "iuf" and bool(not finite or (np.abs(numbers) <= LARGEST).all())
+    return numbers.dtype.kind in "iuf" and bool((np.abs(numbers) <= LARGEST).all())
+
+
+def _values(value: Any) -> bool:
+    """Numbers, complex ones too; whether they can be computed with is for what computes with
+    them."""
+    import numpy as np
+
+    try:
+        return np.asarray(value).dtype.kind in "iufc"
+    except ValueError:  # rows of different length
+        return False
 
 
 def _truth(value: Any) -> bool:
@@ -277,7 +287,7 @@ KINDS: dict[str, tuple[str, Check]] = {
     "str": ("a text", _text),
     "Path": ("a path", lambda v: isinstance(v, Path) or bool(_text(v) and v)),
     "ArrayLike": ("finite numbers", _array),
-    "Array": ("numbers", functools.partial(_array, finite=False)),
+    "Array": ("numbers", _values),
     "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
     "Sequence[str]": ("a list of names", _list_of(_text)),
     "Sequence[TargetPose]": ("a list of TargetPose", _list_of(_is_a("TargetPose"))),
