@@ -349,7 +349,7 @@ class _Writing:
             told += f", at {conditions.time:g} s"
         if self.kept.fitted and conditions.visits is not None:
             sizes = np.linalg.norm(conditions.visits.force, axis=1)
-            low, high = f"{rounded(sizes.min(), 4)}", f"{rounded(sizes.max(), 4)}"
+            low, high = rounded(sizes.min(), 4), rounded(sizes.max(), 4)
             span = high if low == high else f"{low} to {high}"
             told += f", fitted where it was measured, under {span} N, {self.done.base_told}"
         return told

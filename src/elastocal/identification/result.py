@@ -133,7 +133,7 @@ class Combination:
         first, *rest = self.terms.items()
         text = first[0]
         for name, factor in rest:
-            number = f"{rounded(abs(factor), 4)}"
+            number = rounded(abs(factor), 4)
             size = "" if number == "1" else f"{number}·"
             text += f" {'-' if factor < 0 else '+'} {size}{deviation(name, self.held.get(name))}"
         return text

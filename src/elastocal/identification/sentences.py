@@ -167,7 +167,7 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
             )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
-            k: ", ".join(one if isinstance(one, str) else f"{rounded(one)}" for one in v)
+            k: ", ".join(one if isinstance(one, str) else rounded(one) for one in v)
             if isinstance(v, tuple) else rounded(v, DIGITS[k]) if k in DIGITS else v
             for k, v in f.numbers.items()
         }  # fmt: skip
