@@ -36,6 +36,7 @@ from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.least_squares import drawing_root
 from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
+from elastocal.identification.solve import WORTH_A_COLUMN
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
@@ -54,7 +55,6 @@ from elastocal.units import Array, IntArray
 
 SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
-WORTH_A_COLUMN = 1.0  # deviations that a typical change has to move the data by
 UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
 CENTRAL = 0.95
@@ -280,9 +280,7 @@ def _compared(
     load = cell.tool.load_point
     at = load if load.any() else next(iter(cell.tool.markers.values()), load)
     # The set-up of the old campaign for both.
-    values = before.values
-    for name, change in zip(names, z.tolist(), strict=True):
-        values[name] += change
+    values = before.values | {n: before.values[n] + d for n, d in zip(names, z, strict=True)}
     moved = np.array([values[name] for name in before.model.names])
     tool, tool_moved = (
         CalibratedTool(replace(old, model=before.model, x=x), ToolPoint(at, None, "tool"))

@@ -38,6 +38,7 @@ from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.
 DOUBT = 1e-3
+APART = 1.25  # more than the bound of 97.5 % is above that of 95 %
 
 NextVerdict = Literal["measure", "enough", "no_gain"]
 
@@ -72,6 +73,12 @@ class NextPoses(Result):
     source: str = ""
     diagnosis: Diagnosis | None = None
     calibration: Calibration | None = None
+
+    @property
+    def beside(self) -> float | None:
+        """The bound of identify (m), where it is more than APART times as large."""
+        alone = None if self.calibration is None else self.calibration.verdict.at
+        return alone if alone is not None and alone > APART * self.reached else None
 
     def __repr__(self) -> str:
         told = f"at most {self.reached * 1e6:.3g} µm with 95 %"

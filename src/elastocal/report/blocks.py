@@ -314,8 +314,12 @@ Floor = tuple[str, float] | None
 Budget = tuple[Steps, Floor, str]
 
 
+def of_distances(model: Model | None) -> bool:
+    return model is not None and model.observe == "distance"
+
+
 def rms(model: Model | None) -> str:
-    return "rms" if model is not None and model.observe == "distance" else "3-D rms"
+    return "rms" if of_distances(model) else "3-D rms"
 
 
 def budget_table(steps: Steps, floor: Floor, of: str) -> ShownTable:

@@ -78,7 +78,7 @@ def diagnosis_blocks(d: Diagnosis) -> Iterator[say.Block]:
     yield say.Fold("Not tested", lambda: [untested_table(d)], printed=True)
     revolute = ("revolute",) * len(d.noise.repeatability)
     kinds = revolute if d.model is None else d.model.chain.kinds
-    along = "" if say.rms(d.model) == "rms" else " per axis"
+    along = "" if say.of_distances(d.model) else " per axis"
     noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds, along)]
     yield say.Fold("Noise", lambda: [say.Lines(noise)], printed=True)
     if d.noise.faulty:

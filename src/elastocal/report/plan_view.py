@@ -403,9 +403,6 @@ def _execution_lines(plan: Plan) -> Told:
     yield "Drift", f"{text}{f' (in the shortest order {other})' * (d.bias < d.shortest)}."
 
 
-APART = 1.25  # more than the bound of 97.5 % is above that of 95 %
-
-
 def next_lines(found: NextPoses) -> Told:
     g, n = found.gain, say.counted(found.batch, "pose")
     limit = "" if found.required is None else f" (required: {position_error(found.required)})"
@@ -419,8 +416,7 @@ def next_lines(found: NextPoses) -> Told:
     now = "not known yet, as some parameters are undetermined"
     if math.isfinite(found.reached):
         now = f"≤ {position_error(found.reached)} rms at new poses (95 %){limit}"
-        alone = None if found.calibration is None else found.calibration.verdict.at
-        if alone is not None and alone > APART * found.reached:
+        if (alone := found.beside) is not None:
             now += f"; identify says ≤ {position_error(alone)}, as it takes all scatter beyond the "
             now += "noise for what the model may lack, and diagnose finds that improbable"
 
