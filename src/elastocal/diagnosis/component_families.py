@@ -21,7 +21,6 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData, wrenches
 from elastocal.diagnosis.effect_search import settings_of
 from elastocal.diagnosis.evidence import Grams, Item, direct
 from elastocal.diagnosis.hypotheses import (
-    CHANGE_TIMES,
     NO_SETTINGS,
     SCALES,
     UNSIZED_SCALES,
@@ -259,21 +258,10 @@ def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
     moments, time = dataset.moments, dataset.visit_table.time
     if time is None or not len(moments):
         return None
-    entry = effect.entry_at(where)
-    key, visits = (entry.name, (where,)), time.reshape(dataset.present.shape)
-    sums = grams.entry(key)
-
-    def directions(tried: Array) -> Array:
-        later = (visits[:, :, None] >= tried) & dataset.present[:, :, None]
-        return later[:, :, None, :, None] * (MOTION * np.eye(entry.size))[:, None, :]
-
-    def best(tried: Array) -> float:
-        each = sums.each(len(tried), entry.size, lambda some: directions(tried[some]))
-        return float(tried[np.argmax(each.evidence(UNSIZED_SCALES))])
-
-    apart = math.ceil(len(moments) / CHANGE_TIMES)
-    k = int(np.searchsorted(moments, best(moments[apart // 2 :: apart])))
-    moment = best(moments[max(k - apart, 0) : k + apart + 1])
+    entry, present = effect.entry_at(where), dataset.present
+    key, when = (entry.name, (where,)), np.where(present, time.reshape(present.shape), -np.inf)
+    evidence = grams.entry(key).steps(when, moments).evidence(MOTION * UNSIZED_SCALES)
+    moment = float(moments[np.argmax(evidence)])
     begun = np.asarray(dataset.table.time)[first_of_visit(dataset.table)]
     D = (begun >= moment)[:, None, None] * MOTION * np.eye(entry.size)
     return moved(dataset, key, D), {effect.constants[0].key: moment}, math.log(len(moments))

@@ -431,8 +431,9 @@ class Beside:
         self.left, self.moved = list[tuple[Array, Array]](), list[Array]()
         for across, own, z in found.sums.across(columns):
             scaled = self.sum.root[:, None] * across
-            self.moved.append(linalg.cho_solve((self.sum.L, True), scaled))
-            self.left.append((own - scaled.T @ self.moved[-1], z - scaled.T @ self.sum.b))
+            moved = linalg.cho_solve((self.sum.L, True), scaled, check_finite=False)
+            self.moved.append(moved)
+            self.left.append((own - scaled.T @ moved, z - scaled.T @ self.sum.b))
 
     def evidence_instead(self, gone: slice) -> list[float]:
         """Over none, of what is `gone` beside all others of the sum and of each of the columns."""

@@ -597,8 +597,8 @@ def drawn(
         A = S[np.ix_(i, i)] + np.diag(sized[i])
         apart = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
         beta[c[i]] = np.linalg.solve(A, t[i]) + apart
-        rest = z - across @ beta[c] + rng.normal(size=len(x))
-        beta[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
+        beta[x] = z - across @ beta[c] + rng.normal(size=len(x))
+    out[x] = linalg.solve_triangular(L, out[x], lower=True, trans="T", check_finite=False)
     return out
 
 

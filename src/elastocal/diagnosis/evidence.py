@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy import sparse
 from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, Projection, project
@@ -245,6 +246,16 @@ class EntrySums:
         """Spectrum of the groups with directions D, as `products` takes them."""
         return Spectrum.of(*self.products(D))
 
+    def steps(self, time: Array, moments: Array) -> Spectrum:
+        """Spectrum of all motions from each of the `moments` (M,) on, which ascend, visits being at
+        `time` (C, v), −∞ where there is none: sums of what comes later, not columns of each."""
+        both, step = np.minimum(time[:, :, None], time[:, None]), max(1, HELD // self.H[0].size)
+        A = _later(moments, both, self.local.transpose(0, 1, 3, 2, 4))
+        for H in (self.H[k : k + step] for k in range(0, len(self.H), step)):
+            Z = _later(moments, time, H.transpose(1, 2, 0, 3))
+            A -= Z.swapaxes(1, 2) @ Z
+        return Spectrum.of(A, _later(moments, time, self.residuals[0].of)[..., None])
+
     def products(self, D: Array) -> tuple[Array, Array]:
         """A (V, k, k) and b (V, k, T) of the groups with directions D (C, v, d, V, k), or
         (C, 1, d, V, k) where they are the same in all visits of a configuration."""
@@ -260,6 +271,14 @@ class EntrySums:
         A -= _each_with_each(Z.reshape(-1, V, k), Z.reshape(-1, V, k))
         b = np.concatenate([r.along(flat, Z) for r in self.residuals], axis=1)
         return A, b.reshape(V, k, -1)
+
+
+def _later(moments: Array, when: Array, values: Array) -> Array:
+    """Σ (M, …) of the values (*when.shape, …) that are there from each of the moments on."""
+    n, at = when.size, np.searchsorted(moments, when.ravel(), side="right")
+    between = sparse.csr_array((np.ones(n), (at, np.arange(n))), shape=(len(moments) + 1, n))
+    sums = (between @ values.reshape(n, -1))[:0:-1].cumsum(axis=0)[::-1]
+    return np.asarray(sums.reshape(len(moments), *values.shape[when.ndim :]))
 
 
 def _each_with_each(a: Array, b: Array) -> Array:

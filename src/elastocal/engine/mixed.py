@@ -195,12 +195,12 @@ class Mixed:
         # A little more than the prior: what others show as well must not drown in rounding.
         M[np.diag_indices(p)] += self.precision + ROUNDING * known * np.diag(M)
         try:
-            L = np.asarray(linalg.cholesky(M, lower=True))
+            L = np.asarray(linalg.cholesky(M, lower=True, check_finite=False))
         except linalg.LinAlgError:
             raise InsufficientDataError(
                 "the columns of B depend on each other under this noise model; measure more poses"
             ) from None
-        x = linalg.cho_solve((L, True), z)
+        x = linalg.cho_solve((L, True), z, check_finite=False)
         value += 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
         value += (self.rows - int((~known).sum())) * LOG_2PI
         value -= float(np.log(self.precision[known]).sum())
