@@ -14,7 +14,8 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.measurements import Measurements, numbered, visits
 from elastocal.model.chain import joint_limits
-from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
+from elastocal.model.effects.catalogue import effect_of
+from elastocal.model.effects.placements import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.text import did_you_mean, listed, rounded
@@ -251,6 +252,10 @@ def start_values(
     return x
 
 
+# m: how far nominal distances are off, and a marker from where it is guessed.
+ROUGH, AWAY = 2e-3, 0.3
+
+
 def _distance_start(model: Model, table: Measurements, x: Array, movable: set[int]) -> Array:
     """Anchor, offset and attachment by robust least squares.
 
@@ -260,7 +265,7 @@ def _distance_start(model: Model, table: Measurements, x: Array, movable: set[in
     """
     columns = np.array(
         [i for i, p in enumerate(model.parameters)
-         if i in movable and p.effect in (DistanceSensor.name, MarkerPosition.name)]
+         if i in movable and effect_of(p.effect).registered]
     )  # fmt: skip
     if not len(columns):
         return x
@@ -283,11 +288,14 @@ def _distance_start(model: Model, table: Measurements, x: Array, movable: set[in
         y[columns] = z
         return y
 
+    # Where nominal joints do not tell a marker's height from the anchor's, it stays at its guess.
+    tie = np.diag([0.0 if i in anchor else ROUGH / AWAY for i in columns])
     tried = [
         scipy.optimize.least_squares(
-            lambda z: model.predict(table, values(z)) - d, start[columns],
-            lambda z: model.regressor(table, values(z), columns).B,
-            loss="soft_l1", f_scale=2e-3, max_nfev=60,
+            lambda z: np.append(model.predict(table, values(z)) - d, tie @ (z - x[columns])),
+            start[columns],
+            lambda z: np.vstack([model.regressor(table, values(z), columns).B, tie]),
+            loss="soft_l1", f_scale=ROUGH, max_nfev=60,
         )
         for start in starts
     ]  # fmt: skip
