@@ -125,9 +125,6 @@ def reduce(
         chosen = np.append(chosen, own[far > least])
         basis = linalg.qr(R[:, chosen], mode="economic")[0]
     kept = np.sort(chosen)
-    if by_effect:  # what was placed deviates by less than where it may be
-        most = np.array([p.typical or np.inf for p in parameters])
-        R, sizes = R * np.minimum(most / sizes, 1.0), np.minimum(sizes, most)
     dropped, mixing = _stood_for(R, kept)
     while by_effect and np.abs(mixing).max(initial=0.0) > FAR:
         k, d = np.unravel_index(np.abs(mixing).argmax(), mixing.shape)
@@ -304,7 +301,7 @@ def solve(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    started = problem
+    started, exact = problem, False
     problem, nominal = with_placed(problem, CHOOSING)
     progress("first fit, tied weakly to the start")
     few = _sampled(problem)
@@ -317,9 +314,12 @@ def solve(
         reduction = choose(problem, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
             break
-        # What no reading tells stays where it started: a fit of the nominal arm takes it anywhere.
         held = reduction.dropped[is_placed(problem.model)[reduction.dropped]]
-        problem = replace(problem, x0=moved(problem.x0, held, (started.x0 - problem.x0)[held]))
+        if problem.model.observe == "distance":
+            # What no reading tells stays at its guess: a fit of the nominal arm takes it anywhere.
+            problem = replace(problem, x0=moved(problem.x0, held, (started.x0 - problem.x0)[held]))
+        elif not exact and len(held):
+            problem, exact = with_placed(started, PLACING)[0], True
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
         found = fit_kept(problem, found.x, reduction)
@@ -444,9 +444,10 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     if problem.large or not np.isfinite(covariance).all():
         return none, none
     size = problem.sizes[kept]
-    # Base, markers and cable may also be where they were said to be, not where the start saw them.
+    # By distances base, markers and cable may also be where they were said to be.
     model = problem.model
     stated = np.hypot([p.typical or 0.0 for p in model.parameters], found.x - model.nominal)
+    stated *= model.observe == "distance"
     typical = np.where(is_placed(model), stated, problem.sizes)[dropped]
     root = drawing_root(covariance)
     # Of many readings some tell it as well: it is no smaller where there are more of them.
