@@ -23,6 +23,7 @@ counts as noise of each.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -59,6 +60,7 @@ UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typica
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
+BY_ONE = "one session alone shows it"
 MOST_POSES = 100_000
 
 
@@ -99,7 +101,7 @@ class Comparison(Result):
             "the cell's plan"; empty where nothing states a load.
         first_order: Whether the campaigns determined other parameters of the arm, of which sums
             were compared, to first order.
-        not_compared: What the models have and nothing was compared of, with the reason.
+        not_compared: What the models have and nothing was compared of, by the reason.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -118,7 +120,7 @@ class Comparison(Result):
     forces: Array
     loads_of: str
     first_order: bool
-    not_compared: tuple[str, ...]
+    not_compared: dict[str, list[str]]
 
     @property
     def changed(self) -> list[ParameterChange]:
@@ -165,7 +167,9 @@ class Comparison(Result):
             "changed": [c.name for c in self.changed],
             "parameters": [vars(c) for c in self.changes],
             "first_order": self.first_order,
-            "not_compared": list(self.not_compared),
+            "not_compared": [
+                f"{name} ({why})" for why, names in self.not_compared.items() for name in names
+            ],
             "tool": {
                 "poses": len(far),
                 "force_N": self.forces[0] if len(self.forces) == 1 else None,
@@ -257,20 +261,23 @@ def _compared(
     stated = [name for name, needs in unstated.items() if not needs]
     before = arm_with(old, stated)
     own &= {*before.model.names}
-    left = [f"{name.replace('_', ' ')} (follows {listed(needs)})"
-            for name, needs in unstated.items() if needs]  # fmt: skip
+    left = defaultdict[str, list[str]](list)
+    for name, needs in unstated.items():
+        if needs:
+            left[f"follows {listed(needs)}"].append(name.replace("_", " "))
     functions: dict[str, str] = {}  # parameter → the smooth function that it is part of
     for group in smooth_groups(before.model):
         keys = {before.model.names[k] for k in group.columns.ravel()}
         functions |= dict.fromkeys(keys, group.name)
         if (keys <= set(old.determined)) != (keys <= set(new.determined)):
-            left.append(f"{group.name} (one session alone shows it)")
+            left[BY_ONE].append(group.name)
             own -= keys
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
     names, z, V, hidden = _difference(old, new, [n for n in before.model.names if n in own])
-    left += [f"{name} (one session alone shows it)" for name in hidden]
+    if hidden:
+        left[BY_ONE] += hidden
     if not names:
         raise InsufficientDataError(
             f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
@@ -300,7 +307,7 @@ def _compared(
     changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
-        forces, whose, {*old.determined} & own != {*new.determined} & own, tuple(left),
+        forces, whose, {*old.determined} & own != {*new.determined} & own, dict(left),
     )  # fmt: skip
 
 
