@@ -58,6 +58,7 @@ SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
 UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
+CONTRADICTED = 1.96  # standard deviations from a held value: beyond chance, as at 5 %
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
 BY_ONE = "one session alone shows it"
@@ -345,12 +346,13 @@ def _difference(
 ) -> tuple[list[str], Array, Array, list[str]]:
     """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows.
 
-    Raises InputError where users held a parameter at two values, or a covariance has no numbers.
+    Raises InputError where users held a parameter at two values, or at one that the other campaign
+    contradicts, or a covariance has no numbers.
     """
     said = [{*arm.determined, *(name for name, _, _ in _left_open(arm))} for arm in (old, new)]
     for name in (n for n in own if n not in said[0] | said[1]):
         require(
-            bool(np.isclose(old.values[name], new.values[name], rtol=1e-9)),
+            bool(np.isclose(old.values[name], new.values[name], rtol=1e-9, atol=0.0)),
             f"{name} is held at {old.values[name]:.6g} in {old.source} and at "
             f"{new.values[name]:.6g} in {new.source}; identify both with the same value",
         )
@@ -373,6 +375,14 @@ def _difference(
         bool((np.diag(V) > 0).all()),
         f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
     )
+    spread = np.sqrt(np.diag(V))
+    for k, off in zip(alone.tolist(), (t / spread)[len(both) :].tolist(), strict=True):
+        one, other = (new, old) if k in first else (old, new)
+        require(
+            size[k] > 0 or abs(off) < CONTRADICTED,
+            f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
+            f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
+        )
     root = drawing_root(V)
     W, target = np.split(
         linalg.solve_triangular(root, np.column_stack([H, t]), lower=True), [-1], 1
