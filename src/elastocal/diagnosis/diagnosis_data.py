@@ -291,11 +291,12 @@ def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     some = subset(observed, np.arange(n) < base.n_measured)
     waves = np.zeros((n, observed.size, 0))
     common: Array | float = 0.0
-    for found in stated_deviations(base.model, some, base.x, (CONFIGURATION, TIME)):
+    of_all = stated_deviations(base.model, observed, base.x, (CONFIGURATION,))
+    for found in (*of_all, *stated_deviations(base.model, some, base.x, (TIME,))):
         if found.waves is not None:
             rest = np.zeros((n - base.n_measured, *found.waves.shape[1:]))
             waves = np.concatenate([found.waves, rest])
-        loading = found.packed(np.where(member < base.n_measured, member, -1))
+        loading = found.packed(np.where(member < len(found.unit), member, -1))
         common = common + loading @ loading.transpose(0, 2, 1)
     return waves, common
 
