@@ -168,9 +168,7 @@ class Comparison(Result):
             "changed": [c.name for c in self.changed],
             "parameters": [vars(c) for c in self.changes],
             "first_order": self.first_order,
-            "not_compared": [
-                f"{name} ({why})" for why, names in self.not_compared.items() for name in names
-            ],
+            "not_compared": [f"{n} ({why})" for why, of in self.not_compared.items() for n in of],
             "tool": {
                 "poses": len(far),
                 "force_N": self.forces[0] if len(self.forces) == 1 else None,

@@ -52,10 +52,9 @@ class LinkMass:
 class Chain:
     """A serial chain base → joint 1 → … → joint n → flange.
 
-    `flange_placement` (4, 4) places the flange in the last joint's frame.
-    `masses` holds one entry per joint, all bodies rigidly carried by that joint
-    lumped, or is empty where the source has no inertias.  `notes`: what to know of how the source
-    was read, in sentences.
+    `flange_placement` (4, 4) places the flange in the last joint's frame. `masses` holds one entry
+    per joint, all bodies rigidly carried by that joint lumped, or is empty where the source has no
+    inertias.  `notes`: what to know of how the source was read, in sentences.
     """
 
     name: str
