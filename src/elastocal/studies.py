@@ -407,9 +407,8 @@ def statement_of(folder: Path) -> dict[str, Any]:
 def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     """Returns the rows of a study, sorted by task and row; failed tasks only where `failed`.
 
-    Columns: task, task_hash, the task's values, task_row, the results, task_seconds,
-    elastocal (version), task_error.
-    Raises InputError where there are none, or a result is there twice.
+    Columns: task, task_hash, the task's values, task_row, the results, task_seconds, elastocal
+    (version), task_error. Raises InputError where there are none, or a result is there twice.
     """
     import pandas as pd
 

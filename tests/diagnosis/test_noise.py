@@ -70,10 +70,7 @@ def test_the_noise_that_made_the_readings_is_found() -> None:
     np.testing.assert_allclose(*both, rtol=0.15)
     # No search from it or from the true noise finds a twentieth of −2 log posterior more.
     for start in (found, true_noise):
-        further = optimize.minimize(
-            lambda t: data.model.objective(t)[:2], start.logs(), jac=True,
-            method="BFGS",
-        )  # fmt: skip
+        further = optimize.minimize(lambda t: data.model.objective(t)[:2], start.logs(), jac=True)
         assert data.model.objective(found.logs())[0] < further.fun + 0.05
 
 
@@ -83,8 +80,8 @@ def test_a_stated_drift_is_noise_that_readings_have_in_common_by_their_times() -
     model, table = campaign(n=12)
     visit = visits(table)
     table = replace(table, time=60.0 * visit)
-    noise = Unsteadiness(drift=size, lasting=lasting)
-    stated = Model.assembled(model.chain, replace(model.cell, noise=noise))
+    kinds = Unsteadiness(drift=size, lasting=lasting), Unsteadiness(configuration=1.0)
+    stated, shaken = (Model.assembled(model.chain, replace(model.cell, noise=n)) for n in kinds)
     base = fit_baseline(model, table)
     plain, data = (diagnosis_data_of(replace(base, model=m), []) for m in (model, stated))
     assert plain.drift == 0 and data.drift == size
@@ -97,9 +94,11 @@ def test_a_stated_drift_is_noise_that_readings_have_in_common_by_their_times() -
         square = own.reshape(len(members), 3, -1, 3)[: len(here), :, : len(here)]
         found[np.ix_(here, here)] += square.transpose(0, 2, 1, 3)
     own_visit, when = visit[data.lead], table.time[data.lead]
-    expected = (
-        size**2 * np.exp(-np.abs(when[:, None] - when) / lasting)[..., None, None] * np.eye(3)
-    )
+    alike = np.exp(-np.abs(when[:, None] - when) / lasting)
+    expected = size**2 * alike[..., None, None] * np.eye(3)
     same = own_visit[:, None] == own_visit
     np.testing.assert_allclose(found[same], expected[same], atol=1e-9 * size**2)
     assert np.abs(found - expected).max() < 0.1 * size**2
+    # What is common to a configuration is in those that are only planned, too.
+    now, planned = (diagnosis_data_of(replace(base, model=shaken, planned=k), []) for k in (0, 9))
+    np.testing.assert_array_equal(now.data.covariance, planned.data.covariance)

@@ -52,10 +52,9 @@ POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 class Robot:
     """A URDF or a MuJoCo model with the names of its first and last link, or a DH table.
 
-    `masses`: the table of link masses of a DH robot.  `dh` takes a UR's factory calibration too:
-    a YAML of ur_calibration, or a calibration.conf with `ur_model`.  `joint_names` says what
-    jointN means where the file has such a name at another place.  Files as absolute or relative
-    paths.
+    `masses`: the table of link masses of a DH robot.  `dh` takes a UR's factory calibration too: a
+    YAML of ur_calibration, or a calibration.conf with `ur_model`.  `joint_names` says what jointN
+    means where the file has such a name at another place.  Files as absolute or relative paths.
 
     Examples:
         >>> robot = ec.Robot.from_urdf("kr270_2.urdf", flange="flange")

@@ -127,14 +127,13 @@ class TargetBox:
 class Motion:
     """How the arm moves between poses: joint `speed` (n,) rad/s or m/s, (1,) where all are alike
     (None: equal speeds), `home` (n,), `dwell` s of a stop and `reading` s more for each reading of
-    a marker in it, `load_change` s for hanging or taking off the load by hand,
-    `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
-    `load_changes`: how often at most the load may be hung, exchanged or taken off (None: as rarely
-    as can be), `extra_time`: how much longer than by the shortest way all may take so that a
-    drift does less (0: the shortest order; None: a little, and as much as pays for reading poses
-    twice); `reference_every`: after so many visits one pose is
-    visited again.
-    `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
+    a marker in it, `load_change` s for hanging or taking off the load by hand, `both_directions`:
+    approach every pose from both sides (`overshoot` rad), to show backlash. `load_changes`: how
+    often at most the load may be hung, exchanged or taken off (None: as rarely as can be),
+    `extra_time`: how much longer than by the shortest way all may take so that a drift does less
+    (0: the shortest order; None: a little, and as much as pays for reading poses twice);
+    `reference_every`: after so many visits one pose is visited again. `degrees`: speed or home were
+    stated in degrees, which fits revolute joints only."""
 
     speed: Positives | None = keyed(keys=SPEED_KEYS, default=None)
     home: Numbers | None = keyed("one number per joint, in {}", "home_deg", "home_si", default=None)
@@ -224,16 +223,15 @@ class LevelsTable(Table):
 class DesignSpec:
     """`criterion`: the name of one that planning has.
 
-    `levels` joint → values and `per_level` their numbers of poses (for at most one joint);
-    `loads` (L, 3) N: forces under which poses are measured, `load_states`: all of them at every
-    pose, or chosen ones; `repeats` readings each.  `repeatability` m: standard deviation of a
-    deviation common to a configuration's readings, per direction; `marker_sigma` m per marker
-    instead of the tracker's noise; `interest`: parameters, places or effects that D, A, E and O
-    count (default all but base and markers); `elsewhere`: the share of the weight that poses all
-    over the joint ranges have beside the test poses; `elsewhere_cap`: by how much the test poses
-    may be worse for as little error there as can be had (see `cap`); `combination` name → factor
-    for c; `candidates` to draw, and `taught`: a table of poses that are
-    brought, instead of these or beside them."""
+    `levels` joint → values and `per_level` their numbers of poses (for at most one joint); `loads`
+    (L, 3) N: forces under which poses are measured, `load_states`: all of them at every pose, or
+    chosen ones; `repeats` readings each.  `repeatability` m: standard deviation of a deviation
+    common to a configuration's readings, per direction; `marker_sigma` m per marker instead of the
+    tracker's noise; `interest`: parameters, places or effects that D, A, E and O count (default all
+    but base and markers); `elsewhere`: the share of the weight that poses all over the joint ranges
+    have beside the test poses; `elsewhere_cap`: by how much the test poses may be worse for as
+    little error there as can be had (see `cap`); `combination` name → factor for c; `candidates` to
+    draw, and `taught`: a table of poses that are brought, instead of these or beside them."""
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
     criterion: Text = keyed(

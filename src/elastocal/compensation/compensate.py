@@ -171,10 +171,9 @@ def nominal_path(
     whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
 
     `position` (n, 3) m and `rotation` (n, 3, 3) of the flange, or None for any, in the base
-    frame.  The first place is reached in the posture nearest to `near` (default: the middle of
-    the joint ranges), every other from the one before it, so that neighbouring places have
-    neighbouring joints.  Where that fails, or takes a large step, the nearest of many postures
-    is taken.
+    frame.  The first place is reached in the posture nearest to `near` (default: the middle of the
+    joint ranges), every other from the one before it, so that neighbouring places have neighbouring
+    joints.  Where that fails, or takes a large step, the nearest of many postures is taken.
     """
     n = len(position)
     q, reached = np.zeros((n, chain.n_joints)), np.zeros(n, dtype=bool)

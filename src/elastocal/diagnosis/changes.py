@@ -23,6 +23,7 @@ counts as noise of each.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -57,8 +58,10 @@ SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
 UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
+CONTRADICTED = 1.96  # standard deviations from a held value: beyond chance, as at 5 %
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
+BY_ONE = "one session alone shows it"
 MOST_POSES = 100_000
 
 
@@ -99,7 +102,7 @@ class Comparison(Result):
             "the cell's plan"; empty where nothing states a load.
         first_order: Whether the campaigns determined other parameters of the arm, of which sums
             were compared, to first order.
-        not_compared: What the models have and nothing was compared of, with the reason.
+        not_compared: What the models have and nothing was compared of, by the reason.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -118,7 +121,7 @@ class Comparison(Result):
     forces: Array
     loads_of: str
     first_order: bool
-    not_compared: tuple[str, ...]
+    not_compared: dict[str, list[str]]
 
     @property
     def changed(self) -> list[ParameterChange]:
@@ -165,7 +168,7 @@ class Comparison(Result):
             "changed": [c.name for c in self.changed],
             "parameters": [vars(c) for c in self.changes],
             "first_order": self.first_order,
-            "not_compared": list(self.not_compared),
+            "not_compared": [f"{n} ({why})" for why, of in self.not_compared.items() for n in of],
             "tool": {
                 "poses": len(far),
                 "force_N": self.forces[0] if len(self.forces) == 1 else None,
@@ -257,20 +260,23 @@ def _compared(
     stated = [name for name, needs in unstated.items() if not needs]
     before = arm_with(old, stated)
     own &= {*before.model.names}
-    left = [f"{name.replace('_', ' ')} (follows {listed(needs)})"
-            for name, needs in unstated.items() if needs]  # fmt: skip
+    left = defaultdict[str, list[str]](list)
+    for name, needs in unstated.items():
+        if needs:
+            left[f"follows {listed(needs)}"].append(name.replace("_", " "))
     functions: dict[str, str] = {}  # parameter → the smooth function that it is part of
     for group in smooth_groups(before.model):
         keys = {before.model.names[k] for k in group.columns.ravel()}
         functions |= dict.fromkeys(keys, group.name)
         if (keys <= set(old.determined)) != (keys <= set(new.determined)):
-            left.append(f"{group.name} (one session alone shows it)")
+            left[BY_ONE].append(group.name)
             own -= keys
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
     names, z, V, hidden = _difference(old, new, [n for n in before.model.names if n in own])
-    left += [f"{name} (one session alone shows it)" for name in hidden]
+    if hidden:
+        left[BY_ONE] += hidden
     if not names:
         raise InsufficientDataError(
             f"{old.source} and {new.source} determine no parameter of the arm in common; identify "
@@ -300,7 +306,7 @@ def _compared(
     changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
-        forces, whose, {*old.determined} & own != {*new.determined} & own, tuple(left),
+        forces, whose, {*old.determined} & own != {*new.determined} & own, dict(left),
     )  # fmt: skip
 
 
@@ -338,12 +344,13 @@ def _difference(
 ) -> tuple[list[str], Array, Array, list[str]]:
     """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows.
 
-    Raises InputError where users held a parameter at two values, or a covariance has no numbers.
+    Raises InputError where users held a parameter at two values, or at one that the other campaign
+    contradicts, or a covariance has no numbers.
     """
     said = [{*arm.determined, *(name for name, _, _ in _left_open(arm))} for arm in (old, new)]
     for name in (n for n in own if n not in said[0] | said[1]):
         require(
-            bool(np.isclose(old.values[name], new.values[name], rtol=1e-9)),
+            bool(np.isclose(old.values[name], new.values[name], rtol=1e-9, atol=0.0)),
             f"{name} is held at {old.values[name]:.6g} in {old.source} and at "
             f"{new.values[name]:.6g} in {new.source}; identify both with the same value",
         )
@@ -366,6 +373,14 @@ def _difference(
         bool((np.diag(V) > 0).all()),
         f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
     )
+    spread = np.sqrt(np.diag(V))
+    for k, off in zip(alone.tolist(), (t / spread)[len(both) :].tolist(), strict=True):
+        one, other = (new, old) if k in first else (old, new)
+        require(
+            size[k] > 0 or abs(off) < CONTRADICTED,
+            f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
+            f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
+        )
     root = drawing_root(V)
     W, target = np.split(
         linalg.solve_triangular(root, np.column_stack([H, t]), lower=True), [-1], 1

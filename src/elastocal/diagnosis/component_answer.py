@@ -171,7 +171,7 @@ class SumAnswer:
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
-        w = self._drawn[self._own :][index := self._index(members)]
+        w = self._drawn[(index := self._index(members)) + self._own]
         return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
     def _index(self, members: Sequence[int]) -> IntArray:

@@ -291,11 +291,12 @@ def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     some = subset(observed, np.arange(n) < base.n_measured)
     waves = np.zeros((n, observed.size, 0))
     common: Array | float = 0.0
-    for found in stated_deviations(base.model, some, base.x, (CONFIGURATION, TIME)):
+    of_all = stated_deviations(base.model, observed, base.x, (CONFIGURATION,))
+    for found in (*of_all, *stated_deviations(base.model, some, base.x, (TIME,))):
         if found.waves is not None:
             rest = np.zeros((n - base.n_measured, *found.waves.shape[1:]))
             waves = np.concatenate([found.waves, rest])
-        loading = found.packed(np.where(member < base.n_measured, member, -1))
+        loading = found.packed(np.where(member < len(found.unit), member, -1))
         common = common + loading @ loading.transpose(0, 2, 1)
     return waves, common
 
@@ -430,9 +431,8 @@ def monomials(x: Array) -> Array:
 # Blocks: each is one covariate at one place of the chain.  Joint i's angle moves joint k or frame
 # k; time, torque, load and approach direction move joints, frames, markers; the load's force and
 # moment give way at a link; a field over the workspace or a marker's angle of view moves the
-# reading; and products of load with time, angle and direction.  Where a block explains the
-# residual better than every effect of the catalogue, the effect is unknown and the block is its
-# location.
+# reading; and products of load with time, angle and direction.  Where a block explains the residual
+# better than every effect of the catalogue, the effect is unknown and the block is its location.
 
 # Prior sizes of an entry's components at the largest of a smooth dependence.
 MOTION, BASE_MOTION = 1e-4, 5e-5  # m or rad

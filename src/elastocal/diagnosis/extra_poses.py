@@ -357,9 +357,8 @@ def plan_extra(
 
     `diagnosis` of `table` under `model`, its verdict ambiguous or unknown_effect.  The rivals are
     the sets that it calls indistinguishable, or what the unknown effect may be.  Candidates are
-    feasible poses of the cell in the table's load states, after the campaign; their distances
-    come from the columns of the fitted arm with all fitted parameters free (see
-    `Discrimination`).
+    feasible poses of the cell in the table's load states, after the campaign; their distances come
+    from the columns of the fitted arm with all fitted parameters free (see `Discrimination`).
 
     Raises InputError for a verdict that leaves no rivals, or fewer than one pose.
     """

@@ -183,9 +183,8 @@ def _next_to(x: Array) -> tuple[IntArray, IntArray]:
     return order[:-1], order[1:]
 
 
-# The floor that is supported: by repeats where there are some, else by what neighbours do not
-# share and joints and instruments may have.  The rest of what the fit takes for noise is
-# unexplained.
+# The floor that is supported: by repeats where there are some, else by what neighbours do not share
+# and joints and instruments may have.  The rest of what the fit takes for noise is unexplained.
 
 CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted noise were noise
 # What the prior of the noise exceeds in 2.5 % of cases: the scatter of a joint (rad, or m), and
@@ -404,10 +403,9 @@ def with_intervals(drawn: Array) -> tuple[float, Interval, Interval]:
 
 # Faulty readings.
 #
-# A reading i left out has an error d whose square dᵀP_ii d follows χ², if the model is right.
-# Where it is not, an arm's own error is larger than any χ² allows, and only what no arm can do is
-# a fault.  That others show beside which the arm's error is a part of the noise, as large as need
-# be:
+# A reading i left out has an error d whose square dᵀP_ii d follows χ², if the model is right. Where
+# it is not, an arm's own error is larger than any χ² allows, and only what no arm can do is a
+# fault.  That others show beside which the arm's error is a part of the noise, as large as need be:
 #
 #   - the other markers of the same visit: the flange may be anywhere;
 #   - repeats of the same pose, marker and load: the place may be anywhere;

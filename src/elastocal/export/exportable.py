@@ -166,11 +166,10 @@ PAYLOAD = ("load.payload_scale", *(f"load.load_point_{k}" for k in "xyz"))
 class ExportNumbers:
     """The arm in numbers, in SI units.
 
-    `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of
-    the joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point`
-    (3,) in the flange frame; `load_scale`: what acts per newton declared; `springs`: those that
-    yield, with their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no
-    weights act.
+    `links`: per link the frame (4, 4) at its distal end in its joint's frame; `offsets` (n,) of the
+    joints; `T_tracker_base` (4, 4); `markers`: name → T_flange_marker (4, 4); `load_point` (3,) in
+    the flange frame; `load_scale`: what acts per newton declared; `springs`: those that yield, with
+    their compliances in rad/(N m) or m/N; `masses`: as in Chain, empty where no weights act.
     """
 
     chain: Chain

@@ -448,8 +448,7 @@ def refuse_nonsense(
         return
     # Of those set apart too: beside them the few that fit say nothing.
     error, rms = every_off
-    beyond_all = f", {share:.0%} of them more than {rounded(POOREST * length, 2)} m,"
-    most = beyond_all if share > FEW else ""
+    most = f", {share:.0%} of them more than {rounded(POOREST * length, 2)} m," * (share > FEW)
     value = f", whose {beyond[0][0]} is {rounded(beyond[0][1])} m" if beyond else ""
     raise InsufficientDataError(
         f"{table.source}: after the fit the readings are {rounded(error)} m (median) and "

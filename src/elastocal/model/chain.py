@@ -12,7 +12,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, require, wish
 from elastocal.text import did_you_mean, listed, printable, rounded
 from elastocal.units import Array
 
@@ -52,10 +52,9 @@ class LinkMass:
 class Chain:
     """A serial chain base → joint 1 → … → joint n → flange.
 
-    `flange_placement` (4, 4) places the flange in the last joint's frame.
-    `masses` holds one entry per joint, all bodies rigidly carried by that joint
-    lumped, or is empty where the source has no inertias.  `notes`: what to know of how the source
-    was read, in sentences.
+    `flange_placement` (4, 4) places the flange in the last joint's frame. `masses` holds one entry
+    per joint, all bodies rigidly carried by that joint lumped, or is empty where the source has no
+    inertias.  `notes`: what to know of how the source was read, in sentences.
     """
 
     name: str
@@ -322,21 +321,22 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
     another than the Nth joint jointN, `[robot] joint_names` says which is meant.
     """
     known, clash = _meanings(chain, cell.robot.joint_names)
+    at = f"{cell.source}: "
 
     def one(name: str, where: str, others: bool = False) -> str:
         """jointN of a name that stands at `where`; with `others` what is no joint stays."""
         if name in clash:
             raise InputError(
-                f"{cell.source}: {where} names {name}, which in the robot's file is "
-                f"joint number {known[name].removeprefix('joint')} of the arm "
-                f'({names_told(chain)}); say which is meant: [robot] joint_names = "file" (names '
-                'of the file) or "order" (jointN is the Nth)'
+                f"{where} names {name}, which in the robot's file is joint number "
+                f"{known[name].removeprefix('joint')} of the arm ({names_told(chain)}); say which "
+                'is meant: [robot] joint_names = "file" (names of the file) or "order" (jointN is '
+                "the Nth)"
             )
         if name in known or others:
             return known.get(name, name)
         raise InputError(
-            f"{cell.source}: {where} names {name}, but robot '{chain.name}' has "
-            f"{chain.n_joints} joints{did_you_mean(name, known)}; they are {listed(known)}"
+            f"{where} names {name}, but robot '{chain.name}' has {chain.n_joints} joints"
+            f"{did_you_mean(name, known)}; they are {listed(known)}"
         )
 
     loose = partial(one, others=True)
@@ -347,38 +347,40 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
         found = {of(name, where): value for name, value in table.items()}
         if len(found) < len(table):
             raise InputError(
-                f"{cell.source}: {where} names a joint twice, by its name in the "
-                f"robot's file and by its number ({names_told(chain)}); keep one"
+                f"{where} names a joint twice, by its name in the robot's file and by its number "
+                f"({names_told(chain)}); keep one"
             )
         return found
 
     spec, wishes = cell.model, cell.design
     spring = spec.nominal.gravity_compensator
-    where = "[model.nominal.gravity_compensator] joint"
+    where = f"{at}[model.nominal.gravity_compensator] joint"
     nominal = replace(
         spec.nominal,
-        settings=keys(spec.nominal.settings, "[model.nominal.settings]", loose),
-        sizes=keys(spec.nominal.sizes, "[model.nominal.sizes]", loose),
+        settings=keys(spec.nominal.settings, f"{at}[model.nominal.settings]", loose),
+        sizes=keys(spec.nominal.sizes, f"{at}[model.nominal.sizes]", loose),
         gravity_compensator=spring and spring | {"joint": one(str(spring["joint"]), where)},
     )
     effects = tuple(
-        e if e.where is None else replace(e, where=loose(e.where, "[model] effects"))
+        e if e.where is None else replace(e, where=loose(e.where, f"{at}[model] effects"))
         for e in spec.effects
     )
-    levels = keys(spec.compliance_levels, "[model.compliance_levels]", one)
+    levels = keys(spec.compliance_levels, f"{at}[model.compliance_levels]", one)
+    combined = wish("combination", f"{at}[design] combination")
+    wanted = wish("interest", f"{at}[design] interest")
     combination = {
-        ".".join([loose(place, "[design] combination"), *rest]): value
+        ".".join([loose(place, combined), *rest]): value
         for name, value in wishes.combination.items()
         for place, *rest in [name.rsplit(".", 1)]
     }
     return replace(
         cell,
-        limits=keys(cell.limits, "[limits]", one),
+        limits=keys(cell.limits, f"{at}[limits]", one),
         model=replace(spec, nominal=nominal, effects=effects, compliance_levels=levels),
         design=replace(
             wishes,
-            levels=keys(wishes.levels, "[design.levels]", one),
-            interest=tuple(loose(name, "[design] interest") for name in wishes.interest),
+            levels=keys(wishes.levels, wish("levels", f"{at}[design.levels]"), one),
+            interest=tuple(loose(name, wanted) for name in wishes.interest),
             combination=combination,
         ),
     )

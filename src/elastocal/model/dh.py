@@ -322,8 +322,7 @@ def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[L
 #     θ = Δθ,  a = a₀ + Δa,  d = d₀ + Δd,  α = α₀ + Δα
 #
 # The YAML file of `ur_calibration` states the same arm as origins of its joints, x y z in m and
-# roll pitch yaw in rad, whose z are the axes.  Base and flange
-# are the controller's.
+# roll pitch yaw in rad, whose z are the axes.  Base and flange are the controller's.
 
 UR_ENDINGS = (".conf", ".yaml", ".yml")
 JOINTS = tuple(

@@ -261,8 +261,7 @@ class TraceCriterion(ScenarioCriterion):
     Of several such sums, F (T, q, p), the power mean of `order` over T: smooth, and for inf the
     largest.  Nuisance parameters are marginalised by their columns of F being zero.  `figure` is
     `scale` · √Φ in `unit`.  1/Φ is concave for any F.  Raises InputError where F is zero or not
-    finite.
-    Source: Fedorov 1972; Atkinson, Donev & Tobias 2007, ch. 10 (L- or linear optimality).
+    finite. Source: Fedorov 1972; Atkinson, Donev & Tobias 2007, ch. 10 (L- or linear optimality).
     """
 
     F: Array
@@ -400,11 +399,10 @@ class RemainingError(TraceCriterion):
     """Φ = ρ₀² = E‖δp₀‖² = Σ_t w_t tr(A_t cov(X̂) A_tᵀ), V = cov(X̂), in m².
 
     The mean square position error left at the user's test poses and loads once the arm is
-    compensated by the identified parameters.  A (T, r, p) = ∂(position at test pose t)/∂X in m
-    per scaled parameter, w the weights (T,) scaled to the sum 1.  `reported`: ρ₀ in µm.  It does
-    not depend on the parametrisation; what no test pose shows is nuisance.
-    Source: Klimchik, Wu, Pashkevich, Caro & Furet 2012, Applied Mechanics and Materials 162,
-    161–170.
+    compensated by the identified parameters.  A (T, r, p) = ∂(position at test pose t)/∂X in m per
+    scaled parameter, w the weights (T,) scaled to the sum 1.  `reported`: ρ₀ in µm.  It does not
+    depend on the parametrisation; what no test pose shows is nuisance. Source: Klimchik, Wu,
+    Pashkevich, Caro & Furet 2012, Applied Mechanics and Materials 162, 161–170.
     """
 
     name = TEST_POSE

@@ -98,12 +98,10 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
             "A change of what is determined mostly by a prior is hardly seen, and its part of the "
             f"noise is that of the prior: {some(mostly, 8)}."
         )
-    left: dict[str, list[str]] = {}  # by its reason
-    for name, _, reason in (text.partition(" (") for text in c.not_compared):
-        left.setdefault(reason, []).append(printable(name))
     yield say.Lines([
         ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
-        *(("Not compared", f"{some(names, 8)} ({reason}.") for reason, names in left.items()),
+        *(("Not compared", printable(f"{some(names, 8)} ({why})."))
+          for why, names in c.not_compared.items()),
         *(("Next", step) for step in steps),
     ])  # fmt: skip
     yield say.Fold("", lambda: [_moves(c)], figures=("moved",))

@@ -336,11 +336,10 @@ class GravitySag(DrivenEffect):
 
     φ_i are −∂(u·w)/∂q_j of unit moments of the links that the joint carries, at the commanded
     joints, each divided by its rms over the joints' ranges: so a_i is how far the joint gives way
-    on average.  The vertical u is z of the tracker
-    frame, seen from the base wherever that stands.  It needs no masses: a_i is compliance times
-    g times a sum of masses and first moments.  Setting: the prior size `sag_size_rad` of each a_i.
-    Where compliances are known, `link_weights` says more with less, and so does `link_gravity`
-    where masses are.
+    on average.  The vertical u is z of the tracker frame, seen from the base wherever that
+    stands.  It needs no masses: a_i is compliance times g times a sum of masses and first
+    moments.  Setting: the prior size `sag_size_rad` of each a_i. Where compliances are known,
+    `link_weights` says more with less, and so does `link_gravity` where masses are.
     """
 
     name = "gravity_sag"
