@@ -58,7 +58,6 @@ SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
 UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
-CONTRADICTED = 1.96  # standard deviations from a held value: beyond chance, as at 5 %
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
 BY_ONE = "one session alone shows it"
@@ -373,11 +372,13 @@ def _difference(
         bool((np.diag(V) > 0).all()),
         f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
     )
-    spread = np.sqrt(np.diag(V))
+    # What the other held at a value that is no matter of chance, of as many as are held.
+    spread, held = np.sqrt(np.diag(V)), max(int((size[alone] == 0).sum()), 1)
+    most = -float(special.ndtri(LEVEL / held / 2))
     for k, off in zip(alone.tolist(), (t / spread)[len(both) :].tolist(), strict=True):
         one, other = (new, old) if k in first else (old, new)
         require(
-            size[k] > 0 or abs(off) < CONTRADICTED,
+            size[k] > 0 or abs(off) < most,
             f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
             f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
         )
