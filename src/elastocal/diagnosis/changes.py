@@ -256,8 +256,7 @@ def _compared(
     )
     conditions = Conditions()
     unstated = unstated_needs(old, conditions)
-    stated = [name for name, needs in unstated.items() if not needs]
-    before = arm_with(old, stated)
+    before = arm_with(old, [name for name, needs in unstated.items() if not needs])
     own &= {*before.model.names}
     left = defaultdict[str, list[str]](list)
     for name, needs in unstated.items():
@@ -309,18 +308,21 @@ def _compared(
     )  # fmt: skip
 
 
-def _estimates(arm: CalibratedArm, own: list[str]) -> tuple[IntArray, Array, Array, Array]:
-    """Which of the parameters `own` were determined (k,), y (k,) and A (k, own) with y = A X + ε,
-    and the covariance (k, k) of ε: noise, and what was left open of the set-up.
+def _estimates(
+    arm: CalibratedArm, own: list[str], free: list[str]
+) -> tuple[IntArray, Array, Array, Array]:
+    """Which of the parameters `own` are `free` (k,), y (k,) and A (k, own) with y = A X + ε, and
+    the covariance (k, k) of ε: noise, and what was left open of the set-up.
 
     Raises InputError where the covariance has no numbers.
     """
-    kept = np.array([k for k, name in enumerate(own) if name in arm.determined], dtype=np.int64)
+    kept = np.array([k for k, name in enumerate(own) if name in free], dtype=np.int64)
     at = [arm.determined.index(own[k]) for k in kept]
     A, V, values = np.eye(len(own))[kept], arm.covariance[np.ix_(at, at)], arm.values
     require(
-        bool(np.isfinite(V).all()),
-        f"{arm.source}: its covariance has no numbers for {', '.join(own[:3])} …; identify anew",
+        bool(np.isfinite(V).all() and (np.diag(V) > 0).all()),
+        f"{arm.source}: its covariance has no numbers, or negative variances, for "
+        f"{', '.join(own[:3])} …; identify anew",
     )
     y = np.array([values[own[k]] for k in kept])
     for name, shares, typical in _left_open(arm):
@@ -346,14 +348,16 @@ def _difference(
     Raises InputError where users held a parameter at two values, or at one that the other campaign
     contradicts, or a covariance has no numbers.
     """
-    said = [{*arm.determined, *(name for name, _, _ in _left_open(arm))} for arm in (old, new)]
+    # What constraints fix is held as well.
+    free = [np.array(arm.determined)[np.diag(arm.covariance) != 0].tolist() for arm in (old, new)]
+    said = [{*free[i], *(n for n, _, _ in _left_open(arm))} for i, arm in enumerate((old, new))]
     for name in (n for n in own if n not in said[0] | said[1]):
         require(
             bool(np.isclose(old.values[name], new.values[name], rtol=1e-9, atol=0.0)),
             f"{name} is held at {old.values[name]:.6g} in {old.source} and at "
             f"{new.values[name]:.6g} in {new.source}; identify both with the same value",
         )
-    (first, y1, A1, V1), (second, y2, A2, V2) = (_estimates(arm, own) for arm in (old, new))
+    (first, y1, A1, V1), (second, y2, A2, V2) = map(_estimates, (old, new), (own, own), free)
     both, alone = np.intersect1d(first, second), np.setxor1d(first, second)
     # What both determined drops out of the differences, whatever it is: T of all estimates.
     of, side = np.append(first, second), np.repeat([-1.0, 1.0], [len(first), len(second)])
@@ -368,10 +372,6 @@ def _difference(
     G[:, both] = 0.0
     t = T @ np.append(y1, y2) - G @ nominal[[old.model.names.index(name) for name in own]]
     V = T @ linalg.block_diag(V1, V2) @ T.T + (G * size**2) @ G.T
-    require(
-        bool((np.diag(V) > 0).all()),
-        f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
-    )
     # What the other held at a value that is no matter of chance, of as many as are held.
     spread, held = np.sqrt(np.diag(V)), max(int((size[alone] == 0).sum()), 1)
     most = -float(special.ndtri(LEVEL / held / 2))
