@@ -342,7 +342,7 @@ class Feasibility:
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
         """Every rule on every pose q (N, n) under a force (3,) or (N, 3) N; not `every`: a pose
         that broke a rule is not looked at again.  The load hangs wherever the force is not zero."""
-        poses = self._poses(q, force)
+        poses = self.kinematics.poses(q, force)
         broken = np.zeros((len(poses), len(self.rules)), dtype=bool)
         left = np.arange(len(poses))
         for k, rule in enumerate(self.rules):
@@ -373,7 +373,7 @@ class Feasibility:
         """Joints (N, n), force (3,) → (N, markers): which markers the tracker sees of poses that
         are feasible; None where it sees all of them."""
         rule = next((rule for rule in self.rules if isinstance(rule, EnoughMarkers)), None)
-        return None if rule is None else lambda q, force: rule.seen(self._poses(q, force))
+        return None if rule is None else lambda q, force: rule.seen(self.kinematics.poses(q, force))
 
     def advice(self, verdict: PoseFeasibility) -> str:
         """The smallest set of rules that stops candidates by itself, and of these the one that
@@ -394,7 +394,7 @@ class Feasibility:
         text += f"{counts[best]} of them: " + "; ".join(rule.remedy(poses) for rule in chosen)
         lower, upper = finite_ranges(self.chain, *joint_limits(self.cell, self.chain))
         q = np.random.default_rng(0).uniform(lower, upper, (MOST_TRIED, len(lower)))
-        poses = self._poses(q, LOADED)
+        poses = self.kinematics.poses(q, LOADED)
         for pair in self.pairs:
             if Collisions(self.kinematics, [pair]).hits(poses).all():
                 a, b = pair.names
@@ -407,8 +407,7 @@ class Feasibility:
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
         """(M,) for moves q_from → q_to (M, n), as `Paths` guarantees it, each checked once however
         often it is asked for; visibility and torque concern poses at rest."""
-        start, end = self._poses(q_from, LOADED).q, self._poses(q_to, LOADED).q
-        start, end = np.broadcast_arrays(start, end)
+        start, end = np.broadcast_arrays(*np.atleast_2d(q_from, q_to))
         hangs = np.broadcast_to(loaded, len(start))
         ends = zip(start, end, hangs.tolist(), strict=True)
         moves = [(*sorted((a.tobytes(), b.tobytes())), hung) for a, b, hung in ends]
@@ -429,14 +428,3 @@ class Feasibility:
     @cached_property
     def _paths(self) -> Paths:
         return Paths(self.kinematics, self.pairs, self.cell.workspace.load)
-
-    def _poses(self, q: Array, force: Array) -> Poses:
-        q = np.atleast_2d(np.asarray(q, dtype=float))
-        if q.shape[1] != self.chain.n_joints:
-            raise InputError(
-                f"poses have {q.shape[1]} joint values, but robot '{self.chain.name}' has "
-                f"{self.chain.n_joints} joints"
-            )
-        if not np.isfinite(q).all():
-            raise InputError(f"pose {int(np.argwhere(~np.isfinite(q))[0][0])} is not finite")
-        return self.kinematics.poses(q, force)
