@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import count
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -104,9 +104,8 @@ class DesignOptions:
     hold: bool = False
 
     def __post_init__(self) -> None:
-        efforts = get_args(Effort)
         told = f"{option('effort')} {quoted(self.effort)} is unknown"
-        check_known(self.effort, efforts, told)
+        check_known(self.effort, EFFORTS, told)
         require(
             self.jobs == -1 or self.jobs >= 1,
             f"{option('jobs')} takes a number of processes, or -1 for all cores; found {self.jobs}",
@@ -248,12 +247,6 @@ class _Design:
 
     def run(self) -> Plan:
         plan = self._chosen()
-        if (gain := self._gain(plan)) is not None:
-            told = (
-                "with the smooth functions, which stay uncertain, the error at the test poses is "
-            )
-            told += f"{rounded(gain.after * 1e6)} µm rms"
-            plan = replace(plan, gain=gain, warnings=(*plan.warnings, told))
         if self.conditions is None:
             return plan
         whole, fixed = self.conditions
@@ -308,19 +301,26 @@ class _Design:
         drawn = setup.problem(pool, found.shares).random_information(options.seed)
         return self._plan(setup, found, counts, targets.source, curve, drawn)
 
-    def _gain(self, plan: Plan) -> Gain | None:
-        """The plan's gain where smooth functions count, which the readings show in part."""
+    def _gain(self, setup: Setup, M: Array, q: Array, readings: IntArray) -> Gain | None:
+        """Of poses q (N, n) with information M (p, p); of smooth functions, where the cell has
+        some, what the readings show of them counts too."""
         options, done, whole = self.options, self.options.done, self.whole
-        if plan.gain is None or done is None or whole is None:
+        if done is not None and whole is not None and setup.target_rows is not None:
+            self.progress("gain with the smooth functions")
+            fixed = tuple(name for name in self.fixed if whole.meant_by(name))
+            known = Known(fixed, options.prior, measured(whole, done, fixed))
+            targets, sight = self.targets()[0], self.feasibility.seen
+            setup = set_up(whole, q, len(q), targets, known, sight=sight, hold=True)
+            M = setup.gathered(setup.information.blocks(q, readings))
+        if done is None or setup.target_rows is None:
             return None
-        self.progress("gain with the smooth functions")
-        fixed = tuple(name for name in self.fixed if whole.meant_by(name))
-        known = Known(fixed, options.prior, measured(whole, done, fixed))
-        targets, sight = self.targets()[0], self.feasibility.seen
-        setup = set_up(whole, plan.q, len(plan), targets, known, sight=sight, hold=True)
-        assert setup.target_rows is not None  # a plan with a gain has test poses
-        M = setup.gathered(setup.information.blocks(plan.q, plan.readings))
-        return Gain.of(setup.target_rows, setup.prior, M, options.seed)
+        gain = Gain.of(setup.target_rows, setup.prior, M, options.seed)
+        if whole is not None:
+            self.warnings.append(
+                "with the smooth functions, which stay uncertain, the error at the test poses is "
+                f"{rounded(gain.after * 1e6)} µm rms"
+            )
+        return gain
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -467,9 +467,7 @@ class _Design:
             left = alias.information(M, execution.times(len(q), len(self.forces)), noise)
         seen, numbers = setup.information.seen(q), setup.information.numbers(q, readings)
         numbers += 0 if done is None else done.numbers
-        R, gain = setup.target_rows, None
-        if done is not None and R is not None:
-            gain = Gain.of(R, setup.prior, M, self.options.seed)
+        gain = self._gain(setup, M, q, readings)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
         labels = self.options.done.configuration_labels if self.options.done else ()
         return Plan(

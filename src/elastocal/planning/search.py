@@ -384,10 +384,10 @@ class SearchEffort:
 
 
 EFFORTS = {
-    "batch": SearchEffort(starts=0, rounds=0, exchanges=4),
     "quick": SearchEffort(starts=5, rounds=0),
     "normal": SearchEffort(starts=8, rounds=2),
     "thorough": SearchEffort(starts=40, rounds=4),
+    "batch": SearchEffort(starts=0, rounds=0, exchanges=4),
 }
 
 
