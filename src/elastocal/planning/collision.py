@@ -229,6 +229,10 @@ class Sight:
         )
         self._by_length: dict[int, Collisions] = {}
 
+    def past(self, body: Body) -> Sight:
+        """As if there were no other body."""
+        return Sight(self._kinematics, [body], self._eye, self._radius)
+
     def blocked(self, poses: Poses, marker: Array) -> BoolArray:
         line = marker_positions(poses, [marker])[:, 0] - self._eye
         distance = np.linalg.norm(line, axis=1)

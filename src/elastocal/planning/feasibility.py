@@ -149,67 +149,58 @@ class KeepApart(Rule):
         return text
 
 
+@dataclass(frozen=True)
 class LineOfSight(Rule):
     """Every marker is seen from the tracker."""
 
+    sight: Sight
+    markers: Mapping[str, Array]
     name = "line_of_sight"
-
-    def __init__(
-        self, kinematics: Kinematics, bodies: Sequence[Body], eye: Array, radius: float,
-        markers: Mapping[str, Array],
-    ) -> None:  # fmt: skip
-        self._sight = Sight(kinematics, bodies, eye, radius)
-        self._markers = dict(markers)
-        self._one = lambda body: Sight(kinematics, [body], eye, radius)
 
     def broken(self, poses: Poses) -> BoolArray:
         hidden = np.zeros(len(poses), dtype=bool)
-        for marker in self._markers.values():
+        for marker in self.markers.values():
             observed = np.flatnonzero(~hidden)
-            hidden[observed] = self._sight.blocked(poses.take(observed), marker)
+            hidden[observed] = self.sight.blocked(poses.take(observed), marker)
         return hidden
-
-    def hides(self, poses: Poses, marker: str) -> BoolArray:
-        return self._sight.blocked(poses, self._markers[marker])
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         return {
-            f"{name} behind {body.name}": self._one(body).blocked(poses, marker)
-            for body in self._sight.bodies
-            for name, marker in self._markers.items()
+            f"{name} behind {body.name}": self.sight.past(body).blocked(poses, marker)
+            for body in self.sight.bodies
+            for name, marker in self.markers.items()
         }
 
 
+@dataclass(frozen=True)
 class EnoughMarkers(Rule):
     """At least so many markers are in range, turned towards the tracker, and in its sight."""
 
+    bounds: Sequence[Rule]
+    sight: Sight | None
+    markers: Mapping[str, Array]
+    least: int
     name = "markers_seen"
-
-    def __init__(
-        self, bounds: Sequence[Rule], sight: Sequence[LineOfSight], markers: Sequence[str],
-        least: int,
-    ) -> None:  # fmt: skip
-        self._bounds, self._sight, self._markers, self._least = bounds, sight, markers, least
 
     def seen(self, poses: Poses) -> BoolArray:
         """(N, markers): which are seen; nothing is looked for behind bodies where too few remain
         without."""
-        seen = np.ones((len(poses), len(self._markers)), dtype=bool)
-        for rule in self._bounds:
+        seen, names = np.ones((len(poses), len(self.markers)), dtype=bool), list(self.markers)
+        for rule in self.bounds:
             for name, outside in rule.causes(poses).items():
-                seen[:, self._markers.index(name)] &= ~outside
-        hopeful = seen.sum(axis=1) >= self._least
-        for sight in self._sight:
-            for k, name in enumerate(self._markers):
+                seen[:, names.index(name)] &= ~outside
+        hopeful = seen.sum(axis=1) >= self.least
+        if self.sight is not None:
+            for k, marker in enumerate(self.markers.values()):
                 rows = np.flatnonzero(hopeful & seen[:, k])
-                seen[rows, k] = ~sight.hides(poses.take(rows), name)
+                seen[rows, k] = ~self.sight.blocked(poses.take(rows), marker)
         return seen
 
     def broken(self, poses: Poses) -> BoolArray:
-        return np.asarray(self.seen(poses).sum(axis=1) < self._least)
+        return np.asarray(self.seen(poses).sum(axis=1) < self.least)
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        return dict(zip(self._markers, ~self.seen(poses).T, strict=True))
+        return dict(zip(self.markers, ~self.seen(poses).T, strict=True))
 
 
 @dataclass(frozen=True)
@@ -238,16 +229,14 @@ class PoseFeasibility:
 def rule_book(
     cell: Cell, chain: Chain, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
 ) -> tuple[Rule, ...]:
-    bounds = tuple(_visibility(cell))
-    sight: tuple[LineOfSight, ...] = ()
-    stated, markers, least = cell.workspace.visibility, cell.tool.markers, None
-    if stated is not None:
-        least, eye = stated.min_markers, cell.tracker.position
-        if stated.line_of_sight:
-            sight = (LineOfSight(kinematics, bodies, eye, stated.beam_radius, markers),)
-    seen: tuple[Rule, ...] = sight
+    bounds, stated, markers = tuple(_visibility(cell)), cell.workspace.visibility, cell.tool.markers
+    sight, seen = None, tuple[Rule, ...]()
+    if stated is not None and stated.line_of_sight:
+        sight = Sight(kinematics, bodies, cell.tracker.position, stated.beam_radius)
+        seen = (LineOfSight(sight, markers),)
+    least = None if stated is None else stated.min_markers
     if least is not None and least < len(markers):
-        bounds, seen = (), (EnoughMarkers(bounds, sight, tuple(markers), least),)
+        bounds, seen = (), (EnoughMarkers(bounds, sight, markers, least),)
     units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
     joints = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
     limits = joint_limits(cell, chain)
