@@ -59,9 +59,8 @@ class Boxes:
     def of(cls, cell: Cell) -> Boxes:
         freedom = cell.design.choose
         assert freedom is not None
-        boxes = dict(freedom.markers)
-        boxes |= {} if freedom.load_point is None else {LOAD_POINT: freedom.load_point}
-        boxes |= {} if freedom.tracker is None else {TRACKER: freedom.tracker}
+        every = freedom.markers | {LOAD_POINT: freedom.load_point, TRACKER: freedom.tracker}
+        boxes = {name: box for name, box in every.items() if box is not None}
         corners = np.array(list(boxes.values())).reshape(-1, 2, 3)
         return cls(tuple(boxes), corners[:, 0], corners[:, 1])
 
