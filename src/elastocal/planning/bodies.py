@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError, check_known, require, said_of
@@ -106,7 +107,6 @@ def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
 @lru_cache(maxsize=256)
 def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, NDArray[np.int64]]:
     import coal
-    from scipy.spatial import QhullError
 
     with said_of(f"mesh of body '{name}'"):
         check_regular(path, "mesh", MESH_BYTES)
@@ -122,8 +122,6 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
 
 def outward(cloud: Array) -> tuple[Array, NDArray[np.int64]]:
     """Vertices (k, 3) of the convex hull of points (n, 3), and its triangles, turned outwards."""
-    from scipy.spatial import ConvexHull
-
     found = ConvexHull(cloud)
     used, index = np.unique(found.simplices, return_inverse=True)
     points, triangles = cloud[used], index.reshape(found.simplices.shape)

@@ -469,7 +469,6 @@ class _Design:
         numbers += 0 if done is None else done.numbers
         gain = self._gain(setup, M, q, readings)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
-        labels = self.options.done.configuration_labels if self.options.done else ()
         return Plan(
             model=self.model, criterion=spec.criterion, value=found.value,
             reported=figure(found.value), unit=setup.criterion.unit, q=q, forces=self.forces,
@@ -485,7 +484,7 @@ class _Design:
             polished=int(((chosen >= found.first) & (chosen < len(found.pool))).sum()),
             bound_reported=None if bound is None else figure(bound),
             warnings=tuple(self.warnings), made_for="" if done is None else done.note,
-            first=next_number(labels), names=self._names(pool, chosen, len(found.pool)),
+            names=self._names(pool, chosen, len(found.pool)),
             chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=setup.everywhere(M, drawn, left), seen=None if seen.all() else seen,
             readings=readings, states=self.states, gain=gain,
@@ -495,9 +494,6 @@ class _Design:
         """Those that stay, behind the `own` ones of the pool, keep theirs, and the others are
         numbered after all there have been."""
         pins, q = self.options.pins, pool.q
-        crossed = len(np.unique(q[chosen], axis=0)) == len(chosen)
-        if pins is None and not self.taught and crossed:
-            return ()
         labels = self.options.done.configuration_labels if self.options.done else ()
         kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
         new = count(next_number((*labels, *taken, *self.taught.values())))

@@ -375,13 +375,12 @@ class Plan(Result):
         bound_reported: The certificate's bound, in `unit`.
         warnings: What to know before one measures, in sentences.
         made_for: Beside measurements done, the arm that the plan is made for, in words.
-        first: Number of the first configuration: after those that were measured already.
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
         readings: How often each of them is read of each pose in each load state (N, L).
         states: Whether poses are read in all load states or in chosen ones, where it was asked.
-        names: Of the configurations, where poses of an earlier plan were kept.
+        names: Of the configurations.
         gain: What the plan adds to measurements done, where it does.
         chosen: What was chosen besides the poses, where [design.choose] asks for it.
         scheduled: What effects of time and approach make of it, where the cell has some.
@@ -420,7 +419,6 @@ class Plan(Result):
     bound_reported: float | None = None
     warnings: tuple[str, ...] = field(default=())
     made_for: str = ""
-    first: int = 1
     chance: Chance | None = None
     everywhere: Everywhere | None = None
     seen: BoolArray | None = None
@@ -529,7 +527,7 @@ class Plan(Result):
 
     @property
     def configurations(self) -> tuple[str, ...]:
-        return self.names or tuple(str(self.first + k) for k in range(len(self.q)))
+        return self.names
 
     @property
     def group_names(self) -> tuple[str, ...]:
