@@ -268,8 +268,7 @@ def _mobile(
 
 
 def applied(chosen: Chosen, cell: Cell) -> Cell:
-    after = np.array([at[1] for at in chosen.places.values()])
-    cell = Boxes(tuple(chosen.places), after, after).placed(cell, after)
+    cell = Boxes.of(cell).placed(cell, np.array([after for _, after in chosen.places.values()]))
     return cell if chosen.loads is None else _with_loads(cell, chosen.loads)
 
 

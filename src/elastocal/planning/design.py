@@ -325,9 +325,8 @@ class _Design:
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
         shares = shares_of(self.cell, n_poses) - self.pinned
-        short = np.flatnonzero(shares < 0)
         require(
-            not len(short) and bool(shares.any()),
+            bool((shares >= 0).all() and shares.any()),
             f"{self.cell.source}: {self.pinned.sum()} poses are to be kept, and "
             f"the plan has no more than {shares_of(self.cell, n_poses).sum()}"
             f"{' with their shares of the levels' if len(shares) > 1 else ''}; ask for more poses",

@@ -354,9 +354,7 @@ def distinct(q: Array, count: int) -> IntArray:
     """Indices of the first `count` poses of q (N, n) that lie `APART` from those before."""
     chosen: list[int] = []
     for i, pose in enumerate(q):
-        if len(chosen) == count:
-            break
-        if all(np.abs(pose - q[k]).max() > APART for k in chosen):
+        if len(chosen) < count and all(np.abs(pose - q[k]).max() > APART for k in chosen):
             chosen.append(i)
     return np.array(chosen, dtype=np.int64)
 
