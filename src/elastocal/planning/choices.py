@@ -324,9 +324,8 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
             "load_change_s of [design.motion] where they are too high"
         )
     # A plan that holds more parameters errs less in the others, but not in all.
-    most = max(fit.kept for fit in found)
-    whole = [fit for fit in found if fit.kept == most]
-    return tuple(fit.size for fit in whole), min(whole, key=lambda fit: fit.value)
+    best = min(found, key=lambda fit: (-fit.kept, fit.value))
+    return tuple(fit.size for fit in found if fit.kept == best.kept), best
 
 
 def _fitting(

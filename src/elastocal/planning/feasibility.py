@@ -15,6 +15,7 @@ from elastocal.errors import InputError
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.planning.bodies import RULES, Body, Pair, cell_bodies, cell_pairs
 from elastocal.planning.collision import (
+    DOWN,
     Collisions,
     Kinematics,
     Paths,
@@ -307,7 +308,6 @@ def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
 
 SAMPLE = 2000  # candidates whose causes are looked at
 ON_THE_WAY = 200  # samples of a move, in which bodies that come too close are sought
-LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
 MOST_TRIED = 300  # random poses in which a pair must once keep apart to be believed
 
 
@@ -383,7 +383,7 @@ class Feasibility:
         text += f"{counts[best]} of them: " + "; ".join(rule.remedy(poses) for rule in chosen)
         lower, upper = finite_ranges(self.chain, *joint_limits(self.cell, self.chain))
         q = np.random.default_rng(0).uniform(lower, upper, (MOST_TRIED, len(lower)))
-        poses = self.kinematics.poses(q, LOADED)
+        poses = self.kinematics.poses(q, DOWN)
         for pair in self.pairs:
             if Collisions(self.kinematics, [pair]).hits(poses).all():
                 a, b = pair.names
@@ -410,7 +410,7 @@ class Feasibility:
         """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are
         met."""
         step = np.linspace(0.0, 1.0, ON_THE_WAY)[:, None]
-        poses = self.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
+        poses = self.kinematics.poses(q_from + step * (q_to - q_from), DOWN * loaded)
         hits = hits_by_pair(self.kinematics, self.pairs, poses)
         return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
 
