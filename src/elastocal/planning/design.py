@@ -132,36 +132,32 @@ def design(
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
     with options_given(options.asked):
-        return _planned(cell, options, checkpoint, progress)
+        read = options.done.marker_names if options.done else ()
+        if options.done is not None and lacks_noise(cell):
+            progress("noise of the measurements done")
+            with suppress(InsufficientDataError):  # then it has to be stated
+                found = identify(Model(cell, read), options.done, Options(fixed=options.fixed))
+                cell, told = with_noise_of(cell, found)
+                options = replace(options, notes=(*options.notes, *told))
+        whole, spec = _Design(cell, options, checkpoint, progress), cell.design
+        if spec.choose is None and spec.minutes is None:
+            return whole.run()
+        # An assembled model knows no markers but the cell's, nor the file's names of joints.
+        cell = Model(cell, read).cell
+        choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
+        chosen = None if spec.choose is None else choice.best()
+        placed = cell if chosen is None else applied(chosen, cell)
 
+        def plan_of(cell: Cell) -> Plan:
+            own = checkpoint
+            if spec.minutes:  # poses come in several numbers
+                own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
+            made = _Design(cell, options, own, progress, whole)
+            return replace(made.run(), chosen=chosen)
 
-def _planned(
-    cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
-) -> Plan:
-    read = options.done.marker_names if options.done else ()
-    if options.done is not None and lacks_noise(cell):
-        progress("noise of the measurements done")
-        with suppress(InsufficientDataError):  # then it has to be stated
-            found = identify(Model(cell, read), options.done, Options(fixed=options.fixed))
-            cell, told = with_noise_of(cell, found)
-            options = replace(options, notes=(*options.notes, *told))
-    whole, spec = _Design(cell, options, checkpoint, progress), cell.design
-    if spec.choose is None and spec.minutes is None:
-        return whole.run()
-    # What is assembled of a chain knows no markers but the cell's, nor the file's names of joints.
-    cell = Model(cell, read).cell
-    choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
-    chosen = None if spec.choose is None else choice.best()
-    placed = cell if chosen is None else applied(chosen, cell)
-
-    def plan_of(cell: Cell) -> Plan:
-        own = checkpoint
-        if spec.minutes:  # poses come in several numbers
-            own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
-        made = _Design(cell, options, own, progress, whole)
-        return replace(made.run(), chosen=chosen)
-
-    return plan_of(placed) if not spec.minutes else within(choice, placed, plan_of, spec.minutes)
+        if not spec.minutes:
+            return plan_of(placed)
+        return within(choice, placed, plan_of, spec.minutes)
 
 
 class _Design:

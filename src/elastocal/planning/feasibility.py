@@ -343,8 +343,7 @@ class Feasibility:
         """Every rule that each pose q (N, n) breaks under any of the `forces` (k, 3)."""
         ranked = forces[np.argsort(np.linalg.norm(forces, axis=1), kind="stable")]
         verdicts = [self.check(q, force) for force in ranked]
-        broken = np.any([verdict.broken for verdict in verdicts], axis=0)
-        return replace(verdicts[-1], broken=broken)
+        return replace(verdicts[-1], broken=np.any([each.broken for each in verdicts], axis=0))
 
     def under(self, q: Array, forces: Array) -> PoseFeasibility:
         """The first rule that each pose q (N, n) breaks under the first of `forces` (k, 3) that

@@ -210,9 +210,8 @@ class Chance:
         values = np.sort(criterion.of_information(drawn))
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
         median, best, worst = (criterion.figure(v) if np.isfinite(v) else None for v in phi)
-        determined = int(np.isfinite(values).sum())
         share = value / phi[0] if criterion.certifiable and np.isfinite(phi[0]) else None
-        return cls(len(values), determined, median, best, worst, share)
+        return cls(len(values), int(np.isfinite(values).sum()), median, best, worst, share)
 
 
 @dataclass(frozen=True)
