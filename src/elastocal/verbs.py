@@ -190,7 +190,7 @@ def design_request(
     """
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.model.manipulator import Model
-    from elastocal.planning.candidates import check_levels, read_pins
+    from elastocal.planning.candidates import read_pins, shares_of
     from elastocal.planning.design import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
@@ -202,9 +202,9 @@ def design_request(
         cell = replace(cell, design=_design_of(cell, asked))
         cell.check()
     for number in curve:
-        check_levels(cell, "curve", whole("curve", number))
+        shares_of(cell, whole("curve", number), "curve")  # each level takes a pose
     if asked.get("poses") is not None:
-        check_levels(cell, "poses", cell.design.poses or 0)
+        shares_of(cell, cell.design.poses, "poses")
     files, done = (augment, knowledge, keep, strike), None
     known = None if all(file is None for file in files) else Model(cell)
     if augment is not None and known is not None:

@@ -29,7 +29,7 @@ from elastocal.identification.prediction import over_the_workspace, predicted_er
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import check_levels
+from elastocal.planning.candidates import shares_of
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
@@ -160,7 +160,7 @@ def next_poses(
         # A joint whose compliance is known at its levels only can be nowhere else.
         levels=spec.levels or model.cell.model.compliance_levels,
     )  # fmt: skip
-    check_levels(replace(model.cell, design=spec), "batch", batch)
+    shares_of(replace(model.cell, design=spec), batch, "batch")  # each level takes a pose
     unstated = lacks_noise(replace(model.cell, design=spec))
     why = None
     if len(np.unique(table.configuration)) >= FEWEST:

@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError, check_known, require, said_of
@@ -24,11 +25,15 @@ MESH_BYTES = 100_000_000
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
-def hull(solid: Solid) -> tuple[Array, float]:
+def hull(solid: Solid, boxed: bool = False) -> tuple[Array, float]:
     """Points (k, 3) in the carrier's frame and a radius: the solid is their convex hull grown by
-    the radius; a cylinder lies inside."""
+    the radius; a cylinder lies inside, and a mesh that is `boxed`, so that k ≤ 8, in the box around
+    it along its own axes."""
     if solid.shape == "mesh":
         points, radius = mesh_hull(solid)[0], 0.0
+        if boxed:
+            low, high = points.min(axis=0), points.max(axis=0)
+            points = (low + high) / 2 + CORNERS * (high - low)
     elif solid.shape == "box":
         points, radius = CORNERS * solid.size, 0.0
     elif solid.shape == "sphere":
@@ -37,15 +42,6 @@ def hull(solid: Solid) -> tuple[Array, float]:
         half = np.array([0.0, 0.0, solid.size[1] / 2])
         points, radius = np.stack([-half, half]), float(solid.size[0])
     return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], radius
-
-
-def few_points(solid: Solid) -> tuple[Array, float]:
-    """As `hull`, but of a mesh the box around it, along its own axes, so that k ≤ 8."""
-    if solid.shape != "mesh":
-        return hull(solid)
-    low, high = (side(mesh_hull(solid)[0], axis=0) for side in (np.min, np.max))
-    points = (low + high) / 2 + CORNERS * (high - low)
-    return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], 0.0
 
 
 def support(solid: Solid, direction: Array) -> float:
@@ -111,7 +107,6 @@ def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
 @lru_cache(maxsize=256)
 def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, NDArray[np.int64]]:
     import coal
-    from scipy.spatial import QhullError
 
     with said_of(f"mesh of body '{name}'"):
         check_regular(path, "mesh", MESH_BYTES)
@@ -127,8 +122,6 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
 
 def outward(cloud: Array) -> tuple[Array, NDArray[np.int64]]:
     """Vertices (k, 3) of the convex hull of points (n, 3), and its triangles, turned outwards."""
-    from scipy.spatial import ConvexHull
-
     found = ConvexHull(cloud)
     used, index = np.unique(found.simplices, return_inverse=True)
     points, triangles = cloud[used], index.reshape(found.simplices.shape)

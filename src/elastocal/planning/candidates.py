@@ -233,12 +233,13 @@ def _checked(
 DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
 
 
-def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
-    """Poses (L,) per level of [design.levels], (1,) without, `n_poses` in all or as the cell says;
-    what does not divide evenly goes to the first levels."""
-    spec = cell.design
-    levels = _levels(cell)
-    where = f"{cell.source}: [design]"
+def shares_of(cell: Cell, n_poses: int | None = None, asked: str = "") -> IntArray:
+    """Poses (L,) per level of [design.levels], (1,) without, `n_poses` in all, as the option
+    `asked` says, or as the cell says; what does not divide evenly goes to the first levels.
+
+    Raises InputError where these are fewer than the levels."""
+    spec, where = cell.design, f"{cell.source}: [design]"
+    levels = sum(map(len, spec.levels.values())) or 1
     if spec.per_level and n_poses is None:
         each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
         require(
@@ -248,26 +249,12 @@ def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
         )
         return np.array(each, dtype=np.int64)
     total = n_poses or spec.poses or DEFAULT
-    require(
-        total >= levels,
-        f"{where} asks for {total} poses at {levels} levels; ask for {levels} at least, or drop "
-        "levels",
-    )
+    told = f"{where} asks for {total} poses at {levels} levels; ask for {levels}"
+    if asked:
+        told = f"{option(asked, total)}: {cell.source} has {levels} levels, each with a pose; "
+        told += f"ask for {levels} poses"
+    require(not 0 < total < levels, f"{told} at least, or drop levels")
     return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
-
-
-def _levels(cell: Cell) -> int:
-    return max(max((len(v) for v in cell.design.levels.values()), default=1), 1)
-
-
-def check_levels(cell: Cell, name: str, poses: int) -> None:
-    """Raise InputError where the option `name` asks for fewer poses than the cell has levels."""
-    levels = _levels(cell)
-    require(
-        not 0 < poses < levels,
-        f"{option(name, poses)}: {cell.source} has {levels} levels, each with a pose; "
-        f"ask for {levels} poses at least, or drop levels",
-    )
 
 
 def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:

@@ -59,9 +59,8 @@ class Boxes:
     def of(cls, cell: Cell) -> Boxes:
         freedom = cell.design.choose
         assert freedom is not None
-        boxes = dict(freedom.markers)
-        boxes |= {} if freedom.load_point is None else {LOAD_POINT: freedom.load_point}
-        boxes |= {} if freedom.tracker is None else {TRACKER: freedom.tracker}
+        every = freedom.markers | {LOAD_POINT: freedom.load_point, TRACKER: freedom.tracker}
+        boxes = {name: box for name, box in every.items() if box is not None}
         corners = np.array(list(boxes.values())).reshape(-1, 2, 3)
         return cls(tuple(boxes), corners[:, 0], corners[:, 1])
 
@@ -269,8 +268,7 @@ def _mobile(
 
 
 def applied(chosen: Chosen, cell: Cell) -> Cell:
-    after = np.array([at[1] for at in chosen.places.values()])
-    cell = Boxes(tuple(chosen.places), after, after).placed(cell, after)
+    cell = Boxes.of(cell).placed(cell, np.array([after for _, after in chosen.places.values()]))
     return cell if chosen.loads is None else _with_loads(cell, chosen.loads)
 
 
@@ -326,9 +324,8 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
             "load_change_s of [design.motion] where they are too high"
         )
     # A plan that holds more parameters errs less in the others, but not in all.
-    most = max(fit.kept for fit in found)
-    whole = [fit for fit in found if fit.kept == most]
-    return tuple(fit.size for fit in whole), min(whole, key=lambda fit: fit.value)
+    best = min(found, key=lambda fit: (-fit.kept, fit.value))
+    return tuple(fit.size for fit in found if fit.kept == best.kept), best
 
 
 def _fitting(

@@ -26,7 +26,7 @@ from elastocal.planning.bodies import (
     Pair,
     coal_shape,
     data_base,
-    few_points,
+    hull,
     rotation_to,
     touches,
 )
@@ -229,6 +229,10 @@ class Sight:
         )
         self._by_length: dict[int, Collisions] = {}
 
+    def past(self, body: Body) -> Sight:
+        """As if there were no other body."""
+        return Sight(self._kinematics, [body], self._eye, self._radius)
+
     def blocked(self, poses: Poses, marker: Array) -> BoolArray:
         line = marker_positions(poses, [marker])[:, 0] - self._eye
         distance = np.linalg.norm(line, axis=1)
@@ -356,7 +360,7 @@ def _reach(bodies: Sequence[Body]) -> tuple[Array, Array]:
     """Points (k, 3) on a joint and what any point of its bodies may be further out (k,)."""
     if not bodies:  # its origin, which bounds nothing that is asked for
         return np.zeros((1, 3)), np.zeros(1)
-    found = [(b.solid.shape, *few_points(b.solid)) for b in bodies]
+    found = [(b.solid.shape, *hull(b.solid, boxed=True)) for b in bodies]
     radii = [np.full(len(own), (shape == "cylinder") * radius) for shape, own, radius in found]
     return np.concatenate([own for _, own, _ in found]), np.concatenate(radii)
 

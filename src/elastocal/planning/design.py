@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from itertools import count
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -104,9 +104,8 @@ class DesignOptions:
     hold: bool = False
 
     def __post_init__(self) -> None:
-        efforts = get_args(Effort)
         told = f"{option('effort')} {quoted(self.effort)} is unknown"
-        check_known(self.effort, efforts, told)
+        check_known(self.effort, EFFORTS, told)
         require(
             self.jobs == -1 or self.jobs >= 1,
             f"{option('jobs')} takes a number of processes, or -1 for all cores; found {self.jobs}",
@@ -133,36 +132,32 @@ def design(
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
     with options_given(options.asked):
-        return _planned(cell, options, checkpoint, progress)
+        read = options.done.marker_names if options.done else ()
+        if options.done is not None and lacks_noise(cell):
+            progress("noise of the measurements done")
+            with suppress(InsufficientDataError):  # then it has to be stated
+                found = identify(Model(cell, read), options.done, Options(fixed=options.fixed))
+                cell, told = with_noise_of(cell, found)
+                options = replace(options, notes=(*options.notes, *told))
+        whole, spec = _Design(cell, options, checkpoint, progress), cell.design
+        if spec.choose is None and spec.minutes is None:
+            return whole.run()
+        # An assembled model knows no markers but the cell's, nor the file's names of joints.
+        cell = Model(cell, read).cell
+        choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
+        chosen = None if spec.choose is None else choice.best()
+        placed = cell if chosen is None else applied(chosen, cell)
 
+        def plan_of(cell: Cell) -> Plan:
+            own = checkpoint
+            if spec.minutes:  # poses come in several numbers
+                own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
+            made = _Design(cell, options, own, progress, whole)
+            return replace(made.run(), chosen=chosen)
 
-def _planned(
-    cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
-) -> Plan:
-    read = options.done.marker_names if options.done else ()
-    if options.done is not None and lacks_noise(cell):
-        progress("noise of the measurements done")
-        with suppress(InsufficientDataError):  # then it has to be stated
-            found = identify(Model(cell, read), options.done, Options(fixed=options.fixed))
-            cell, told = with_noise_of(cell, found)
-            options = replace(options, notes=(*options.notes, *told))
-    whole, spec = _Design(cell, options, checkpoint, progress), cell.design
-    if spec.choose is None and spec.minutes is None:
-        return whole.run()
-    # What is assembled of a chain knows no markers but the cell's, nor the file's names of joints.
-    cell = Model(cell, read).cell
-    choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
-    chosen = None if spec.choose is None else choice.best()
-    placed = cell if chosen is None else applied(chosen, cell)
-
-    def plan_of(cell: Cell) -> Plan:
-        own = checkpoint
-        if spec.minutes:  # poses come in several numbers
-            own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
-        made = _Design(cell, options, own, progress, whole)
-        return replace(made.run(), chosen=chosen)
-
-    return plan_of(placed) if not spec.minutes else within(choice, placed, plan_of, spec.minutes)
+        if not spec.minutes:
+            return plan_of(placed)
+        return within(choice, placed, plan_of, spec.minutes)
 
 
 class _Design:
@@ -248,12 +243,6 @@ class _Design:
 
     def run(self) -> Plan:
         plan = self._chosen()
-        if (gain := self._gain(plan)) is not None:
-            told = (
-                "with the smooth functions, which stay uncertain, the error at the test poses is "
-            )
-            told += f"{rounded(gain.after * 1e6)} µm rms"
-            plan = replace(plan, gain=gain, warnings=(*plan.warnings, told))
         if self.conditions is None:
             return plan
         whole, fixed = self.conditions
@@ -308,26 +297,32 @@ class _Design:
         drawn = setup.problem(pool, found.shares).random_information(options.seed)
         return self._plan(setup, found, counts, targets.source, curve, drawn)
 
-    def _gain(self, plan: Plan) -> Gain | None:
-        """The plan's gain where smooth functions count, which the readings show in part."""
+    def _gain(self, setup: Setup, M: Array, q: Array, readings: IntArray) -> Gain | None:
+        """Of poses q (N, n) with information M (p, p); of smooth functions, where the cell has
+        some, what the readings show of them counts too."""
         options, done, whole = self.options, self.options.done, self.whole
-        if plan.gain is None or done is None or whole is None:
+        if done is not None and whole is not None and setup.target_rows is not None:
+            self.progress("gain with the smooth functions")
+            fixed = tuple(name for name in self.fixed if whole.meant_by(name))
+            known = Known(fixed, options.prior, measured(whole, done, fixed))
+            targets, sight = self.targets()[0], self.feasibility.seen
+            setup = set_up(whole, q, len(q), targets, known, sight=sight, hold=True)
+            M = setup.gathered(setup.information.blocks(q, readings))
+        if done is None or setup.target_rows is None:
             return None
-        self.progress("gain with the smooth functions")
-        fixed = tuple(name for name in self.fixed if whole.meant_by(name))
-        known = Known(fixed, options.prior, measured(whole, done, fixed))
-        targets, sight = self.targets()[0], self.feasibility.seen
-        setup = set_up(whole, plan.q, len(plan), targets, known, sight=sight, hold=True)
-        assert setup.target_rows is not None  # a plan with a gain has test poses
-        M = setup.gathered(setup.information.blocks(plan.q, plan.readings))
-        return Gain.of(setup.target_rows, setup.prior, M, options.seed)
+        gain = Gain.of(setup.target_rows, setup.prior, M, options.seed)
+        if whole is not None:
+            self.warnings.append(
+                "with the smooth functions, which stay uncertain, the error at the test poses is "
+                f"{rounded(gain.after * 1e6)} µm rms"
+            )
+        return gain
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
         shares = shares_of(self.cell, n_poses) - self.pinned
-        short = np.flatnonzero(shares < 0)
         require(
-            not len(short) and bool(shares.any()),
+            bool((shares >= 0).all() and shares.any()),
             f"{self.cell.source}: {self.pinned.sum()} poses are to be kept, and "
             f"the plan has no more than {shares_of(self.cell, n_poses).sum()}"
             f"{' with their shares of the levels' if len(shares) > 1 else ''}; ask for more poses",
@@ -467,11 +462,8 @@ class _Design:
             left = alias.information(M, execution.times(len(q), len(self.forces)), noise)
         seen, numbers = setup.information.seen(q), setup.information.numbers(q, readings)
         numbers += 0 if done is None else done.numbers
-        R, gain = setup.target_rows, None
-        if done is not None and R is not None:
-            gain = Gain.of(R, setup.prior, M, self.options.seed)
+        gain = self._gain(setup, M, q, readings)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
-        labels = self.options.done.configuration_labels if self.options.done else ()
         return Plan(
             model=self.model, criterion=spec.criterion, value=found.value,
             reported=figure(found.value), unit=setup.criterion.unit, q=q, forces=self.forces,
@@ -487,7 +479,7 @@ class _Design:
             polished=int(((chosen >= found.first) & (chosen < len(found.pool))).sum()),
             bound_reported=None if bound is None else figure(bound),
             warnings=tuple(self.warnings), made_for="" if done is None else done.note,
-            first=next_number(labels), names=self._names(pool, chosen, len(found.pool)),
+            names=self._names(pool, chosen, len(found.pool)),
             chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=setup.everywhere(M, drawn, left), seen=None if seen.all() else seen,
             readings=readings, states=self.states, gain=gain,
@@ -497,9 +489,6 @@ class _Design:
         """Those that stay, behind the `own` ones of the pool, keep theirs, and the others are
         numbered after all there have been."""
         pins, q = self.options.pins, pool.q
-        crossed = len(np.unique(q[chosen], axis=0)) == len(chosen)
-        if pins is None and not self.taught and crossed:
-            return ()
         labels = self.options.done.configuration_labels if self.options.done else ()
         kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
         new = count(next_number((*labels, *taken, *self.taught.values())))

@@ -552,18 +552,10 @@ def schedule(
     moves, order = clock.moves, [(node, 0) for node in tour]
     if motion.reference_every:
         order = with_references(tour, moves, clock.travel, motion.reference_every, paired)
-        while moves.check([node for node, _ in order]):
-            pass
-    return _executed(moves, order, motion, drift)
-
-
-def _executed(
-    moves: Moves, order: list[tuple[int, int]], motion: Motion, drift: Drifting | None
-) -> Execution:
-    """Of the nodes in their `order`, behind each how often it was visited for reference."""
     nodes = [node for node, _ in order]
-    stops: list[Stop] = []
-    visited: Counter[tuple[int, ...]] = Counter()
+    while moves.check(nodes):
+        pass
+    stops, visited = list[Stop](), Counter[tuple[int, ...]]()
     for u, (v, again) in zip([0, *nodes], order, strict=False):
         for stop in _stops(moves, u, v):
             key = (stop.pose, stop.load, stop.side, again)

@@ -15,6 +15,7 @@ from elastocal.errors import InputError
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.planning.bodies import RULES, Body, Pair, cell_bodies, cell_pairs
 from elastocal.planning.collision import (
+    DOWN,
     Collisions,
     Kinematics,
     Paths,
@@ -149,67 +150,58 @@ class KeepApart(Rule):
         return text
 
 
+@dataclass(frozen=True)
 class LineOfSight(Rule):
     """Every marker is seen from the tracker."""
 
+    sight: Sight
+    markers: Mapping[str, Array]
     name = "line_of_sight"
-
-    def __init__(
-        self, kinematics: Kinematics, bodies: Sequence[Body], eye: Array, radius: float,
-        markers: Mapping[str, Array],
-    ) -> None:  # fmt: skip
-        self._sight = Sight(kinematics, bodies, eye, radius)
-        self._markers = dict(markers)
-        self._one = lambda body: Sight(kinematics, [body], eye, radius)
 
     def broken(self, poses: Poses) -> BoolArray:
         hidden = np.zeros(len(poses), dtype=bool)
-        for marker in self._markers.values():
+        for marker in self.markers.values():
             observed = np.flatnonzero(~hidden)
-            hidden[observed] = self._sight.blocked(poses.take(observed), marker)
+            hidden[observed] = self.sight.blocked(poses.take(observed), marker)
         return hidden
-
-    def hides(self, poses: Poses, marker: str) -> BoolArray:
-        return self._sight.blocked(poses, self._markers[marker])
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         return {
-            f"{name} behind {body.name}": self._one(body).blocked(poses, marker)
-            for body in self._sight.bodies
-            for name, marker in self._markers.items()
+            f"{name} behind {body.name}": self.sight.past(body).blocked(poses, marker)
+            for body in self.sight.bodies
+            for name, marker in self.markers.items()
         }
 
 
+@dataclass(frozen=True)
 class EnoughMarkers(Rule):
     """At least so many markers are in range, turned towards the tracker, and in its sight."""
 
+    bounds: Sequence[Rule]
+    sight: Sight | None
+    markers: Mapping[str, Array]
+    least: int
     name = "markers_seen"
-
-    def __init__(
-        self, bounds: Sequence[Rule], sight: Sequence[LineOfSight], markers: Sequence[str],
-        least: int,
-    ) -> None:  # fmt: skip
-        self._bounds, self._sight, self._markers, self._least = bounds, sight, markers, least
 
     def seen(self, poses: Poses) -> BoolArray:
         """(N, markers): which are seen; nothing is looked for behind bodies where too few remain
         without."""
-        seen = np.ones((len(poses), len(self._markers)), dtype=bool)
-        for rule in self._bounds:
+        seen, names = np.ones((len(poses), len(self.markers)), dtype=bool), list(self.markers)
+        for rule in self.bounds:
             for name, outside in rule.causes(poses).items():
-                seen[:, self._markers.index(name)] &= ~outside
-        hopeful = seen.sum(axis=1) >= self._least
-        for sight in self._sight:
-            for k, name in enumerate(self._markers):
+                seen[:, names.index(name)] &= ~outside
+        hopeful = seen.sum(axis=1) >= self.least
+        if self.sight is not None:
+            for k, marker in enumerate(self.markers.values()):
                 rows = np.flatnonzero(hopeful & seen[:, k])
-                seen[rows, k] = ~sight.hides(poses.take(rows), name)
+                seen[rows, k] = ~self.sight.blocked(poses.take(rows), marker)
         return seen
 
     def broken(self, poses: Poses) -> BoolArray:
-        return np.asarray(self.seen(poses).sum(axis=1) < self._least)
+        return np.asarray(self.seen(poses).sum(axis=1) < self.least)
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        return dict(zip(self._markers, ~self.seen(poses).T, strict=True))
+        return dict(zip(self.markers, ~self.seen(poses).T, strict=True))
 
 
 @dataclass(frozen=True)
@@ -238,16 +230,14 @@ class PoseFeasibility:
 def rule_book(
     cell: Cell, chain: Chain, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
 ) -> tuple[Rule, ...]:
-    bounds = tuple(_visibility(cell))
-    sight: tuple[LineOfSight, ...] = ()
-    stated, markers, least = cell.workspace.visibility, cell.tool.markers, None
-    if stated is not None:
-        least, eye = stated.min_markers, cell.tracker.position
-        if stated.line_of_sight:
-            sight = (LineOfSight(kinematics, bodies, eye, stated.beam_radius, markers),)
-    seen: tuple[Rule, ...] = sight
+    bounds, stated, markers = tuple(_visibility(cell)), cell.workspace.visibility, cell.tool.markers
+    sight, seen = None, tuple[Rule, ...]()
+    if stated is not None and stated.line_of_sight:
+        sight = Sight(kinematics, bodies, cell.tracker.position, stated.beam_radius)
+        seen = (LineOfSight(sight, markers),)
+    least = None if stated is None else stated.min_markers
     if least is not None and least < len(markers):
-        bounds, seen = (), (EnoughMarkers(bounds, sight, tuple(markers), least),)
+        bounds, seen = (), (EnoughMarkers(bounds, sight, markers, least),)
     units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
     joints = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
     limits = joint_limits(cell, chain)
@@ -318,7 +308,6 @@ def _load(cell: Cell, chain: Chain, joints: tuple[str, ...]) -> Iterator[Rule]:
 
 SAMPLE = 2000  # candidates whose causes are looked at
 ON_THE_WAY = 200  # samples of a move, in which bodies that come too close are sought
-LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
 MOST_TRIED = 300  # random poses in which a pair must once keep apart to be believed
 
 
@@ -342,7 +331,7 @@ class Feasibility:
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
         """Every rule on every pose q (N, n) under a force (3,) or (N, 3) N; not `every`: a pose
         that broke a rule is not looked at again.  The load hangs wherever the force is not zero."""
-        poses = self._poses(q, force)
+        poses = self.kinematics.poses(q, force)
         broken = np.zeros((len(poses), len(self.rules)), dtype=bool)
         left = np.arange(len(poses))
         for k, rule in enumerate(self.rules):
@@ -354,8 +343,7 @@ class Feasibility:
         """Every rule that each pose q (N, n) breaks under any of the `forces` (k, 3)."""
         ranked = forces[np.argsort(np.linalg.norm(forces, axis=1), kind="stable")]
         verdicts = [self.check(q, force) for force in ranked]
-        broken = np.any([verdict.broken for verdict in verdicts], axis=0)
-        return replace(verdicts[-1], broken=broken)
+        return replace(verdicts[-1], broken=np.any([each.broken for each in verdicts], axis=0))
 
     def under(self, q: Array, forces: Array) -> PoseFeasibility:
         """The first rule that each pose q (N, n) breaks under the first of `forces` (k, 3) that
@@ -373,7 +361,7 @@ class Feasibility:
         """Joints (N, n), force (3,) → (N, markers): which markers the tracker sees of poses that
         are feasible; None where it sees all of them."""
         rule = next((rule for rule in self.rules if isinstance(rule, EnoughMarkers)), None)
-        return None if rule is None else lambda q, force: rule.seen(self._poses(q, force))
+        return None if rule is None else lambda q, force: rule.seen(self.kinematics.poses(q, force))
 
     def advice(self, verdict: PoseFeasibility) -> str:
         """The smallest set of rules that stops candidates by itself, and of these the one that
@@ -394,7 +382,7 @@ class Feasibility:
         text += f"{counts[best]} of them: " + "; ".join(rule.remedy(poses) for rule in chosen)
         lower, upper = finite_ranges(self.chain, *joint_limits(self.cell, self.chain))
         q = np.random.default_rng(0).uniform(lower, upper, (MOST_TRIED, len(lower)))
-        poses = self._poses(q, LOADED)
+        poses = self.kinematics.poses(q, DOWN)
         for pair in self.pairs:
             if Collisions(self.kinematics, [pair]).hits(poses).all():
                 a, b = pair.names
@@ -407,8 +395,7 @@ class Feasibility:
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool | BoolArray) -> BoolArray:
         """(M,) for moves q_from → q_to (M, n), as `Paths` guarantees it, each checked once however
         often it is asked for; visibility and torque concern poses at rest."""
-        start, end = self._poses(q_from, LOADED).q, self._poses(q_to, LOADED).q
-        start, end = np.broadcast_arrays(start, end)
+        start, end = np.broadcast_arrays(*np.atleast_2d(q_from, q_to))
         hangs = np.broadcast_to(loaded, len(start))
         ends = zip(start, end, hangs.tolist(), strict=True)
         moves = [(*sorted((a.tobytes(), b.tobytes())), hung) for a, b, hung in ends]
@@ -422,21 +409,10 @@ class Feasibility:
         """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are
         met."""
         step = np.linspace(0.0, 1.0, ON_THE_WAY)[:, None]
-        poses = self.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
+        poses = self.kinematics.poses(q_from + step * (q_to - q_from), DOWN * loaded)
         hits = hits_by_pair(self.kinematics, self.pairs, poses)
         return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
 
     @cached_property
     def _paths(self) -> Paths:
         return Paths(self.kinematics, self.pairs, self.cell.workspace.load)
-
-    def _poses(self, q: Array, force: Array) -> Poses:
-        q = np.atleast_2d(np.asarray(q, dtype=float))
-        if q.shape[1] != self.chain.n_joints:
-            raise InputError(
-                f"poses have {q.shape[1]} joint values, but robot '{self.chain.name}' has "
-                f"{self.chain.n_joints} joints"
-            )
-        if not np.isfinite(q).all():
-            raise InputError(f"pose {int(np.argwhere(~np.isfinite(q))[0][0])} is not finite")
-        return self.kinematics.poses(q, force)

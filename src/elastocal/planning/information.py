@@ -300,10 +300,8 @@ class Estimable:
             return np.array(own or range(len(kept)), dtype=np.int64)
         chosen: set[int] = set()
         for name in wanted:
-            told, unknown = (
-                f"{where} names {quoted(name)}",
-                "no parameter, place or effect of the model",
-            )
+            told = f"{where} names {quoted(name)}"
+            unknown = "no parameter, place or effect of the model"
             check_known(name, model.all_names, f"{told}, which is {unknown}")
             meant = model.meant_by(name)
             here = [k for k, c in enumerate(self.columns) if c in meant]
@@ -315,15 +313,17 @@ class Estimable:
     @property
     def unseen(self) -> tuple[str, ...]:
         """Which parameters no pose shows, in sentences."""
-        model, unseen = self.model, self.structure.invisible.tolist()
-        if len(unseen) < 2:
-            return tuple(self.why(i) for i in unseen)
-        names, loads = [model.names[i] for i in unseen], model.cell.design.loads
+        unseen = [self.model.names[i] for i in self.structure.invisible]
+        return (self._shown_by_none(unseen),) if unseen else ()
+
+    def _shown_by_none(self, names: list[str]) -> str:
+        loads = self.model.cell.design.loads
         loaded, remedy = loads is not None and loads.any(), "state a load ([design] loads_N)"
         remedy = "change the load's direction or the limits" if loaded else remedy
+        they_move, them = ("it moves", "it") if len(names) == 1 else ("they move", "them")
         return (
-            f"no feasible pose shows {listed(names)}: they move no marker in any of them; "
-            f"{remedy}, or leave them out ({option('fixed', names[0])})",
+            f"no feasible pose shows {listed(names)}: {they_move} no marker in any of them; "
+            f"{remedy}, or leave {them} out ({option('fixed', names[0])})"
         )
 
     @property
@@ -349,10 +349,7 @@ class Estimable:
                 f"hold it; measure more poses or repeats, or state a prior ({option('knowledge')})"
             )
         if index in r.invisible:
-            return (
-                f"no feasible pose shows {name}: it moves no marker in any of them; change the "
-                f"load's direction or the limits, or leave it out ({option('fixed', name)})"
-            )
+            return self._shown_by_none([name])
         if index in r.dropped:
             share = np.abs(r.mixing[:, list(r.dropped).index(index)]) / self.sizes[r.kept]
             partner = model.names[r.kept[int(share.argmax())]]

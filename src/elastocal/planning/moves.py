@@ -16,6 +16,7 @@ from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.chain import Chain, told
 from elastocal.planning.feasibility import Feasibility
+from elastocal.text import some
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which joint moves are free: a graph over joint vectors whose edges are checked when needed.
@@ -305,14 +306,13 @@ class Moves:
                 raise self._unreachable(roadmap, every if clear else lost[0])
 
     def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
-        named = ", ".join(self._name(point) for point in lost[:MOST_NAMED])
-        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        named = some(map(self._name, lost), MOST_NAMED)
         others = np.setdiff1d(np.arange(len(self.points)), lost)
         between = self.times[lost][:, others]
         i, j = np.unravel_index(int(np.argmin(between)), between.shape)
         by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
         return Unreachable(
-            f"{named}{more} cannot be reached{roadmap.carrying} by collision-free joint moves, "
+            f"{named} cannot be reached{roadmap.carrying} by collision-free joint moves, "
             f"neither directly nor through home and other poses{by}; give another home in "
             "[design.motion], free the way, or narrow [limits] to exclude such poses",
             *np.unique(self.pose[np.isin(self.leave, lost)]),

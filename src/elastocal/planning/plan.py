@@ -210,10 +210,8 @@ class Chance:
         values = np.sort(criterion.of_information(drawn))
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
         median, best, worst = (criterion.figure(v) if np.isfinite(v) else None for v in phi)
-        counts = criterion.certifiable and median is not None
-        determined = int(np.isfinite(values).sum())
-        share = value / phi[0] if counts else None
-        return cls(len(values), determined, median, best, worst, share)
+        share = value / phi[0] if criterion.certifiable and np.isfinite(phi[0]) else None
+        return cls(len(values), int(np.isfinite(values).sum()), median, best, worst, share)
 
 
 @dataclass(frozen=True)
@@ -375,13 +373,12 @@ class Plan(Result):
         bound_reported: The certificate's bound, in `unit`.
         warnings: What to know before one measures, in sentences.
         made_for: Beside measurements done, the arm that the plan is made for, in words.
-        first: Number of the first configuration: after those that were measured already.
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
         readings: How often each of them is read of each pose in each load state (N, L).
         states: Whether poses are read in all load states or in chosen ones, where it was asked.
-        names: Of the configurations, where poses of an earlier plan were kept.
+        names: Of the configurations.
         gain: What the plan adds to measurements done, where it does.
         chosen: What was chosen besides the poses, where [design.choose] asks for it.
         scheduled: What effects of time and approach make of it, where the cell has some.
@@ -420,7 +417,6 @@ class Plan(Result):
     bound_reported: float | None = None
     warnings: tuple[str, ...] = field(default=())
     made_for: str = ""
-    first: int = 1
     chance: Chance | None = None
     everywhere: Everywhere | None = None
     seen: BoolArray | None = None
@@ -529,7 +525,7 @@ class Plan(Result):
 
     @property
     def configurations(self) -> tuple[str, ...]:
-        return self.names or tuple(str(self.first + k) for k in range(len(self.q)))
+        return self.names
 
     @property
     def group_names(self) -> tuple[str, ...]:

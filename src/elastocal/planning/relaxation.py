@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError
 from elastocal.planning.criteria import (
     DeterminantCriterion,
     ScenarioCriterion,
@@ -223,15 +223,9 @@ class Relaxed:
 def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) -> Relaxed:
     """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l].
 
-    The problem should be a `balanced` one.  `start` (N,) ≥ 0: weights near the optimum, as those of
-    a smaller pool.  Where rounding forbids the `gap` that is asked for, the bound holds all the
-    same."""
-    criterion = problem.criterion
-    require(
-        criterion.certifiable,
-        f"criterion {criterion.name} has no relaxation, since it {criterion.without_bound}; design "
-        "with it by exchange alone, or take D, E or test_pose",
-    )
+    The problem should be a `balanced` one of a certifiable criterion.  `start` (N,) ≥ 0: weights
+    near the optimum, as those of a smaller pool.  Where rounding forbids the `gap` that is asked
+    for, the bound holds all the same."""
     size = np.bincount(problem.group, minlength=len(problem.shares))
     full = (size == problem.shares)[problem.group]
     if full.any():

@@ -354,9 +354,7 @@ def distinct(q: Array, count: int) -> IntArray:
     """Indices of the first `count` poses of q (N, n) that lie `APART` from those before."""
     chosen: list[int] = []
     for i, pose in enumerate(q):
-        if len(chosen) == count:
-            break
-        if all(np.abs(pose - q[k]).max() > APART for k in chosen):
+        if len(chosen) < count and all(np.abs(pose - q[k]).max() > APART for k in chosen):
             chosen.append(i)
     return np.array(chosen, dtype=np.int64)
 
@@ -384,10 +382,10 @@ class SearchEffort:
 
 
 EFFORTS = {
-    "batch": SearchEffort(starts=0, rounds=0, exchanges=4),
     "quick": SearchEffort(starts=5, rounds=0),
     "normal": SearchEffort(starts=8, rounds=2),
     "thorough": SearchEffort(starts=40, rounds=4),
+    "batch": SearchEffort(starts=0, rounds=0, exchanges=4),
 }
 
 

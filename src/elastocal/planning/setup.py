@@ -122,9 +122,8 @@ class Setup:
     def problem(self, pool: FeasiblePool, shares: IntArray) -> DesignProblem:
         """Of as many stops as the `shares` (L,) of poses take in all load states."""
         shares = shares * self.ways.shape[1] // np.count_nonzero(self.ways[0])
-        cell = self.information.model.cell
         prior = self.prior if self.pinned is None else self.gathered(self.pinned.blocks)
-        source = f"{cell.source}: "
+        source = f"{self.information.model.cell.source}: "
         return DesignProblem(pool.blocks, prior, pool.group, shares, self.criterion, source)
 
     def gathered(self, blocks: Array) -> Array:

@@ -17,7 +17,7 @@ from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
-from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.effects.catalogue import choose_effects
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import Postures, inverse_kinematics
@@ -440,15 +440,8 @@ def _with_points(model: Model, points: Array) -> Model:
     """The same arm with test points (k, 3) as markers whose place on the flange is known."""
     cell = model.cell
     # Effects act where they do on the model as it is, without the test points.
-    effects = tuple(
-        EffectChoice(choice.name, where)
-        for choice in cell.model.effects
-        for where in (
-            CATALOGUE[choice.name].places(model.chain, cell)
-            if choice.where is None
-            else (choice.where,)
-        )
-    )
+    active = choose_effects(model.chain, cell)
+    effects = tuple(EffectChoice(effect.name, where) for effect, where in active)
     spec = replace(cell.model, effects=effects, observe="position")
     named = {f"test point {k + 1}": point for k, point in enumerate(points)}
     tool = replace(cell.tool, markers=cell.tool.markers | named)
