@@ -34,7 +34,7 @@ TABLE = (
     added("a test pose beyond the limits", f"[limits]\njoint2_deg = [-50, -40]\n{POINT}"),
     added("a test box out of reach", "[design.test_box]\nlower_m = [5, 5, 5]\nupper_m = [6, 6, 6]"),
     added("an obstacle that swallows the robot", f"{BLOCK}[9, 9, 9]"),
-    added("a home behind a wall",
+    added("a home in a wall",
           f"[design.motion]\nhome_deg = [0, 90, -90, 0, 0, 0]\n{BLOCK}[0.1, 3, 3]"),
     added("a tracker that sees no pose", "[workspace.visibility]\nrange_m = [0.1, 0.2]"),
     asked("a parameter that no pose shows", 'criterion = "D"\ninterest = ["joint1.compliance"]'),

@@ -90,6 +90,11 @@ class Kinematics:
 # spherical joint more at the load point, which undoes the rotation of the last link.
 
 
+# m: at a margin of 0 coal takes bodies that lie symmetrically in each other for free, as their
+# distance is then 0 but for rounding.
+NOTHING = 1e-9
+
+
 class Collisions:
     """Tests a fixed list of pairs; `free` bodies more, carried by n + 1, n + 2, …, may be placed at
     will in every pose."""
@@ -121,7 +126,7 @@ class Collisions:
         last = poses.frames[:, poses.q.shape[1] - 1, :3, :3]
         upright = Rotation.from_matrix(last.transpose(0, 2, 1)).as_quat()
         configuration = np.hstack([poses.q, upright, *([] if placed is None else [placed])])
-        margins, found = self._margins + extra, np.zeros(len(poses), dtype=bool)
+        margins, found = self._margins + extra + NOTHING, np.zeros(len(poses), dtype=bool)
         for (own, pool), counts in zip(self._pools, (~found, poses.loaded), strict=True):
             left = np.flatnonzero(counts & ~found)
             if not len(own) or not len(left):
