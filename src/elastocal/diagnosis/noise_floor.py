@@ -169,7 +169,8 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
         scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
         one, other = _unordered(nearest(scaled)[0]).T
         pairs.append((one, other))
-        rho = np.array([(z[i] * z[k]).mean() for i, k in pairs]) / (z**2).mean()
+        rho = np.array([(z[i] * z[k]).mean() for i, k in pairs])
+        rho /= max(float((z**2).mean()), 1e-300)
         rho[rho * np.sqrt([len(i) for i, _ in pairs]) <= limit] = 0.0  # no more than chance
         share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)
         out[j] = share * float((z**2).mean()) / float(h[known, j].mean())
