@@ -7,6 +7,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Iterable, Mapping
+from decimal import Decimal
 from difflib import get_close_matches
 from typing import Any
 
@@ -50,10 +51,28 @@ def counted(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
+def significant(value: float, digits: int = 3) -> str:
+    """A number of so many digits, without an exponent where it is readable: 1830, 0.120, 1.00."""
+    if not 1e-5 < abs(value) < 1e10:
+        return f"{value + 0.0:.{digits}g}"
+    return f"{Decimal(f'{value:.{digits - 1}e}'):f}"
+
+
 def rounded(value: float, digits: int = 3) -> str:
-    """A number of so many digits as people write it: 1830, not 1.83e+03."""
-    told = f"{value:.{digits}g}"
-    return f"{float(told):.0f}" if "e+0" in told else told
+    """The same without zeros at its end: 1830, 0.12, 1."""
+    told = significant(value, digits)
+    return told.rstrip("0").rstrip(".") if "." in told and "e" not in told else told
+
+
+def length(metres: float) -> str:
+    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
+    if not math.isfinite(metres):
+        return "not available"
+    if abs(metres) < 0.9995e-3:
+        return f"{significant(metres * 1e6)} µm"
+    if abs(metres) < 0.9995:
+        return f"{significant(metres * 1e3)} mm"
+    return f"{significant(metres)} m"
 
 
 def gathered(names: Iterable[str]) -> str:

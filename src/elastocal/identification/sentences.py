@@ -116,7 +116,7 @@ SENTENCES = {
         "use {count}intervals by cr2; measure more configurations rather than more repeats."
     ),
     "drift": (
-        "Base or tracker drift during the session ({sigma_um} µm in each direction, by the "
+        "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
         "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
         "held out. {remedy}"
     ),
@@ -171,6 +171,7 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
             if isinstance(v, tuple) else rounded(v, DIGITS[k]) if k in DIGITS else v
             for k, v in f.numbers.items()
         }  # fmt: skip
+        words["along"] = "" if result.model.observe == "distance" else " in each direction"
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
         default = "the default method, whose noise model has this scatter, or "
         words["count"] = "" if result.noise.estimated else default

@@ -19,7 +19,7 @@ import numpy as np
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.model.chain import Chain
 from elastocal.planning.execution import Execution
-from elastocal.text import printable
+from elastocal.text import printable, rounded
 from elastocal.units import Array
 
 # Text and numbers as robot controllers read them.
@@ -118,8 +118,8 @@ def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
 def limits_text(lower: Array, upper: Array) -> str:
     shown = []
     for i, (low, high) in enumerate(zip(lower, upper, strict=True), 1):
-        told = [f"from {math.degrees(low):.4g}"] if math.isfinite(low) else []
-        told += [f"to {math.degrees(high):.4g}"] if math.isfinite(high) else []
+        told = [f"from {rounded(math.degrees(low), 4)}"] if math.isfinite(low) else []
+        told += [f"to {rounded(math.degrees(high), 4)}"] if math.isfinite(high) else []
         shown.append(f"J{i} {' '.join(told).removeprefix('from ' * (len(told) == 2)) or 'any'}")
     return ", ".join(shown)
 

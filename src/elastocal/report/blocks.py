@@ -24,7 +24,7 @@ from elastocal.model.chain import numbered
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of
 from elastocal.model.manipulator import Model, load_chain
 from elastocal.text import counted as counted
-from elastocal.text import printable
+from elastocal.text import length, printable, rounded, significant
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -219,25 +219,6 @@ def plain(value: float) -> str:
     return f"{value + 0.0:.6g}"
 
 
-def significant(value: float, digits: int = 3) -> str:
-    """A finite number rounded to `digits` digits, without an exponent where it is readable."""
-    if value == 0 or not 1e-5 < abs(value) < 1e7:
-        return f"{value:.{digits}g}"
-    decimals = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    return _fixed(value, decimals)
-
-
-def length(metres: float) -> str:
-    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
-    if not math.isfinite(metres):
-        return "not available"
-    if abs(metres) < 0.9995e-3:
-        return f"{significant(metres * 1e6)} µm"
-    if abs(metres) < 0.9995:
-        return f"{significant(metres * 1e3)} mm"
-    return f"{significant(metres)} m"
-
-
 def newtons(force: Iterable[float]) -> str:
     """ "(0, 0, -2600) N"."""
     return f"({', '.join(f'{v + 0.0:g}' for v in force)}) N"
@@ -252,7 +233,7 @@ def loads_text(forces: Array, one: str, several: str) -> str:
     if len(forces) == 1:
         return one.format(newtons(forces[0]))
     sizes = [math.hypot(*force) for force in forces]
-    return f"{several.format(len(sizes))}, {min(sizes):.4g} to {max(sizes):.4g} N"
+    return f"{several.format(len(sizes))}, {rounded(min(sizes), 4)} to {rounded(max(sizes), 4)} N"
 
 
 def _fixed(value: float, decimals: int) -> str:

@@ -19,7 +19,7 @@ from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import warning_sentences
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
-from elastocal.text import gathered, listed, printable, some
+from elastocal.text import gathered, listed, printable, rounded, some
 
 
 def judgement(result: Calibration) -> say.ShownVerdict:
@@ -295,7 +295,7 @@ def prior_line(result: Calibration) -> str | None:
         return None
 
     def percent(share: float) -> str:  # never 100 % where the data say anything
-        return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"
+        return f"{rounded(min(100 * share, 99.9))} %" if share < 1 else "100 %"
 
     if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
