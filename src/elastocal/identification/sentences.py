@@ -9,6 +9,7 @@ from elastocal.errors import option
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
 from elastocal.text import counted, gathered, listed, rounded
+from elastocal.units import display
 
 # What to do about a finding.
 
@@ -125,17 +126,17 @@ SENTENCES = {
         "p = {p:.1g}). Weights and intervals account for it. {remedy}"
     ),
     "beyond_bound": (
-        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound:g}: {remedy}"
+        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: {remedy}"
     ),
     "many_faulty_readings": (
         "Too many for reading errors: a shifted block of readings, or a missing effect in some "
         "load state, marker or region. {remedy}"
     ),
 }
-DIGITS = {"condition_number": 2, "sigma_um": 3, "value": 3, "std": 2}  # of numbers in them
+DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
-    "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
+    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}",
 }
 
 
@@ -173,6 +174,7 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         }  # fmt: skip
         words["along"] = "" if result.model.observe == "distance" else " in each direction"
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
+        words |= _shown(f) if within else {}
         default = "the default method, whose noise model has this scatter, or "
         words["count"] = "" if result.noise.estimated else default
         ask = f.remedy.startswith("Ask")
@@ -183,12 +185,17 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if len(same) == 1:
             yield SENTENCES[f.kind].format(**words)
             return
-        pairs = (
-            f"{rounded(o.numbers.get('value', 0))} ± {rounded(o.numbers.get('std', 0), 2)}"
-            for o in same
-        )
+        pairs = ("{value} ± {std}".format(**_shown(other)) for other in same)
         words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
         yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
+
+
+def _shown(f: Finding) -> dict[str, str]:
+    """Value, standard deviation and bound of a parameter in the unit that people think in."""
+    unit = str(f.numbers["unit"])
+    digits = {"value": 3, "std": 2, "bound": 3}
+    sizes = {k: rounded(display(f.number(k), unit)[0], n) for k, n in digits.items()}
+    return sizes | {"unit": display(0.0, unit)[1]}
 
 
 def _runs(lines: Iterable[int]) -> str:
