@@ -6,7 +6,7 @@ import json
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
 from difflib import get_close_matches
 from typing import Any
@@ -75,6 +75,20 @@ def length(metres: float) -> str:
     return f"{significant(metres)} m"
 
 
+def newtons(force: Iterable[float]) -> str:
+    """ "(0, 0, -2600) N"."""
+    return f"({', '.join(rounded(v, 6) for v in force)}) N"
+
+
+def load_text(force: Iterable[float]) -> str:
+    return newtons(force) if any(force) else "unloaded"
+
+
+def together(parts: Sequence[str], last: str = "and") -> str:
+    """ "a, b and c"."""
+    return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
+
+
 def gathered(names: Iterable[str]) -> str:
     """Parameters by their places: "compliance of joints 1, 2 and 5, dx of link 3"."""
     found: dict[tuple[str, str], list[str]] = {}
@@ -84,8 +98,7 @@ def gathered(names: Iterable[str]) -> str:
         found.setdefault((what, kind), []).append(where[len(kind) :])
     told = []
     for (what, kind), places in found.items():
-        several = " and ".join(p for p in (", ".join(places[:-1]), places[-1]) if p)
-        told.append(f"{what} of {kind}{'s' * (len(places) > 1)} {several}".rstrip())
+        told.append(f"{what} of {kind}{'s' * (len(places) > 1)} {together(places)}".rstrip())
     return ", ".join(told)
 
 

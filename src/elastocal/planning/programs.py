@@ -19,7 +19,7 @@ import numpy as np
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.model.chain import Chain
 from elastocal.planning.execution import Execution
-from elastocal.text import printable, rounded
+from elastocal.text import newtons, printable, rounded
 from elastocal.units import Array
 
 # Text and numbers as robot controllers read them.
@@ -53,10 +53,11 @@ def steps_of(execution: Execution, configurations: Sequence[str], forces: Array)
     home, dwell, nothing = execution.motion.home, execution.motion.dwell, np.zeros(0)
     steps: list[Step] = [] if home is None else [("move", home, "home")]
     for stop in execution.stops:
-        name, load = f"configuration {stop.name(configurations)}", load_name(forces[stop.load])
+        name, force = f"configuration {stop.name(configurations)}", forces[stop.load]
+        load = f"load of {newtons(force)}" if force.any() else "no load"
         moves: list[Step] = [("move", q, VIA) for q in stop.via] + [("move", stop.q, name)]
         if stop.change_after is not None:
-            hang = f"hang the {load}" if np.any(forces[stop.load]) else TAKE_OFF
+            hang = f"hang the {load}" if force.any() else TAKE_OFF
             moves.insert(stop.change_after, ("load", nothing, hang))
         side = "" if stop.approach is None else f", approached from {('below', 'above')[stop.side]}"
         part = ", once more" if stop.part else ""
@@ -66,12 +67,6 @@ def steps_of(execution: Execution, configurations: Sequence[str], forces: Array)
     if home is not None:
         steps += [*(("move", q, VIA) for q in execution.home_via), ("move", home, "home")]
     return steps
-
-
-def load_name(force: Array) -> str:
-    if not np.any(force):
-        return "no load"
-    return "load of ({:g}, {:g}, {:g}) N".format(*np.asarray(force, dtype=float) + 0.0)
 
 
 LONGEST = 100  # characters of a note; controllers cut or refuse long lines

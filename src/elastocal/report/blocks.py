@@ -24,7 +24,7 @@ from elastocal.model.chain import numbered
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of
 from elastocal.model.manipulator import Model, load_chain
 from elastocal.text import counted as counted
-from elastocal.text import length, printable, rounded, significant
+from elastocal.text import length, newtons, printable, rounded, significant, together
 from elastocal.units import Array, display
 
 if TYPE_CHECKING:
@@ -195,15 +195,6 @@ def plain(value: float) -> str:
     return f"{value + 0.0:.6g}"
 
 
-def newtons(force: Iterable[float]) -> str:
-    """ "(0, 0, -2600) N"."""
-    return f"({', '.join(f'{v + 0.0:g}' for v in force)}) N"
-
-
-def load_text(force: Iterable[float]) -> str:
-    return newtons(force) if any(force) else "unloaded"
-
-
 def loads_text(forces: Array, one: str, several: str) -> str:
     """Forces in the words for `one` of them, or for their number and how large they are."""
     if len(forces) == 1:
@@ -232,11 +223,6 @@ MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
 def typeset(text: str) -> str:
     """With proper minus signs before numbers and between terms, not in names."""
     return MINUS.sub("−", text)
-
-
-def together(parts: Sequence[str], last: str = "and") -> str:
-    """ "a, b and c"."""
-    return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
 
 
 def capital(text: str) -> str:
