@@ -64,6 +64,22 @@ def rounded(value: float, digits: int = 3) -> str:
     return told.rstrip("0").rstrip(".") if "." in told and "e" not in told else told
 
 
+SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
+
+
+def p_value(p: float) -> str:
+    """Two digits, or that it is below the smallest that is told."""
+    if not math.isfinite(p):
+        return "–"
+    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
+
+
+def size_of(p: float) -> str:
+    """ "p = 0.02", "p < 0.0001"."""
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
 def length(metres: float) -> str:
     """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
     if not math.isfinite(metres):

@@ -8,7 +8,7 @@ from typing import Any
 from elastocal.errors import option
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
-from elastocal.text import counted, gathered, listed, rounded
+from elastocal.text import counted, gathered, listed, rounded, size_of
 from elastocal.units import display
 
 # What to do about a finding.
@@ -112,18 +112,18 @@ SENTENCES = {
     ),
     "lack_of_fit": (
         "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
-        "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not return to the same "
+        "and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
         "place, or an effect is missing. The intervals do not include it and are too narrow: "
         "use {count}intervals by cr2; measure more configurations rather than more repeats."
     ),
     "drift": (
         "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
-        "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
+        "{by}; {p}). Weights and intervals account for it, and whole blocks in time are "
         "held out. {remedy}"
     ),
     "joint_scatter": (
         "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
-        "p = {p:.1g}). Weights and intervals account for it. {remedy}"
+        "{p}). Weights and intervals account for it. {remedy}"
     ),
     "beyond_bound": (
         "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: {remedy}"
@@ -173,6 +173,7 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
             for k, v in f.numbers.items()
         }  # fmt: skip
         words["along"] = "" if result.model.observe == "distance" else " in each direction"
+        words["p"] = size_of(f.number("p")) if "p" in words else ""
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
         words |= _shown(f) if within else {}
         default = "the default method, whose noise model has this scatter, or "

@@ -25,6 +25,8 @@ from elastocal.model.effects.catalogue import CATALOGUE, cell_of
 from elastocal.model.manipulator import Model, load_chain
 from elastocal.text import counted as counted
 from elastocal.text import length, newtons, printable, rounded, significant, together
+from elastocal.text import p_value as p_value
+from elastocal.text import size_of as size_of
 from elastocal.units import Array, display
 
 if TYPE_CHECKING:
@@ -393,21 +395,6 @@ def probability(p: float) -> str:
     if p > 0.995:
         return "> 0.99"
     return "< 0.01" if p < 0.005 else f"{p:.2f}"
-
-
-def p_value(p: float) -> str:
-    """Two digits, or that it is below the smallest that is told."""
-    from elastocal.diagnosis.diagnosis import SMALLEST_P
-
-    if not math.isfinite(p):
-        return "–"
-    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
-
-
-def size_of(p: float) -> str:
-    """ "p = 0.02", "p < 0.0001"."""
-    text = p_value(p)
-    return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
 def percent(fraction: float) -> str:
