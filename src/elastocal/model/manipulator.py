@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -588,3 +589,33 @@ def where_smooth_functions_end(cell: Cell) -> str:
         else f"{name} from {np.degrees(low):.1f}° to {np.degrees(high):.1f}°"
         for name, (low, high) in sorted(ends.items())
     )  # fmt: skip
+
+
+def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
+    """Per effect, stage by stage in the catalogue's order: name, what it is, places, parameters.
+
+    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
+    parameter's typical size is null where only the readings say it.
+    """
+    given = cell_of(cell)
+    chain = load_chain(given)
+    given = numbered(given, chain)
+    on, entries = {choice.name for choice in given.model.effects}, []
+    stages = list(dict.fromkeys(effect.stage for effect in CATALOGUE.values()))
+    for effect in sorted(CATALOGUE.values(), key=lambda effect: stages.index(effect.stage)):
+        where = effect.places(chain, given)
+        first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
+        try:
+            parameters = effect.parameters(where[0], chain, given) if where else ()
+        except InputError:  # of link weights without masses: settings of the cell make them
+            parameters = ()
+        entries.append({
+            "name": effect.name, "stage": effect.stage,
+            "on": effect.name in on or effect.acts_unasked(given), "what": " ".join(first.split()),
+            "places": list(where), "needs": list(effect.needed(given)),
+            "parameters": [
+                {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
+                for p in parameters
+            ],
+        })  # fmt: skip
+    return entries

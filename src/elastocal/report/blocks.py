@@ -9,20 +9,15 @@ and the digits that are known.
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from elastocal.errors import InputError
 from elastocal.measurements import in_file_units
-from elastocal.model.chain import numbered
-from elastocal.model.effects.catalogue import CATALOGUE, cell_of
-from elastocal.model.manipulator import Model, load_chain
+from elastocal.model.manipulator import Model
 from elastocal.text import counted as counted
 from elastocal.text import length, newtons, printable, rounded, significant, together
 from elastocal.text import p_value as p_value
@@ -30,7 +25,6 @@ from elastocal.text import size_of as size_of
 from elastocal.units import Array, display
 
 if TYPE_CHECKING:
-    from elastocal.cell.work_cell import Cell
     from elastocal.diagnosis.diagnosis import Candidate, EffectAt, FoundEffect
     from elastocal.planning.plan import Plan
 
@@ -470,48 +464,15 @@ def setting_value(key: str, value: float) -> str:
     return f"{significant(value / 60)} min"
 
 
-# What can be fitted, as rows: each effect of the catalogue with its unit, size, places, words.
-
-
-def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
-    """Per effect, stage by stage in the catalogue's order: name, what it is, places, parameters.
-
-    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
-    parameter's typical size is null where only the readings say it.
-    """
-    given = cell_of(cell)
-    chain = load_chain(given)
-    given = numbered(given, chain)
-    on, entries = {choice.name for choice in given.model.effects}, []
-    stages = list(dict.fromkeys(effect.stage for effect in CATALOGUE.values()))
-    for effect in sorted(CATALOGUE.values(), key=lambda effect: stages.index(effect.stage)):
-        where = effect.places(chain, given)
-        first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
-        try:
-            parameters = effect.parameters(where[0], chain, given) if where else ()
-        except InputError:  # of link weights without masses: settings of the cell make them
-            parameters = ()
-        entries.append({
-            "name": effect.name, "stage": effect.stage,
-            "on": effect.name in on or effect.acts_unasked(given), "what": " ".join(first.split()),
-            "places": list(where), "needs": list(effect.needed(given)),
-            "parameters": [
-                {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
-                for p in parameters
-            ],
-        })  # fmt: skip
-    return entries
-
-
 def effect_head(entry: dict[str, Any]) -> str:
     """Name (* where it is on), places and typical sizes by unit of an effect, for people."""
     sizes: dict[str, list[float]] = {}
     for p in entry["parameters"]:
         value, unit = display(p["typical"] or 0.0, p["unit"])
-        sizes.setdefault(unit, []).append(float(f"{value:.2g}"))
+        sizes.setdefault(unit, []).append(value)
     told = []
     for unit, found in sizes.items():
-        ends = dict.fromkeys(f"{v:g}" for v in (min(found), max(found)))
+        ends = dict.fromkeys(rounded(v, 2) for v in (min(found), max(found)))
         told.append(f"{' to '.join(ends)} {unit}" if max(found) else f"{unit}, as the readings say")
     where = places(entry["places"], runs=True) or "nowhere here"
     what = ", ".join(told) or "no size of its own"
