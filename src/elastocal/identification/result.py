@@ -391,9 +391,8 @@ class Calibration(scrutiny.FoundFit, Result):
             if name not in found:
                 raise UnknownNameError.of("limit", name, found)
             if most is not None and not found[name] <= most:
-                finite = math.isfinite(found[name])
-                value = f"{rounded(found[name] * 1e6)} µm" if finite else "not known"
-                told.append(f"{name}: {value} where at most {rounded(most * 1e6)} µm is required")
+                value = length(found[name]) if math.isfinite(found[name]) else "not known"
+                told.append(f"{name}: {value} where at most {length(most)} is required")
         return tuple(told)
 
     def certificate(

@@ -32,7 +32,7 @@ from elastocal.model.chain import beyond_limits
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
-from elastocal.text import did_you_mean, listed, quoted, rounded
+from elastocal.text import did_you_mean, length, listed, quoted, rounded
 from elastocal.units import Array, IntArray
 
 UNLOADED = ("none", "unloaded", "0")
@@ -283,13 +283,13 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
              f"points lie up to {rounded(far)} m from the tracker and span {rounded(spread)} m: mm "
              "read as m? Map x_mm, y_mm, z_mm"),
             (table.position is not None and moved > 0.3 and spread < LEAST_SPREAD_M,
-             f"all points lie within {rounded(spread * 1e3)} mm although the arm moved: m read as "
+             f"all points lie within {length(spread)} although the arm moved: m read as "
              "mm? Map x_m, y_m, z_m"),
         ),
         ((force > LARGEST_FORCE_N,
           f"forces reach {rounded(force)} N, more than any arm carries; check [loads]"),),
         ((sigma > LARGEST_SIGMA_M,
-          f"standard deviations reach {rounded(sigma * 1e3)} mm; are they in µm?"),),
+          f"standard deviations reach {length(sigma)}; are they in µm?"),),
         ((table.position is not None and bool(np.any(table.force[:, 2] > 0)),
           "some forces point up (+z of the tracker's frame); a hanging load is negative"),),
         ((observe == "deflection" and lonely,

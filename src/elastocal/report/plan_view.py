@@ -297,7 +297,7 @@ def _everywhere_lines(plan: Plan) -> Told:
     )
     if drift := plan.model.cell.noise.drift:
         text += (
-            f"; with the drift of {rounded(drift * 1e6)} µm that [noise] states "
+            f"; with the drift of {say.length(drift)} that [noise] states "
             f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
         )
     if e.share:

@@ -23,7 +23,7 @@ from elastocal.report import blocks as say
 from elastocal.report import identification_view as fitted
 from elastocal.report.figures import NO_ENDS, rows_of_dots
 from elastocal.report.judgement_view import judgement, method_and_weights
-from elastocal.text import listed, load_text, printable, rounded, some
+from elastocal.text import listed, load_text, printable, some
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -405,7 +405,7 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
     if table.time is not None:
         yield "Time", f"{table.time.max():.6g} s from the first reading to the last"
     if found.fit is not None:
-        error = f"{rounded(found.fit.error * 1e3)} mm"
+        error = say.length(found.fit.error)
         yield "Nominal arm", f"readings fit it to {error} (median, base and markers fitted)"
 
 
