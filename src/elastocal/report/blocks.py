@@ -186,9 +186,7 @@ def with_ends(value: float, low: float, high: float) -> tuple[str, str, float]:
 
 def plain(value: float) -> str:
     """A number without known uncertainty, such as a nominal value: at most six digits."""
-    if not math.isfinite(value):
-        return "–"
-    return f"{value + 0.0:.6g}"
+    return rounded(value, 6) if math.isfinite(value) else "–"
 
 
 def loads_text(forces: Array, one: str, several: str) -> str:
