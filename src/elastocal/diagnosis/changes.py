@@ -104,7 +104,7 @@ class Comparison(Result):
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
         >>> ec.compare(fit, fit)
-        <Comparison kuka_kr270_2: 0 of 9 parameters changed, p = 1>
+        <Comparison kuka_kr270_2: 0 of 9 parameters changed, p = 1.0>
     """
 
     old: CalibratedArm

@@ -392,7 +392,7 @@ class Calibration(scrutiny.FoundFit, Result):
                 raise UnknownNameError.of("limit", name, found)
             if most is not None and not found[name] <= most:
                 value = length(found[name]) if math.isfinite(found[name]) else "not known"
-                told.append(f"{name}: {value} where at most {length(most)} is required")
+                told.append(f"{name}: {value} where at most {rounded(most * 1e6)} µm is required")
         return tuple(told)
 
     def certificate(

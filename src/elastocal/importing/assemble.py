@@ -289,7 +289,7 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
         ((force > LARGEST_FORCE_N,
           f"forces reach {rounded(force)} N, more than any arm carries; check [loads]"),),
         ((sigma > LARGEST_SIGMA_M,
-          f"standard deviations reach {length(sigma)}; are they in µm?"),),
+          f"standard deviations reach {rounded(sigma * 1e3)} mm; are they in µm?"),),
         ((table.position is not None and bool(np.any(table.force[:, 2] > 0)),
           "some forces point up (+z of the tracker's frame); a hanging load is negative"),),
         ((observe == "deflection" and lonely,
