@@ -317,8 +317,9 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     for name, one in known.items():
         if name in data:
             found[name] = _value(one.kind, data[name], spot / name, one.takes)
-        else:
-            spot.require(not one.required, f"key {spot.key(name)} is missing; it takes {one.takes}")
+        elif one.required:
+            told = f"key {spot.key(name)} is missing; it takes {one.takes}"
+            raise InputError(f"{spot.path}: {told}")
     if issubclass(cls, BaseModel):
         return cls.model_construct(**found)
     return from_table(cls, found, spot)
@@ -376,8 +377,9 @@ def from_table(cls: type[Record], table: Mapping[str, Any], spot: Spot, **values
 def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
     """The value in SI units and name of the one of `keys` that the table states, None for none."""
     given = [known for known in keys if known.name in table]
-    names = " and ".join(spot.key(known.name) for known in given)
-    spot.require(len(given) < 2, f"{names} say the same in two units; keep one of them")
+    if len(given) > 1:
+        names = " and ".join(spot.key(known.name) for known in given)
+        raise InputError(f"{spot.path}: {names} say the same in two units; keep one of them")
     if not given:
         return None
     known = given[0]

@@ -6,7 +6,8 @@ import json
 import math
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from decimal import Decimal
 from difflib import get_close_matches
 from typing import Any
 
@@ -50,10 +51,58 @@ def counted(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
+def significant(value: float, digits: int = 3) -> str:
+    """A number of so many digits, without an exponent where it is readable: 1830, 0.120, 1.00."""
+    if not 1e-5 < abs(value) < 1e10:
+        return f"{value + 0.0:.{digits}g}"
+    return f"{Decimal(f'{value:.{digits - 1}e}'):f}"
+
+
 def rounded(value: float, digits: int = 3) -> str:
-    """A number of so many digits as people write it: 1830, not 1.83e+03."""
-    told = f"{value:.{digits}g}"
-    return f"{float(told):.0f}" if "e+0" in told else told
+    """The same without zeros at its end: 1830, 0.12, 1."""
+    told = significant(value, digits)
+    return told.rstrip("0").rstrip(".") if "." in told and "e" not in told else told
+
+
+SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
+
+
+def p_value(p: float) -> str:
+    """Two digits, or that it is below the smallest that is told."""
+    if not math.isfinite(p):
+        return "–"
+    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
+
+
+def size_of(p: float) -> str:
+    """ "p = 0.02", "p < 0.0001"."""
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def length(metres: float) -> str:
+    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
+    if not math.isfinite(metres):
+        return "not available"
+    if abs(metres) < 0.9995e-3:
+        return f"{significant(metres * 1e6)} µm"
+    if abs(metres) < 0.9995:
+        return f"{significant(metres * 1e3)} mm"
+    return f"{significant(metres)} m"
+
+
+def newtons(force: Iterable[float]) -> str:
+    """ "(0, 0, -2600) N"."""
+    return f"({', '.join(rounded(v, 6) for v in force)}) N"
+
+
+def load_text(force: Iterable[float]) -> str:
+    return newtons(force) if any(force) else "unloaded"
+
+
+def together(parts: Sequence[str], last: str = "and") -> str:
+    """ "a, b and c"."""
+    return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
 
 
 def gathered(names: Iterable[str]) -> str:
@@ -65,8 +114,7 @@ def gathered(names: Iterable[str]) -> str:
         found.setdefault((what, kind), []).append(where[len(kind) :])
     told = []
     for (what, kind), places in found.items():
-        several = " and ".join(p for p in (", ".join(places[:-1]), places[-1]) if p)
-        told.append(f"{what} of {kind}{'s' * (len(places) > 1)} {several}".rstrip())
+        told.append(f"{what} of {kind}{'s' * (len(places) > 1)} {together(places)}".rstrip())
     return ", ".join(told)
 
 

@@ -131,3 +131,30 @@ def split_unit(header: str) -> tuple[str, str | None]:
         if found and unit is not None and header[: found.start()].strip():
             return header[: found.start()].strip(), unit
     return header, None
+
+
+# SI unit → (factor, unit shown).
+SHOWN = {
+    "m": (1e3, "mm"),
+    "rad": (1e3, "mrad"),
+    "1": (1e6, "ppm"),
+    "rad/(N*m)": (1e6, "µrad/(N·m)"),
+    "m/N": (1e6, "µm/N"),
+    "N/m": (1e-3, "N/mm"),
+    "N*m/rad": (1e-3, "kN·m/rad"),
+    "m/s": (3.6e9, "µm/h"),
+    "rad/s": (3.6e9, "µrad/h"),
+    "1/K": (1e6, "ppm/K"),
+    "1/m": (1e6, "µm/m²"),
+}
+
+
+def display(value: float, unit: str) -> tuple[float, str]:
+    """`value` in SI `unit` as people read it: 2.87e-7, "rad/(N*m)" → 0.287, "µrad/(N·m)".
+
+    A unit that is not listed keeps its value, written with proper symbols.
+    """
+    if unit in SHOWN:
+        factor, text = SHOWN[unit]
+        return value * factor, text
+    return value, unit.replace("*", "·").replace("^2", "²").replace("^3", "³")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
@@ -694,9 +693,10 @@ def effects(cell: Any = None) -> DataFrame:
     """
     import pandas as pd
 
+    from elastocal.model.manipulator import effect_entries
+
     given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
-    entries = import_module("elastocal.report.blocks").effect_entries  # it lies above
-    return pd.DataFrame(entries(_checked_cell(getattr(given, "cell", given), "cell")))
+    return pd.DataFrame(effect_entries(_checked_cell(getattr(given, "cell", given), "cell")))
 
 
 # What the verbs take

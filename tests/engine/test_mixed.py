@@ -9,7 +9,7 @@ import pytest
 import statsmodels.formula.api as smf
 from engine.dense import Table, dense, readings
 
-from elastocal.engine.mixed import Expected, LogPrior, MixedFit
+from elastocal.engine import Expected, LogPrior, MixedFit
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_choice import NoisyReadings, fitted, prior_of_groups
 from elastocal.identification.noise_structure import STRUCTURES, Kind, Readings

@@ -98,7 +98,7 @@ def effects(cell: Annotated[Path | None, typer.Argument()] = None, *, run: Run) 
     """
     from elastocal.demo import example
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.blocks import effect_entries
+    from elastocal.model.manipulator import effect_entries
 
     known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
     entries = effect_entries(known)

@@ -46,7 +46,7 @@ from elastocal.model.rigid import (
 )
 from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.tables import column, csv_text
-from elastocal.text import listed, plain, rounded, some
+from elastocal.text import length, listed, plain, rounded, some
 from elastocal.units import Array, BoolArray, IntArray
 
 # Targets: where the tool is to be, and in which frame that is stated.
@@ -579,11 +579,10 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     unknown, std = sure.unknown[reached], sure.std[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
     if len(unknown) and rms > max(WORTH_TELLING, float(np.sqrt(np.mean(std**2)))):
-        size = f"{rms * 1e6:.0f} µm" if rms < 0.9995e-3 else f"{rounded(rms * 1e3, 4)} mm"
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
-            f"this point depends: typical deviations of them would move it by {size} rms, which "
-            "within95_um counts and std_um leaves out; choose a marker that was fitted "
+            f"this point depends: typical deviations of them would move it by {length(rms)} rms, "
+            "which within95_um counts and std_um leaves out; choose a marker that was fitted "
             f"({option('point')}), or measure what is missing"
         )
     known = np.isin(arm.model.names, arm.determined)
@@ -606,11 +605,11 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         return
     outside = far.copy()
     outside[far] = _std_of_markers(arm, c, far) > shown.most
-    said = f" µm at most, at measured poses {shown.most * 1e6:.0f} µm)"
+    said = f" at most, at measured poses {length(shown.most)})"
     if (some := far & ~outside).any():
         yield (
             f"{_rows(c.targets, some)}: where the {c.point.told} lies on the tool is hardly known "
-            f"(standard deviation {sure.std[some].max() * 1e6:.0f}{said}; measure a marker there, "
+            f"(standard deviation {length(sure.std[some].max())}{said}; measure a marker there, "
             f"or choose a marker that was fitted ({option('point')})"
         )
     if outside.any():
@@ -618,7 +617,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         yield (
             f"{_rows(c.targets, outside)}: {'these targets are' if several else 'this target is'} "
             f"outside the measured poses (standard deviation "
-            f"{sure.std[outside].max() * 1e6:.0f}{said}; measure poses there"
+            f"{length(sure.std[outside].max())}{said}; measure poses there"
         )
 
 

@@ -27,7 +27,7 @@ from elastocal.model.calibrated import (
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
-from elastocal.text import listed
+from elastocal.text import listed, rounded
 from elastocal.units import Array, BoolArray
 
 LEAST_STEP = 1e-9  # m between levels
@@ -188,7 +188,7 @@ def _mostly_inexact(
         q, heads = inside[~helped], joint_columns(chain.kinds)
         levels = in_file_units(q[:1], chain.kinds)[0]
         singular = [
-            heads[k] + (f" = {levels[k] + 0.0:.4g}" if len(axis) == 1 else "")
+            heads[k] + (f" = {rounded(levels[k], 4)}" if len(axis) == 1 else "")
             for k, axis in enumerate(grid.axes)
             if exact(q + aside[k] * np.eye(len(heads))[k]).mean() > HELPS
         ]

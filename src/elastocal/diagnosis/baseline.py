@@ -10,7 +10,7 @@ from functools import cache, cached_property
 import numpy as np
 from scipy import linalg
 
-from elastocal.engine.mixed import (
+from elastocal.engine import (
     LOG_2PI,
     ROUNDING,
     LogPrior,

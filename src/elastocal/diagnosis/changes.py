@@ -51,7 +51,7 @@ from elastocal.model.calibrated import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import smooth_groups
-from elastocal.text import listed
+from elastocal.text import listed, size_of
 from elastocal.units import Array, IntArray
 
 SCHEMA = "elastocal/comparison/1"
@@ -106,7 +106,7 @@ class Comparison(Result):
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
         >>> ec.compare(fit, fit)
-        <Comparison kuka_kr270_2: 0 of 9 parameters changed, p = 1>
+        <Comparison kuka_kr270_2: 0 of 9 parameters changed, p = 1.0>
     """
 
     old: CalibratedArm
@@ -148,7 +148,7 @@ class Comparison(Result):
     def __repr__(self) -> str:
         return (
             f"<Comparison {self.old.model.chain.name}: {len(self.changed)} of "
-            f"{len(self.changes)} parameters changed, p = {self.p:.2g}>"
+            f"{len(self.changes)} parameters changed, {size_of(self.p)}>"
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -49,7 +49,7 @@ from elastocal.diagnosis.effect_search import ModelSet, about, extended, spans_o
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import scatter_beyond
-from elastocal.engine.mixed import ROUNDING, Standardised, beside
+from elastocal.engine import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.gears import GearRipple, GearSpectrum

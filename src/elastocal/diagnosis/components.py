@@ -40,7 +40,7 @@ from elastocal.diagnosis.baseline import (
 from elastocal.diagnosis.effect_search import spans_of, within_bounds
 from elastocal.diagnosis.evidence import at_scales
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.engine.mixed import Products, Standardised, beside, climb
+from elastocal.engine import Products, Standardised, beside, climb
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import Waves
 from elastocal.units import Array, IntArray

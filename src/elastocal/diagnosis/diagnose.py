@@ -53,7 +53,7 @@ from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
 from elastocal.plugin_loader import is_plugin_file
-from elastocal.text import did_you_mean, listed, rounded
+from elastocal.text import did_you_mean, length, listed
 from elastocal.units import BoolArray, Progress
 
 # Keys of the cell file, in whatever table, whose texts are paths.
@@ -186,11 +186,11 @@ def diagnose(
         return replace(found, warnings=(str(lies), *found.warnings))
     progress(f"once more with {lies.axis} up")
     upright = _diagnosed(model, lies.turned(table), options, progress)
-    before, after = (1e6 * d.budget[-2].heldout_rms for d in (found, upright))
+    before, after = (d.budget[-2].heldout_rms for d in (found, upright))
     names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "none"
     told = (
         f"{lies}. With {lies.axis} up the verdict is {upright.verdict} (effects: {names}), and the "
-        f"held-out error falls to {rounded(after)} µm instead of {rounded(before)} µm"
+        f"held-out error falls to {length(after)} instead of {length(before)}"
     )
     if after > (1 - PAYS) * before:
         told = f"{lies}. Here it makes no difference"

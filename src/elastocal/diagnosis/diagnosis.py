@@ -15,6 +15,7 @@ from elastocal.identification.scrutiny import BudgetStep
 from elastocal.measurements import Measurements
 from elastocal.model.effects.base import Stage
 from elastocal.model.manipulator import Model
+from elastocal.text import SMALLEST_P as SMALLEST_P
 from elastocal.text import plain
 
 
@@ -62,7 +63,6 @@ MICRO = 1e6
 # A true effect at this distance (standard deviations) from "nothing" is found 99 times in 100,
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
 VISIBLE, FAINTEST = 5.0, 3.0
-SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
 LARGE = 0.1  # share of the gap, in squares, from which what has no name leaves the verdict open
 STRUCTURE = 0.05  # family-wise p-value up to which the dependence on a covariate is told
 

@@ -34,6 +34,7 @@ from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import test_poses
+from elastocal.text import length
 from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.
@@ -81,7 +82,7 @@ class NextPoses(Result):
         return alone if alone is not None and alone > APART * self.reached else None
 
     def __repr__(self) -> str:
-        told = f"at most {self.reached * 1e6:.3g} µm with 95 %"
+        told = f"at most {length(self.reached)} with 95 %"
         return f"<NextPoses {self.verdict}: {told}, {self.batch} more poses>"
 
     def to_json(self) -> dict[str, Any]:

@@ -34,7 +34,7 @@ from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import XmlFile, check_urdf, tree_of
 from elastocal.tables import csv_text
-from elastocal.text import did_you_mean, json_text, listed, plain, rounded
+from elastocal.text import did_you_mean, json_text, length, listed, plain, rounded
 from elastocal.units import Array, microns, pose_at, rpy_from_rotation
 
 ENDINGS = {
@@ -503,7 +503,7 @@ def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
 def _accepted(distance: float, largest: float) -> float:
     if not distance <= largest:
         raise ElastocalError(
-            f"the written file, read back, is {rounded(distance * 1e6)} µm from the model and was "
+            f"the written file, read back, is {length(distance)} from the model and was "
             "not kept; please report this robot description"
         )
     return distance

@@ -37,7 +37,6 @@ from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
-from elastocal.model.symbolic import SymbolicArm
 from elastocal.model.urdf import urdf_file
 from elastocal.tables import csv_text
 from elastocal.units import Array, microns
@@ -223,8 +222,7 @@ class ExportNumbers:
 
 
 def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
-    model = part.model
-    symbolic = SymbolicArm(model.chain, model.cell)
+    model, symbolic = part.model, part.model.symbolic
     arm = symbolic.arm
     given = {"time": conditions.time, "temperature": conditions.temperature}
     inputs = [np.full(s.shape[0], given.get(name) or 0.0) for name, s in arm.inputs.items()]
@@ -565,15 +563,14 @@ def _gears(kept: Kept) -> JointCorrection:
     held = {choice.name for choice in kept.exported.model.cell.model.effects}
     lost = (c for c in full.model.cell.model.effects if c.name not in held)
     part = _with(full, (c for c in lost if effect_of(c.name).stage == "transmission"))
-    chain, cell = part.model.chain, part.model.cell
-    symbolic = SymbolicArm(chain, cell)
+    chain, symbolic = part.model.chain, part.model.symbolic
     arm = symbolic.arm
     motion = ca.vertcat(*arm.q) - arm.q_commanded
     function = BatchFunction([*arm.inputs.values(), symbolic.p], [motion])
     assert conditions.visits is not None
     middle = np.median(conditions.visits.q, axis=0)
     curves = []
-    ranges = zip(*finite_ranges(chain, *joint_limits(cell, chain)), strict=True)
+    ranges = zip(*finite_ranges(chain, *joint_limits(part.model.cell, chain)), strict=True)
     for i, (low, high) in enumerate(ranges):
         x = np.linspace(low, high, int(np.ceil((high - low) / FINE)) + 1)
         q = np.tile(middle, (len(x) + 1, 1))

@@ -25,6 +25,7 @@ from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.model.effects.placements import MarkerPosition
+from elastocal.text import length
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.
@@ -79,7 +80,7 @@ class FaultyGroup:
 
     def __str__(self) -> str:
         name = {"block": f"lines {self.name}"}.get(self.level, f"{self.level} {self.name}")
-        return f"{name} by {self.error * 1e3:.3g} mm"
+        return f"{name} by {length(self.error)}"
 
 
 @dataclass(frozen=True)

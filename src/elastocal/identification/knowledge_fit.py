@@ -30,7 +30,7 @@ from elastocal.identification.solve import (
     residual_sigma,
 )
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.text import listed, quoted, some
+from elastocal.text import listed, quoted, size_of, some
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # A fit with knowledge: where its constraints let it go, and how far.
@@ -309,7 +309,7 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
     what = [*["the prior"] * bool(rows), *(f"'{a.label}'" for a in found.best.active)]
     return (
         f"The readings contradict {some(what, 6, ' and ')}: without, they are fitted better than "
-        f"noise explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, p = {p:.1g}). "
+        f"noise explains (F = {F:.1f} on {stated} and {dof:.0f} degrees of freedom, {size_of(p)}). "
         "Check names, units and signs of what is stated, and whether the model lacks an effect.",
     )
 

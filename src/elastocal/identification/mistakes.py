@@ -27,7 +27,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.text import listed, rounded
+from elastocal.text import length, listed, rounded
 from elastocal.units import Array, IntArray
 
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
@@ -83,7 +83,7 @@ def nominal_fit(
     for words, other in chain_of(of_columns, _of_rows(rigid, table)):
         left = _errors(rigid, other)[1]
         if left < near:
-            near, best = left, words.format(f"{rounded(left * 1e3)} mm")
+            near, best = left, words.format(length(left))
         if near <= POOR:
             break
     better = near < far / BETTER
@@ -93,7 +93,7 @@ def nominal_fit(
             "columns, one or two of them, nor rows that have shifted mend that: check the robot of "
             "the cell, offsets of joints, and which joint values belong to which point"
         )
-    said = f"the readings fit the nominal arm only to {rounded(far * 1e3)} mm"
+    said = f"the readings fit the nominal arm only to {length(far)}"
     return NominalFit(error, f"{said}{';' if better else ','} {best}", better and near <= POOR)
 
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse, special
 
-from elastocal.engine.mixed import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
+from elastocal.engine import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (

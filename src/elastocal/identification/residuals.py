@@ -13,6 +13,7 @@ from scipy import linalg, special
 from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
 from elastocal.measurements import numbered
 from elastocal.model.observations import COMPONENTS, Observations
+from elastocal.text import load_text
 from elastocal.units import Array, BoolArray, IntArray
 
 # Held-out residuals: cross-validation over configurations in closed form.
@@ -278,7 +279,7 @@ def groupings(
     table, size = observed.table, observed.size
     force = np.round(table.force[observed.lead], 3)
     load = numbered(*force.T)
-    loads = tuple(map(_named, force[np.unique(load, return_index=True)[1]]))
+    loads = tuple(map(load_text, force[np.unique(load, return_index=True)[1]]))
     coded: list[tuple[str, IntArray, tuple[str, ...]]] = [
         ("component", np.arange(size)[None], COMPONENTS[observed.kind]),
         ("marker", table.marker[observed.lead][:, None], table.marker_names),
@@ -293,12 +294,6 @@ def groupings(
             place = np.empty(len(names), dtype=np.int64)
             place[order] = np.arange(len(order))
             yield by, place[code], np.array(names, dtype=object)[order]
-
-
-def _named(force: Array) -> str:
-    if not force.any():
-        return "unloaded"
-    return "(" + ", ".join(f"{f + 0.0:.6g}" for f in force) + ") N"
 
 
 # Do the residuals look as the noise model says?  For the whole table and by group.

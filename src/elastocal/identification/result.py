@@ -45,7 +45,7 @@ from elastocal.model.calibrated import (
     tool_point,
 )
 from elastocal.model.observations import COMPONENTS, observe
-from elastocal.text import plain, rounded
+from elastocal.text import length, plain, rounded
 from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"
@@ -391,8 +391,7 @@ class Calibration(scrutiny.FoundFit, Result):
             if name not in found:
                 raise UnknownNameError.of("limit", name, found)
             if most is not None and not found[name] <= most:
-                finite = math.isfinite(found[name])
-                value = f"{rounded(found[name] * 1e6)} µm" if finite else "not known"
+                value = length(found[name]) if math.isfinite(found[name]) else "not known"
                 told.append(f"{name}: {value} where at most {rounded(most * 1e6)} µm is required")
         return tuple(told)
 
@@ -473,7 +472,7 @@ class Calibration(scrutiny.FoundFit, Result):
 
     def __repr__(self) -> str:
         known = sum(e.identifiable for e in self.ordinary)
-        held = f", held-out {self.heldout_rms * 1e6:.3g} µm" if self.heldout_rms < np.inf else ""
+        held = f", held-out {length(self.heldout_rms)}" if self.heldout_rms < np.inf else ""
         functions = f", {len(self.smooth)} smooth functions" if self.smooth else ""
         return (
             f"<Calibration {self.model.chain.name}: {known} of {len(self.ordinary)} parameters"

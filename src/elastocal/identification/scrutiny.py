@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.engine.mixed import Standardised
+from elastocal.engine import Standardised
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.options import SmoothPart
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares

@@ -8,7 +8,8 @@ from typing import Any
 from elastocal.errors import option
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
-from elastocal.text import counted, gathered, listed, rounded
+from elastocal.text import counted, gathered, listed, rounded, size_of
+from elastocal.units import display
 
 # What to do about a finding.
 
@@ -111,31 +112,31 @@ SENTENCES = {
     ),
     "lack_of_fit": (
         "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
-        "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not return to the same "
+        "and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
         "place, or an effect is missing. The intervals do not include it and are too narrow: "
         "use {count}intervals by cr2; measure more configurations rather than more repeats."
     ),
     "drift": (
-        "Base or tracker drift during the session ({sigma_um} µm in each direction, by the "
-        "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
+        "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
+        "{by}; {p}). Weights and intervals account for it, and whole blocks in time are "
         "held out. {remedy}"
     ),
     "joint_scatter": (
         "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
-        "p = {p:.1g}). Weights and intervals account for it. {remedy}"
+        "{p}). Weights and intervals account for it. {remedy}"
     ),
     "beyond_bound": (
-        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound:g}: {remedy}"
+        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: {remedy}"
     ),
     "many_faulty_readings": (
         "Too many for reading errors: a shifted block of readings, or a missing effect in some "
         "load state, marker or region. {remedy}"
     ),
 }
-DIGITS = {"condition_number": 2, "sigma_um": 3, "value": 3, "std": 2}  # of numbers in them
+DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
-    "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
+    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}",
 }
 
 
@@ -171,7 +172,10 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
             if isinstance(v, tuple) else rounded(v, DIGITS[k]) if k in DIGITS else v
             for k, v in f.numbers.items()
         }  # fmt: skip
+        words["along"] = "" if result.model.observe == "distance" else " in each direction"
+        words["p"] = size_of(f.number("p")) if "p" in words else ""
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
+        words |= _shown(f) if within else {}
         default = "the default method, whose noise model has this scatter, or "
         words["count"] = "" if result.noise.estimated else default
         ask = f.remedy.startswith("Ask")
@@ -182,12 +186,17 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if len(same) == 1:
             yield SENTENCES[f.kind].format(**words)
             return
-        pairs = (
-            f"{rounded(o.numbers.get('value', 0))} ± {rounded(o.numbers.get('std', 0), 2)}"
-            for o in same
-        )
+        pairs = ("{value} ± {std}".format(**_shown(other)) for other in same)
         words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
         yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
+
+
+def _shown(f: Finding) -> dict[str, str]:
+    """Value, standard deviation and bound of a parameter in the unit that people think in."""
+    unit = str(f.numbers["unit"])
+    digits = {"value": 3, "std": 2, "bound": 3}
+    sizes = {k: rounded(display(f.number(k), unit)[0], n) for k, n in digits.items()}
+    return sizes | {"unit": display(0.0, unit)[1]}
 
 
 def _runs(lines: Iterable[int]) -> str:

@@ -19,7 +19,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse, special
 
-from elastocal.engine.mixed import Products, climb
+from elastocal.engine import Products, climb
 from elastocal.identification.knowledge import share_of_prior
 from elastocal.identification.least_squares import Covariance, Fit, PriorRows
 from elastocal.identification.least_squares import fit as least_squares

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.measurements import Measurements, numbered, visits
-from elastocal.model.chain import joint_limits
+from elastocal.model.chain import beyond_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.placements import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
@@ -308,7 +308,7 @@ def _distance_start(model: Model, table: Measurements, x: Array, movable: set[in
 # before a wrong unit is the likelier cause.
 EXTENT_FACTOR = 30.0
 SMALL_ANGLE = np.radians(2 * np.pi)  # what a full turn in rad reads as in degrees
-LIMIT_SLACK = np.radians(0.5)  # controllers overshoot soft limits by a little
+OVERSHOOT = np.radians(0.5)  # controllers overshoot soft limits by a little
 SAME = 1e-9
 SOME = 2**14  # readings that are enough to tell their unit
 
@@ -356,23 +356,18 @@ def check_limits(model: Model, table: Measurements) -> None:
             f"({int(wound.any(axis=1).sum())} lines); these are probably degrees in a column "
             "named …_rad: rename it to …_deg"
         )
-    lower, upper = joint_limits(model.cell, model.chain)
-    beyond = (table.q < lower - LIMIT_SLACK) | (table.q > upper + LIMIT_SLACK)
-    if beyond.any():
-        i, j = (int(v) for v in np.argwhere(beyond)[0])
-        unit, factor = ("°", 180 / np.pi) if revolute[j] else (" m", 1.0)
-        share = beyond.any(axis=1).mean()
+    beyond = beyond_limits(model.cell, model.chain, table.q, OVERSHOOT, 4)
+    if beyond is not None:
+        rows, _, told = beyond
         hint = (
             "; most lines are beyond: probably degrees given as radians (or the reverse), or "
             "another robot"
-            if share > 0.5
+            if 2 * len(rows) > len(table)
             else "; correct the line or the limits"
         )
         raise InputError(
-            f"{table.source}, line {table.row[i]}: joint{j + 1} ({model.chain.joints[j].name}) at "
-            f"{rounded(table.q[i, j] * factor, 4)}{unit} is beyond its limits "
-            f"[{rounded(lower[j] * factor, 4)}, {rounded(upper[j] * factor, 4)}]{unit} "
-            f"({int(beyond.any(axis=1).sum())} of {len(table)} lines){hint}"
+            f"{table.source}, line {table.row[rows[0]]}: {told} ({len(rows)} of {len(table)} "
+            f"lines){hint}"
         )
 
 

@@ -22,6 +22,7 @@ from elastocal.model.observations import (
     position_covariance,
     subset,
 )
+from elastocal.text import length
 from elastocal.units import Array, IntArray
 
 # Measurement noise: covariance of the observations and the weights W with W Σ = I.
@@ -126,7 +127,7 @@ def stated_covariance(observed: Observations, tracker: Tracker, kind: str) -> tu
     if observed.kind == "distance":
         need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
         sigma = float(tracker.distance_sigma or 1.0)
-        text = f"distance sigma {sigma * 1e6:.3g} µm from the cell"
+        text = f"distance sigma {length(sigma)} from the cell"
         return np.full((len(observed.table), 1, 1), sigma**2), text
     blocks, text = position_covariance(observed.table, tracker, kind)
     if observed.kind == "pose":

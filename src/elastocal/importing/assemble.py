@@ -28,11 +28,11 @@ from elastocal.importing.exports import FORCES, Records, joint_stems, read_recor
 from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import LoadStatesTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
-from elastocal.model.chain import Chain, joint_limits
+from elastocal.model.chain import beyond_limits
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
-from elastocal.text import did_you_mean, listed, quoted, rounded
+from elastocal.text import did_you_mean, length, listed, quoted, rounded
 from elastocal.units import Array, IntArray
 
 UNLOADED = ("none", "unloaded", "0")
@@ -283,7 +283,7 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
              f"points lie up to {rounded(far)} m from the tracker and span {rounded(spread)} m: mm "
              "read as m? Map x_mm, y_mm, z_mm"),
             (table.position is not None and moved > 0.3 and spread < LEAST_SPREAD_M,
-             f"all points lie within {rounded(spread * 1e3)} mm although the arm moved: m read as "
+             f"all points lie within {length(spread)} although the arm moved: m read as "
              "mm? Map x_m, y_m, z_m"),
         ),
         ((force > LARGEST_FORCE_N,
@@ -297,27 +297,6 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
           f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"),),
     )  # fmt: skip
     return [told for row in doubts for told in [text for so, text in row if so][:1]]
-
-
-SLACK = 1e-6  # rad or m beyond a limit that rounding explains
-
-
-def beyond_limits(cell: Cell, chain: Chain, table: Measurements, columns: Columns) -> str:
-    """Why the limits of the cell refuse the table; "" where they do not."""
-    lower, upper = joint_limits(cell, chain)
-    beyond = (table.q < lower - SLACK) | (table.q > upper + SLACK)
-    if not beyond.any():
-        return ""
-    rows = np.flatnonzero(beyond.any(axis=1))
-    i, j = int(rows[0]), int(np.argmax(beyond[rows[0]]))
-    factor, unit = (180 / np.pi, "°") if chain.kinds[j] == "revolute" else (1e3, " mm")
-    return (
-        f"{columns['note_source'][i]}: joint{j + 1} ({chain.joints[j].name}) at "
-        f"{rounded(table.q[i, j] * factor, 4)}{unit} is beyond its limits "
-        f"[{rounded(lower[j] * factor, 4)}, {rounded(upper[j] * factor, 4)}]{unit} ({len(rows)} of "
-        f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
-        "the limits of the cell"
-    )
 
 
 @dataclass(frozen=True)
@@ -378,7 +357,12 @@ def import_files(
             measured = read(joint_kinds=chain.kinds, marker_names=markers, observe=observe)
     fit, refused = None, ""
     if cell is not None and chain is not None:
-        refused = beyond_limits(cell, chain, measured, columns)
+        if (beyond := beyond_limits(cell, chain, measured.q)) is not None:
+            rows, _, why = beyond
+            refused = (
+                f"{columns['note_source'][rows[0]]}: {why} ({len(rows)} of {len(measured)} rows); "
+                "correct unit, sign, offset_deg or order in [joints], or the limits of the cell"
+            )
         fit = nominal_fit(chain, cell, measured, spherical)
     warnings += [
         *told,

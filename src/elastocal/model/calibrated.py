@@ -27,7 +27,7 @@ from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model, smooth_groups
-from elastocal.model.symbolic import SymbolicArm, Total
+from elastocal.model.symbolic import Total
 from elastocal.text import did_you_mean, listed, quoted, rounded
 from elastocal.units import Array
 
@@ -562,7 +562,7 @@ class CalibratedTool:
         self.calibrated, self.point = arm, point
         self.chain, self.cell = arm.model.chain, arm.model.cell
         self.x = arm.x
-        self._symbolic = SymbolicArm(self.chain, self.cell)
+        self._symbolic = arm.model.symbolic
         own = self._symbolic.arm
         if point.marker is None:
             place, turn = rigid.constant(point.place), ca.SX.eye(3)

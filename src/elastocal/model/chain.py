@@ -14,7 +14,7 @@ import numpy as np
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require, wish
 from elastocal.text import did_you_mean, listed, printable, rounded
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 JointKind = Literal["revolute", "prismatic"]
 
@@ -112,8 +112,28 @@ def finite_ranges(
     return low, np.where(np.isfinite(upper), upper, low + 2 * half)
 
 
-def told(chain: Chain, j: int, value: float) -> str:
-    return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"
+def told(chain: Chain, j: int, value: float, digits: int = 6) -> str:
+    turns = chain.kinds[j] == "revolute"
+    return f"{rounded(np.degrees(value), digits)}°" if turns else f"{rounded(value, digits)} m"
+
+
+LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a limit
+
+
+def beyond_limits(
+    cell: Cell, chain: Chain, q: Array, slack: float = LIMIT_SLACK, digits: int = 6
+) -> tuple[IntArray, int, str] | None:
+    """The postures q (n, joints) that lie beyond the limits, and of the first one the joint
+    (0-based) and a sentence on it."""
+    lower, upper = joint_limits(cell, chain)
+    beyond = (q < lower - slack) | (q > upper + slack)
+    if not beyond.any():
+        return None
+    i, j = (int(v) for v in np.argwhere(beyond)[0])
+    at, low, high = (told(chain, j, v, digits) for v in (q[i, j], lower[j], upper[j]))
+    name = f"joint{j + 1} ({chain.joints[j].name})"
+    rows = np.flatnonzero(beyond.any(axis=1))
+    return rows, j, f"{name} at {at} is beyond its limits, {low} to {high}"
 
 
 def joint_index(name: str) -> int:

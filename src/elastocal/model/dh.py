@@ -40,7 +40,7 @@ from elastocal.tables import (
     match_columns,
     read_table,
 )
-from elastocal.text import did_you_mean, listed, nearest, quoted
+from elastocal.text import did_you_mean, listed, nearest, quoted, rounded
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -204,9 +204,9 @@ def _closer(table: RawTable, chain: Chain) -> Chain:
     if extent(closer) > MAX_LENGTH and column is not None:
         raise _too_much(table, i, column, d[i], "m is too long for a link, and the d do not cancel")
     told = (
-        f"the d of nearly parallel axes, up to {abs(d[i]):.4g} m, cancel: joint frames are taken "
-        f"where the axes pass the arm, whose links are {extent(closer):.2f} m long together; it "
-        "moves as the table says"
+        f"the d of nearly parallel axes, up to {rounded(abs(d[i]), 4)} m, cancel: joint frames are "
+        f"taken where the axes pass the arm, whose links are {extent(closer):.2f} m long together; "
+        "it moves as the table says"
     )
     return replace(closer, notes=(*closer.notes, told))
 
@@ -368,8 +368,8 @@ def _of_deviations(path: Path, text: str, ur_model: str | None) -> Chain:
     )
     longest = float(np.abs(delta[2]).max())
     told = (
-        f"d of up to {longest:.4g} m in the controller's table cancel: joint frames are taken "
-        "where the axes pass the arm; it moves as the table says"
+        f"d of up to {rounded(longest, 4)} m in the controller's table cancel: joint frames are "
+        "taken where the axes pass the arm; it moves as the table says"
     )
     return replace(chain, notes=(told,))
 

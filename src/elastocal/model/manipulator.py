@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -123,20 +124,20 @@ class Model(ByValue):
     ) -> None:
         self.chain, self.cell, self._extra = chain, cell, tuple(extra)
         self.observe = cell.model.observe
-        self._symbolic = SymbolicArm(chain, cell, extra, backend)
-        self.parameters: tuple[Parameter, ...] = self._symbolic.parameters
+        self.symbolic = SymbolicArm(chain, cell, extra, backend)  # its expressions
+        self.parameters: tuple[Parameter, ...] = self.symbolic.parameters
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by what it is made of; another process derives the functions again."""
         plugins = Carried(Path(self.cell.source), self.cell.plugins)  # run first
-        made_of = plugins, self.chain, self.cell, self._extra, self._symbolic.backend
+        made_of = plugins, self.chain, self.cell, self._extra, self.symbolic.backend
         return _arrived, made_of, {"_markers_stated": self._markers_stated}
 
     def _compared(self) -> Mapping[str, Any]:
         """The robot's numbers and all that the cell says, but for names and places of files."""
         cell = {k: v for k, v in vars(self.cell).items() if k not in ("name", "path", "robot")}
         extra = [(effect.name, place) for effect, place in self._extra]
-        return cell | {"chain": self.chain, "extra": extra, "backend": self._symbolic.backend}
+        return cell | {"chain": self.chain, "extra": extra, "backend": self.symbolic.backend}
 
     def __hash__(self) -> int:
         return hash((self.chain.name, self.names))
@@ -251,7 +252,7 @@ class Model(ByValue):
         if self._markers_stated or not names or names == tuple(self.cell.tool.markers):
             return self
         cell = _with_markers(self.cell, names)
-        model = Model.assembled(self.chain, cell, backend=self._symbolic.backend)
+        model = Model.assembled(self.chain, cell, backend=self.symbolic.backend)
         model._markers_stated = False
         return model
 
@@ -262,7 +263,7 @@ class Model(ByValue):
     def specified(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
         """The same arm with all of another [model]."""
         cell = replace(self.cell, model=spec)
-        return Model.assembled(self.chain, cell, extra, self._symbolic.backend)
+        return Model.assembled(self.chain, cell, extra, self.symbolic.backend)
 
     @cached_property
     def rigid(self) -> Model:
@@ -293,7 +294,7 @@ class Model(ByValue):
 
     def backend_report(self) -> str:
         """What evaluates this model, for reports: engines and threads."""
-        return evaluated_by(self._symbolic.backend)
+        return evaluated_by(self.symbolic.backend)
 
     @property
     def nominal(self) -> Array:
@@ -345,7 +346,7 @@ class Model(ByValue):
             >>> bool(abs(model.deflection(loaded)).max() < 0.01)
             True
         """
-        return self._symbolic.equilibrium(row_inputs(self._symbolic.arm, table), self._at(x))[0]
+        return self.symbolic.equilibrium(row_inputs(self.symbolic.arm, table), self._at(x))[0]
 
     def _at(self, x: ArrayLike | None, several: bool = False) -> NDArray:
         """Parameter values (parameters,), the nominal ones by default; or `several` (k, …)."""
@@ -386,7 +387,7 @@ class Model(ByValue):
             (810,)
         """
         x = self._at(x, several=True)
-        inputs = row_inputs(self._symbolic.arm, table)
+        inputs = row_inputs(self.symbolic.arm, table)
         observed = observations or observe(table, self.observe)
         if x.ndim == 1:
             return observed.apply(self._readings(inputs, x)).ravel()
@@ -400,9 +401,8 @@ class Model(ByValue):
 
     def _readings(self, inputs: list[NDArray], x: NDArray) -> NDArray:
         """Readings (rows, size) at values x (parameters,), or (rows, parameters) by row."""
-        return self._symbolic.readings(*inputs, x, self._symbolic.equilibrium(inputs, x)[0])[0][
-            ..., 0
-        ]
+        theta = self.symbolic.equilibrium(inputs, x)[0]
+        return self.symbolic.readings(*inputs, x, theta)[0][..., 0]
 
     @checked_arguments
     def B(self, table: Measurements, x: Array | None = None) -> NDArray:
@@ -441,7 +441,7 @@ class Model(ByValue):
         x = self._at(x)
         chosen = tuple(range(len(x))) if columns is None else tuple(int(c) for c in columns)
         observed = observations or observe(table, self.observe)
-        h, B = self._symbolic.regressor(row_inputs(self._symbolic.arm, table), x, columns=chosen)
+        h, B = self.symbolic.regressor(row_inputs(self.symbolic.arm, table), x, columns=chosen)
         check_equilibrium(table, h)
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
@@ -458,8 +458,8 @@ class Model(ByValue):
 
     def _frames(self, table: Measurements, x: Array | None) -> list[NDArray]:
         x = self._at(x)
-        inputs = row_inputs(self._symbolic.arm, table)
-        return self._symbolic.frames(*inputs, x, self._symbolic.equilibrium(inputs, x)[0])
+        inputs = row_inputs(self.symbolic.arm, table)
+        return self.symbolic.frames(*inputs, x, self.symbolic.equilibrium(inputs, x)[0])
 
 
 NOMINAL = "check force_*_N and [model.nominal] joint_compliance, which is in rad/(N m)"
@@ -589,3 +589,33 @@ def where_smooth_functions_end(cell: Cell) -> str:
         else f"{name} from {np.degrees(low):.1f}° to {np.degrees(high):.1f}°"
         for name, (low, high) in sorted(ends.items())
     )  # fmt: skip
+
+
+def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
+    """Per effect, stage by stage in the catalogue's order: name, what it is, places, parameters.
+
+    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
+    parameter's typical size is null where only the readings say it.
+    """
+    given = cell_of(cell)
+    chain = load_chain(given)
+    given = numbered(given, chain)
+    on, entries = {choice.name for choice in given.model.effects}, []
+    stages = list(dict.fromkeys(effect.stage for effect in CATALOGUE.values()))
+    for effect in sorted(CATALOGUE.values(), key=lambda effect: stages.index(effect.stage)):
+        where = effect.places(chain, given)
+        first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
+        try:
+            parameters = effect.parameters(where[0], chain, given) if where else ()
+        except InputError:  # of link weights without masses: settings of the cell make them
+            parameters = ()
+        entries.append({
+            "name": effect.name, "stage": effect.stage,
+            "on": effect.name in on or effect.acts_unasked(given), "what": " ".join(first.split()),
+            "places": list(where), "needs": list(effect.needed(given)),
+            "parameters": [
+                {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
+                for p in parameters
+            ],
+        })  # fmt: skip
+    return entries

@@ -35,6 +35,7 @@ from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Pla
 from elastocal.planning.relaxation import Relaxed, exact_plan, prospects
 from elastocal.planning.setup import FeasiblePool, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
+from elastocal.text import rounded
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states
@@ -310,7 +311,7 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
     spec, drawn, found = cell.design, choice.draw(cell), list[_Fit]()
     # Where a reading takes no time nothing says how many of them there may be.
     for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):
-        choice.progress(f"within {minutes:.4g} minutes: {repeats} readings each")
+        choice.progress(f"within {rounded(minutes, 4)} minutes: {repeats} readings each")
         read = found[-1].read if found else None
         with suppress(InsufficientDataError):
             found += _fitting(choice, cell, minutes, drawn, repeats, read)
@@ -320,8 +321,8 @@ def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize,
     if not found:
         raise InsufficientDataError(
             f"{cell.source}: no plan that determines the parameters takes "
-            f"{minutes:.4g} minutes or less; allow more time, or lower dwell_s, reading_s and "
-            "load_change_s of [design.motion] where they are too high"
+            f"{rounded(minutes, 4)} minutes or less; allow more time, or lower dwell_s, reading_s "
+            "and load_change_s of [design.motion] where they are too high"
         )
     # A plan that holds more parameters errs less in the others, but not in all.
     best = min(found, key=lambda fit: (-fit.kept, fit.value))

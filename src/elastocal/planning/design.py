@@ -75,7 +75,7 @@ from elastocal.planning.search import (
 )
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
-from elastocal.text import listed, quoted, rounded
+from elastocal.text import length, listed, quoted, rounded
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
@@ -314,7 +314,7 @@ class _Design:
         if whole is not None:
             self.warnings.append(
                 "with the smooth functions, which stay uncertain, the error at the test poses is "
-                f"{rounded(gain.after * 1e6)} µm rms"
+                f"{length(gain.after)} rms"
             )
         return gain
 
@@ -439,7 +439,7 @@ class _Design:
             last = tried[max(tried)]
             raise InsufficientDataError(
                 f"{self.cell.source}: no plan of up to {last.poses} poses meets "
-                f"the target of {wanted * 1e6:g} µm; the best found reaches "
+                f"the target of {rounded(wanted * 1e6)} µm; the best found reaches "
                 f"{rounded(last.value, 4)} µm: ask for less, measure more repeats, or take a "
                 "better tracker"
             )

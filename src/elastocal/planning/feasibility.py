@@ -27,6 +27,7 @@ from elastocal.planning.collision import (
     marker_positions,
     rope_angle,
 )
+from elastocal.text import rounded
 from elastocal.units import Array, BoolArray
 
 # What a rule of the cell is, and those that bound a quantity of the pose.
@@ -100,7 +101,8 @@ class Bound(Rule):
         unit = self.units[i % len(self.units)]
         scale = 180 / np.pi if unit == "°" else 1.0
         return (
-            f"{self.key} of {half * scale:.4g} {unit} instead of {limit * scale:.4g} {unit} for "
+            f"{self.key} of {rounded(half * scale, 4)} {unit} instead of "
+            f"{rounded(limit * scale, 4)} {unit} for "
             f"{self.labels[i]} would let half of those pass"
         )
 
@@ -146,7 +148,7 @@ class KeepApart(Rule):
         freed = int((~self._collisions.hits(poses, POSE_SLACK - margin)).sum()) if margin else 0
         key = {"obstacle": "clearance_mm", "self_collision": "self_clearance_mm"}.get(self.name)
         if freed:
-            text += f", or {key} of 0 instead of {margin * 1e3:.4g} would free {freed}"
+            text += f", or {key} of 0 instead of {rounded(margin * 1e3, 4)} would free {freed}"
         return text
 
 

@@ -37,7 +37,7 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import SIZE, Observations, available_noise, observe
 from elastocal.simulation import simulate
-from elastocal.text import listed, quoted, rounded
+from elastocal.text import length, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.
@@ -472,7 +472,7 @@ def with_noise_of(cell: Cell, done: Calibration) -> tuple[Cell, tuple[str, ...]]
         tracker = replace(cell.tracker, noise=CartesianNoise(np.full(3, sigma)))
         key, along = "sigma_um", " on each axis"
     told = (
-        f"no noise of a reading is stated: the plan takes the {rounded(1e6 * sigma)} µm{along} "
+        f"no noise of a reading is stated: the plan takes the {length(sigma)}{along} "
         f"that the measurements done show; state [tracker] {key} where you know it"
     )
     return replace(cell, tracker=tracker), (told,)

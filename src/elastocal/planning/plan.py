@@ -26,6 +26,7 @@ from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import csv_text
+from elastocal.text import rounded
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.
@@ -433,7 +434,7 @@ class Plan(Result):
         told = "" if away is None else f", none of its pool is over {100 * away:.1f} % better"
         return (
             f"<Plan {self.model.chain.name}: {len(self)} poses by {self.criterion}, "
-            f"{self.reported:.4g} {self.unit}{told}>"
+            f"{rounded(self.reported, 4)} {self.unit}{told}>"
         )
 
     def __len__(self) -> int:

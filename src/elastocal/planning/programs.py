@@ -19,7 +19,7 @@ import numpy as np
 from elastocal.errors import ElastocalError, InputError, require
 from elastocal.model.chain import Chain
 from elastocal.planning.execution import Execution
-from elastocal.text import printable
+from elastocal.text import newtons, printable, rounded
 from elastocal.units import Array
 
 # Text and numbers as robot controllers read them.
@@ -53,8 +53,8 @@ def steps_of(execution: Execution, configurations: Sequence[str], forces: Array)
     home, dwell, nothing = execution.motion.home, execution.motion.dwell, np.zeros(0)
     steps: list[Step] = [] if home is None else [("move", home, "home")]
     for stop in execution.stops:
-        name, force = f"configuration {stop.name(configurations)}", forces[stop.load] + 0.0
-        load = "load of ({:g}, {:g}, {:g}) N".format(*force) if force.any() else "no load"
+        name, force = f"configuration {stop.name(configurations)}", forces[stop.load]
+        load = f"load of {newtons(force)}" if force.any() else "no load"
         moves: list[Step] = [("move", q, VIA) for q in stop.via] + [("move", stop.q, name)]
         if stop.change_after is not None:
             hang = f"hang the {load}" if force.any() else TAKE_OFF
@@ -113,8 +113,8 @@ def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
 def limits_text(lower: Array, upper: Array) -> str:
     shown = []
     for i, (low, high) in enumerate(zip(lower, upper, strict=True), 1):
-        told = [f"from {math.degrees(low):.4g}"] if math.isfinite(low) else []
-        told += [f"to {math.degrees(high):.4g}"] if math.isfinite(high) else []
+        told = [f"from {rounded(math.degrees(low), 4)}"] if math.isfinite(low) else []
+        told += [f"to {rounded(math.degrees(high), 4)}"] if math.isfinite(high) else []
         shown.append(f"J{i} {' '.join(told).removeprefix('from ' * (len(told) == 2)) or 'any'}")
     return ", ".join(shown)
 

@@ -27,7 +27,7 @@ from elastocal import __version__
 from elastocal.errors import InsufficientDataError, require
 from elastocal.files import atomic_write, open_input
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.model.symbolic import SymbolicArm, configuration_rows
+from elastocal.model.symbolic import configuration_rows
 from elastocal.planning.candidates import CHUNK, JointSpace, draw, points
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
@@ -148,8 +148,8 @@ class Searches:
         """B (q, x) and its adjoint (q, x, W) of poses at a level, as q (n,) is."""
         if level not in self._rows:
             info = self.setup.information
-            arm = SymbolicArm(info.model.chain, info.model.cell)
-            self._rows[level] = configuration_rows(arm, info.rows(q[None]), info.columns)
+            arm, template = info.model.symbolic, info.rows(q[None])
+            self._rows[level] = configuration_rows(arm, template, info.columns)
         return self._rows[level]
 
     def moved(

@@ -32,7 +32,7 @@ from elastocal.planning.plan import Everywhere, Plan, Scheduled, predicted, rema
 from elastocal.planning.relaxation import DesignProblem, relax
 from elastocal.planning.test_poses import TargetPoses, known_rows
 from elastocal.simulation import expand_plan, simulate
-from elastocal.text import listed, rounded
+from elastocal.text import length, listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 WORTH_TELLING = 1e-7  # m
@@ -193,7 +193,7 @@ def _aimed(
     if why and (bias := found.remaining_bias(rows, weight)) >= WORTH_TELLING:
         told += (
             f"{'; '.join(why)}; identification holds what it cannot see, and typical deviations "
-            f"of that move the test points by {rounded(bias * 1e6)} µm rms, which the criterion "
+            f"of that move the test points by {length(bias)} rms, which the criterion "
             "does not count",
         )
     inputs = replace(setup.inputs, A=found.on_kept(rows[:T], hold), weights=targets.weight)

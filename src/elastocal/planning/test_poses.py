@@ -16,7 +16,15 @@ from elastocal.errors import InputError, InsufficientDataError, require, wish
 from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
-from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
+from elastocal.model.chain import (
+    LIMIT_SLACK,
+    Chain,
+    beyond_limits,
+    finite_ranges,
+    joint_index,
+    joint_limits,
+    told,
+)
 from elastocal.model.effects.catalogue import choose_effects
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
@@ -30,8 +38,6 @@ from elastocal.text import listed, quoted, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 # Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
-
-LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a limit
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:
@@ -62,20 +68,8 @@ def check_cell(cell: Cell, chain: Chain) -> None:
 
 def _check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
     _check_numbers(chain, key, q, degrees)
-    if (beyond := beyond_limits(cell, chain, q)) is not None:
-        raise InputError(f"{key}: {beyond[1]}; correct the posture or the limits")
-
-
-def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
-    """Which joint (0-based) of the posture q (n,) lies beyond its limits, and a sentence on it."""
-    lower, upper = joint_limits(cell, chain)
-    beyond = np.flatnonzero((q < lower - LIMIT_SLACK) | (q > upper + LIMIT_SLACK))
-    if not len(beyond):
-        return None
-    j = int(beyond[0])
-    at, low, high = (told(chain, j, value) for value in (q[j], lower[j], upper[j]))
-    name = f"joint{j + 1} ({chain.joints[j].name})"
-    return j, f"{name} at {at} is beyond its limits, {low} to {high}"
+    if (beyond := beyond_limits(cell, chain, q[None])) is not None:
+        raise InputError(f"{key}: {beyond[2]}; correct the posture or the limits")
 
 
 def _check_numbers(chain: Chain, key: str, found: Sized, degrees: bool, one: bool = False) -> None:
@@ -250,11 +244,10 @@ class _Sources:
             weight = weight[:, 0]
         force, q, position = raw.si("force"), raw.si("q"), raw.si("position")
         turn, source = rotation_column(raw), f"{n} of {spec.file.name}"
-        for i, posture in enumerate([] if q is None else q):
-            if (beyond := beyond_limits(self.cell, self.chain, posture)) is not None:
-                where = raw.where(i, columns["q"][beyond[0]].header)
-                raise InputError(f"{where}: {beyond[1]}; correct the path or the limits")
-
+        if q is not None and (beyond := beyond_limits(self.cell, self.chain, q)) is not None:
+            rows, joint, why = beyond
+            where = raw.where(int(rows[0]), columns["q"][joint].header)
+            raise InputError(f"{where}: {why}; correct the path or the limits")
         if q is None:
             assert position is not None  # _columns: joints or positions
             rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()

@@ -26,7 +26,7 @@ from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks as say
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
-from elastocal.text import printable
+from elastocal.text import load_text, printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
@@ -289,7 +289,7 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
         groups = [own[marker[own] == m] for m in markers]
         name = table.configuration_labels[table.configuration[rows[k]]]
         poses.append(Posed(
-            f"{name}, {say.load_text(table.force[rows[k]])}" if several else name,
+            f"{name}, {load_text(table.force[rows[k]])}" if several else name,
             f"rms residual {say.length(float(rms[code]))} of {len(own)} readings",
             frames[k], flange[k],
             np.array([at[g].mean(axis=0) for g in groups]),

@@ -9,26 +9,22 @@ and the digits that are known.
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from elastocal.errors import InputError
 from elastocal.measurements import in_file_units
-from elastocal.model.chain import numbered
-from elastocal.model.effects.catalogue import CATALOGUE, cell_of
-from elastocal.model.manipulator import Model, load_chain
+from elastocal.model.manipulator import Model
 from elastocal.text import counted as counted
-from elastocal.text import printable
-from elastocal.units import Array
+from elastocal.text import length, newtons, printable, rounded, significant, together
+from elastocal.text import p_value as p_value
+from elastocal.text import size_of as size_of
+from elastocal.units import Array, display
 
 if TYPE_CHECKING:
-    from elastocal.cell.work_cell import Cell
     from elastocal.diagnosis.diagnosis import Candidate, EffectAt, FoundEffect
     from elastocal.planning.plan import Plan
 
@@ -146,31 +142,7 @@ def unfolded(blocks: Iterable[Block], which: Callable[[Fold], bool]) -> Iterator
 
 # Numbers
 
-# SI unit → (factor, unit shown).
-SHOWN = {
-    "m": (1e3, "mm"),
-    "rad": (1e3, "mrad"),
-    "1": (1e6, "ppm"),
-    "rad/(N*m)": (1e6, "µrad/(N·m)"),
-    "m/N": (1e6, "µm/N"),
-    "N/m": (1e-3, "N/mm"),
-    "N*m/rad": (1e-3, "kN·m/rad"),
-    "m/s": (3.6e9, "µm/h"),
-    "rad/s": (3.6e9, "µrad/h"),
-    "1/K": (1e6, "ppm/K"),
-}
 MOST_DECIMALS = 9
-
-
-def display(value: float, unit: str) -> tuple[float, str]:
-    """`value` in SI `unit` as people read it: 2.87e-7, "rad/(N*m)" → 0.287, "µrad/(N·m)".
-
-    A unit that is not listed keeps its value, written with proper symbols.
-    """
-    if unit in SHOWN:
-        factor, text = SHOWN[unit]
-        return value * factor, text
-    return value, unit.replace("*", "·").replace("^2", "²").replace("^3", "³")
 
 
 def with_uncertainty(value: float, half: float) -> tuple[str, str]:
@@ -214,37 +186,7 @@ def with_ends(value: float, low: float, high: float) -> tuple[str, str, float]:
 
 def plain(value: float) -> str:
     """A number without known uncertainty, such as a nominal value: at most six digits."""
-    if not math.isfinite(value):
-        return "–"
-    return f"{value + 0.0:.6g}"
-
-
-def significant(value: float, digits: int = 3) -> str:
-    """A finite number rounded to `digits` digits, without an exponent where it is readable."""
-    if value == 0 or not 1e-5 < abs(value) < 1e7:
-        return f"{value:.{digits}g}"
-    decimals = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    return _fixed(value, decimals)
-
-
-def length(metres: float) -> str:
-    """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
-    if not math.isfinite(metres):
-        return "not available"
-    if abs(metres) < 0.9995e-3:
-        return f"{significant(metres * 1e6)} µm"
-    if abs(metres) < 0.9995:
-        return f"{significant(metres * 1e3)} mm"
-    return f"{significant(metres)} m"
-
-
-def newtons(force: Iterable[float]) -> str:
-    """ "(0, 0, -2600) N"."""
-    return f"({', '.join(f'{v + 0.0:g}' for v in force)}) N"
-
-
-def load_text(force: Iterable[float]) -> str:
-    return newtons(force) if any(force) else "unloaded"
+    return rounded(value, 6) if math.isfinite(value) else "–"
 
 
 def loads_text(forces: Array, one: str, several: str) -> str:
@@ -252,7 +194,7 @@ def loads_text(forces: Array, one: str, several: str) -> str:
     if len(forces) == 1:
         return one.format(newtons(forces[0]))
     sizes = [math.hypot(*force) for force in forces]
-    return f"{several.format(len(sizes))}, {min(sizes):.4g} to {max(sizes):.4g} N"
+    return f"{several.format(len(sizes))}, {rounded(min(sizes), 4)} to {rounded(max(sizes), 4)} N"
 
 
 def _fixed(value: float, decimals: int) -> str:
@@ -275,11 +217,6 @@ MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
 def typeset(text: str) -> str:
     """With proper minus signs before numbers and between terms, not in names."""
     return MINUS.sub("−", text)
-
-
-def together(parts: Sequence[str], last: str = "and") -> str:
-    """ "a, b and c"."""
-    return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
 
 
 def capital(text: str) -> str:
@@ -452,21 +389,6 @@ def probability(p: float) -> str:
     return "< 0.01" if p < 0.005 else f"{p:.2f}"
 
 
-def p_value(p: float) -> str:
-    """Two digits, or that it is below the smallest that is told."""
-    from elastocal.diagnosis.diagnosis import SMALLEST_P
-
-    if not math.isfinite(p):
-        return "–"
-    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
-
-
-def size_of(p: float) -> str:
-    """ "p = 0.02", "p < 0.0001"."""
-    text = p_value(p)
-    return f"p {text}" if text.startswith("<") else f"p = {text}"
-
-
 def percent(fraction: float) -> str:
     return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
 
@@ -540,48 +462,15 @@ def setting_value(key: str, value: float) -> str:
     return f"{significant(value / 60)} min"
 
 
-# What can be fitted, as rows: each effect of the catalogue with its unit, size, places, words.
-
-
-def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
-    """Per effect, stage by stage in the catalogue's order: name, what it is, places, parameters.
-
-    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
-    parameter's typical size is null where only the readings say it.
-    """
-    given = cell_of(cell)
-    chain = load_chain(given)
-    given = numbered(given, chain)
-    on, entries = {choice.name for choice in given.model.effects}, []
-    stages = list(dict.fromkeys(effect.stage for effect in CATALOGUE.values()))
-    for effect in sorted(CATALOGUE.values(), key=lambda effect: stages.index(effect.stage)):
-        where = effect.places(chain, given)
-        first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
-        try:
-            parameters = effect.parameters(where[0], chain, given) if where else ()
-        except InputError:  # of link weights without masses: settings of the cell make them
-            parameters = ()
-        entries.append({
-            "name": effect.name, "stage": effect.stage,
-            "on": effect.name in on or effect.acts_unasked(given), "what": " ".join(first.split()),
-            "places": list(where), "needs": list(effect.needed(given)),
-            "parameters": [
-                {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
-                for p in parameters
-            ],
-        })  # fmt: skip
-    return entries
-
-
 def effect_head(entry: dict[str, Any]) -> str:
     """Name (* where it is on), places and typical sizes by unit of an effect, for people."""
     sizes: dict[str, list[float]] = {}
     for p in entry["parameters"]:
         value, unit = display(p["typical"] or 0.0, p["unit"])
-        sizes.setdefault(unit, []).append(float(f"{value:.2g}"))
+        sizes.setdefault(unit, []).append(value)
     told = []
     for unit, found in sizes.items():
-        ends = dict.fromkeys(f"{v:g}" for v in (min(found), max(found)))
+        ends = dict.fromkeys(rounded(v, 2) for v in (min(found), max(found)))
         told.append(f"{' to '.join(ends)} {unit}" if max(found) else f"{unit}, as the readings say")
     where = places(entry["places"], runs=True) or "nowhere here"
     what = ", ".join(told) or "no size of its own"

@@ -19,7 +19,7 @@ from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import warning_sentences
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
-from elastocal.text import gathered, listed, printable, some
+from elastocal.text import gathered, listed, printable, rounded, some
 
 
 def judgement(result: Calibration) -> say.ShownVerdict:
@@ -295,7 +295,7 @@ def prior_line(result: Calibration) -> str | None:
         return None
 
     def percent(share: float) -> str:  # never 100 % where the data say anything
-        return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"
+        return f"{rounded(min(100 * share, 99.9))} %" if share < 1 else "100 %"
 
     if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
@@ -425,7 +425,7 @@ def repeats_line(result: Calibration) -> str | None:
         return None
     numbers = (
         f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
-        f"{f.numbers['dof_pure']} degrees of freedom, {_p(f.number('p'))}"
+        f"{f.numbers['dof_pure']} degrees of freedom, {say.size_of(f.number('p'))}"
     )
     by = str(f.numbers["counted_by"])
     if f.kind == "repeats_agree":
@@ -455,7 +455,7 @@ def shape_line(summary: ResidualSummary) -> str:
     if f.kind == "residuals_too_few":
         text = f"Too few values to judge whether residuals are normal ({numbers})."
     else:
-        numbers += f", {_p(f.number('p'))}"
+        numbers += f", {say.size_of(f.number('p'))}"
         text = f"Standardised residuals agree with a normal distribution ({numbers})."
         if f.kind != "residuals_normal":
             text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
@@ -475,7 +475,7 @@ def shape_line(summary: ResidualSummary) -> str:
 def deviating_table(summary: ResidualSummary) -> say.ShownTable:
     rows = [
         (f"{by} {printable(g.name)}", str(g.n), say.significant(float(np.sqrt(g.mean_square)), 2),
-         f"{g.p_holm:.1g}")
+         say.p_value(g.p_holm))
         for by, g in summary.deviating
     ]  # fmt: skip
     heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
@@ -489,7 +489,7 @@ def in_time_line(result: Calibration) -> str | None:
         return None
     numbers = (
         f"correlation {found.correlations[0]:+.2f} over {found.visits} visits in the order of "
-        f"{'their times' if found.by == 'times' else 'the rows'}, {_p(found.p)}"
+        f"{'their times' if found.by == 'times' else 'the rows'}, {say.size_of(found.p)}"
     )
     told = result.finding("autocorrelated")
     which = "Residuals of successive visits are"
@@ -501,10 +501,6 @@ def in_time_line(result: Calibration) -> str | None:
         f"{which} alike ({numbers}): drift, or an effect missing at neighbouring poses. Intervals "
         "are too narrow."
     )
-
-
-def _p(p: float) -> str:
-    return "p < 1e-6" if p < 1e-6 else f"p = {say.significant(p, 2)}"
 
 
 FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit

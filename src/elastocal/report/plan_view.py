@@ -44,7 +44,7 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     figure = f"{plan.criterion} {plan.unit}".strip()
     if plan.curve:
         rows = [
-            (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
+            (str(s.poses), rounded(s.value, 4), "–" if s.bound is None else rounded(s.bound, 4))
             for s in plan.curve
         ]
         heads = ("poses", figure, "best possible on the pool")
@@ -54,7 +54,7 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
     if plan.timed:
         timed = say.ShownTable(
             ("poses", "readings each", "minutes", figure),
-            [(str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}")
+            [(str(s.poses), str(s.repeats), f"{s.minutes:.0f}", rounded(s.value, 4))
              for s in plan.timed],
             (), title="Poses and readings within the time",
         )  # fmt: skip
@@ -77,22 +77,21 @@ def next_blocks(found: NextPoses) -> Iterator[say.Block]:
         yield from plan_blocks(found.plan)
 
 
-def position_error(metres: float) -> str:
-    """A position error in µm, as plans have it, and where that is beyond all reading in mm or m."""
-    return f"{metres * 1e6:.3g} µm" if metres < 0.9995e-3 else say.length(metres)
-
-
 def _key(plan: Plan) -> say.KeyFigures:
     n, minutes = say.counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
-    worth = "criterion", f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
+    worth = "criterion", f"{plan.criterion} = {_value(plan, plan.reported)}"
     if plan.of_test_poses:
-        worth = "error at the test poses", position_error(_rho(plan) * 1e-6)
+        worth = "error at the test poses", say.length(_rho(plan) * 1e-6)
     figures = [("poses", str(len(plan.q))), worth]
     if (e := plan.everywhere) is not None:
-        figures.append(("error over the joint ranges", position_error(e.elsewhere)))
+        figures.append(("error over the joint ranges", say.length(e.elsewhere)))
     figures.append(("time", minutes))
     figures += [("load states", str(len(plan.forces)))][: 4 - len(figures)]
     return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
+
+
+def _value(plan: Plan, value: float, digits: int = 4) -> str:
+    return f"{rounded(value, digits)} {plan.unit}".rstrip()
 
 
 TOLD = 2  # parameters that a pose serves, in the table
@@ -122,7 +121,7 @@ def served(reason: Reason) -> str:
     def grown(factor: float) -> str:
         if math.isinf(factor):
             return "undetermined"
-        return f"×{factor:.3g}" if factor >= MANIFOLD else f"+{100 * (factor - 1):.0f} %"
+        return f"×{rounded(factor)}" if factor >= MANIFOLD else f"+{100 * (factor - 1):.0f} %"
 
     parts = [f"{printable(name)} {grown(factor)}" for name, factor in reason.serves[:TOLD]]
     return ", ".join(parts) or "all slightly"
@@ -152,10 +151,10 @@ def stop_table(plan: Plan) -> say.ShownTable:
 def plan_headline(plan: Plan) -> str:
     text = f"{say.counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
-        error = position_error(_rho(plan) * 1e-6)
+        error = say.length(_rho(plan) * 1e-6)
         text += f"position error ρ₀ = {error} rms at the test poses after compensation"
     else:
-        text += f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
+        text += f"{plan.criterion} = {_value(plan, plan.reported)}"
     better = plan.certificate.better_pool
     if better is None or plan.certificate.vain:
         return f"{text}; no bound on the best plan is known."
@@ -210,12 +209,12 @@ Told = Iterator[tuple[str, str]]  # label, sentence
 def plan_lines(plan: Plan) -> Told:
     yield from _chosen_lines(plan)
     if not plan.of_test_poses:
-        yield "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+        yield "Criterion", f"{plan.criterion} = {_value(plan, plan.reported, 6)}."
     else:
         yield (
             "Criterion",
-            f"ρ₀ = {_rho(plan):.4g} µm rms position error at the test poses after compensation "
-            f"({printable(plan.targets)}).",
+            f"ρ₀ = {rounded(_rho(plan), 4)} µm rms position error at the test poses after "
+            f"compensation ({printable(plan.targets)}).",
         )
     if plan.made_for:
         yield "Made for", f"{printable(plan.made_for)}."
@@ -232,8 +231,8 @@ def plan_lines(plan: Plan) -> Told:
     if s is not None and s.test_poses is not None and s.without is not None:
         yield (
             "In time",
-            f"{s.test_poses * 1e6:.4g} µm at the test poses with {listed(s.effects)} identified "
-            f"too, {s.without * 1e6:.4g} µm if they were known.",
+            f"{rounded(s.test_poses * 1e6, 4)} µm at the test poses with {listed(s.effects)} "
+            f"identified too, {rounded(s.without * 1e6, 4)} µm if they were known.",
         )
     if plan.timed:
         spec, took = plan.model.cell.design, plan.execution.total / 60
@@ -245,10 +244,10 @@ def plan_lines(plan: Plan) -> Told:
 
 
 def _chosen_lines(plan: Plan) -> Told:
-    c, s, unit = plan.chosen, plan.states, f" {plan.unit}" if plan.unit else ""
+    c, s = plan.chosen, plan.states
 
     def at(place: Any) -> str:
-        return f"[{', '.join(f'{v:.4g}' for v in place)}]"
+        return f"[{', '.join(rounded(v, 4) for v in place)}]"
 
     if c is not None:
         told = [
@@ -258,9 +257,10 @@ def _chosen_lines(plan: Plan) -> Told:
         if c.loads is not None:
             told.append(f"loads {', '.join(at(load) for load in c.loads)} N")
         yield "Chosen", f"{'; '.join(told)}."
-        stood = "no plan" if c.before is None else f"{c.before:.4g}"
+        stood = "no plan" if c.before is None else rounded(c.before, 4)
         seen = "none" if c.share[0] is None else f"{100 * c.share[0]:.1f} %"
-        worth = f"best possible value of any plan from {stood} to {c.after:.4g} {c.unit}".rstrip()
+        value = f"{rounded(c.after, 4)} {c.unit}".rstrip()
+        worth = f"best possible value of any plan from {stood} to {value}"
         yield (
             "Chosen",
             f"{worth} (relaxed, {c.candidates} candidates each), feasible poses from {seen} to "
@@ -277,8 +277,8 @@ def _chosen_lines(plan: Plan) -> Told:
         )
     if s.crossed is not None and s.chosen is not None:
         text += (
-            f" (relaxed on candidates, in the same time: in all load states {s.crossed:.4g}{unit}, "
-            f"chosen for each pose {s.chosen:.4g}{unit})"
+            f" (relaxed on candidates, in the same time: in all load states "
+            f"{_value(plan, s.crossed)}, chosen for each pose {_value(plan, s.chosen)})"
         )
     yield "Loads", f"{text}."
 
@@ -288,7 +288,7 @@ def _everywhere_lines(plan: Plan) -> Told:
         return
 
     def shown(error: float | None) -> str:
-        return "none" if error is None else f"{error * 1e6:.4g}"
+        return "none" if error is None else rounded(error * 1e6, 4)
 
     own = "" if plan.of_test_poses else f"; at the test poses {shown(e.test_poses)}"
     text = (
@@ -297,13 +297,13 @@ def _everywhere_lines(plan: Plan) -> Told:
     )
     if drift := plan.model.cell.noise.drift:
         text += (
-            f"; with the drift of {rounded(drift * 1e6)} µm that [noise] states "
+            f"; with the drift of {say.length(drift)} that [noise] states "
             f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
         )
     if e.share:
         text += (
-            f"; minimised is the weighted error, {plan.reported:.4g} µm, in which the joint ranges "
-            f"count {100 * e.share:.0f} %"
+            f"; minimised is the weighted error, {rounded(plan.reported, 4)} µm, in which the "
+            f"joint ranges count {100 * e.share:.0f} %"
         )
         text += f", with ρ₀ at most {100 * e.cap:g} % above its minimum" if e.cap else ""
     elif plan.of_test_poses:
@@ -317,14 +317,14 @@ def _chance_lines(plan: Plan) -> Told:
     c = plan.chance
     if c is None:
         return
-    whole, unit = f"{c.n} random plans of as many feasible poses", f" {plan.unit}".rstrip()
+    whole = f"{c.n} random plans of as many feasible poses"
     lost = f"{c.n - c.determined} of {whole} do not determine all parameters of this plan"
     text = ""
     if c.median is not None and c.best is not None:
-        worst = "no value" if c.worst is None else f"{c.worst:.4g}"
+        worst = "no value" if c.worst is None else rounded(c.worst, 4)
         text = (
-            f"the median of {whole} has {_criterion(plan)} = {c.median:.4g}{unit} (best "
-            f"{c.best:.4g}, worst {worst})"
+            f"the median of {whole} has {_criterion(plan)} = {_value(plan, c.median)} (best "
+            f"{rounded(c.best, 4)}, worst {worst})"
         )
         if c.efficiency is not None:
             text += f", an efficiency of {c.efficiency:.2f} against this plan"
@@ -332,13 +332,13 @@ def _chance_lines(plan: Plan) -> Told:
 
 
 def _certificate(plan: Plan) -> Iterator[str]:
-    c, name, unit = plan.certificate, _criterion(plan), f" {plan.unit}" if plan.unit else ""
+    c, name = plan.certificate, _criterion(plan)
     found, bound = c.efficiency_pool, plan.bound_reported
     if found is None:
         reason = CRITERIA[plan.criterion].without_bound
         yield f"none: {plan.criterion} {reason}, so no bound is known."
         return
-    told = "" if bound is None else f" (bound {name} = {bound:.4g}{unit})"
+    told = "" if bound is None else f" (bound {name} = {_value(plan, bound)})"
     efficiency = f"{found:.1g}" if c.vain else f"{found:.4f}"
     yield (
         f"certified on the pool: efficiency {efficiency} (in readings) against the best subset of "
@@ -357,11 +357,12 @@ def _certificate(plan: Plan) -> Iterator[str]:
             "have been missed."
         )
     if c.starts and bound is not None:
-        ends = " to ".join(dict.fromkeys(f"{e:.4g}" for e in (min(c.starts), max(c.starts))))
+        ends = " to ".join(dict.fromkeys(rounded(e, 4) for e in (min(c.starts), max(c.starts))))
         yield (
             f"{say.counted(len(c.starts), 'start')} of the search ended with {name} = "
-            f"{ends}{unit}, the bound is {bound:.4g}{unit}. The difference is what no start "
-            "found, or what only weights can reach: the fewer poses, the more of the latter."
+            f"{f'{ends} {plan.unit}'.rstrip()}, the bound is {_value(plan, bound)}. The difference "
+            "is what no start found, or what only weights can reach: the fewer poses, the more of "
+            "the latter."
         )
 
 
@@ -395,17 +396,17 @@ def _execution_lines(plan: Plan) -> Told:
         return
     text = f"a steady drift of {DRIFT * 1e6:g} µm changes "
     if d.at_test_poses:
-        text += f"the result by at most {round(d.bias * 1e6, 6):.2g} µm at the test poses"
-        other = f"{d.shortest * 1e6:.2g} µm"
+        text += f"the result by at most {rounded(round(d.bias * 1e6, 6), 2)} µm at the test poses"
+        other = f"{rounded(d.shortest * 1e6, 2)} µm"
     else:
-        text += f"parameters by at most {d.bias:.2g} standard deviations"
-        other = f"{d.shortest:.2g}"
+        text += f"parameters by at most {rounded(d.bias, 2)} standard deviations"
+        other = rounded(d.shortest, 2)
     yield "Drift", f"{text}{f' (in the shortest order {other})' * (d.bias < d.shortest)}."
 
 
 def next_lines(found: NextPoses) -> Told:
     g, n = found.gain, say.counted(found.batch, "pose")
-    limit = "" if found.required is None else f" (required: {position_error(found.required)})"
+    limit = "" if found.required is None else f" (required: {say.length(found.required)})"
     verdicts = {
         "measure": f"measure {n} more; then run it again with all readings in one table",
         "enough": "no further pose is needed: the required error is kept with 95 %",
@@ -415,14 +416,14 @@ def next_lines(found: NextPoses) -> Told:
     }
     now = "not known yet, as some parameters are undetermined"
     if math.isfinite(found.reached):
-        now = f"≤ {position_error(found.reached)} rms at new poses (95 %){limit}"
+        now = f"≤ {say.length(found.reached)} rms at new poses (95 %){limit}"
         if (alone := found.beside) is not None:
-            now += f"; identify says ≤ {position_error(alone)}, as it takes all scatter beyond the "
+            now += f"; identify says ≤ {say.length(alone)}, as it takes all scatter beyond the "
             now += "noise for what the model may lack, and diagnose finds that improbable"
 
     def both(before: float, after: float) -> str:
-        begun = position_error(before) if math.isfinite(before) else "an unknown error"
-        return f"{begun} to {position_error(after)}"
+        begun = say.length(before) if math.isfinite(before) else "an unknown error"
+        return f"{begun} to {say.length(after)}"
 
     yield "Next", f"{verdicts[found.verdict]}."
     yield "Error now", f"{now}."

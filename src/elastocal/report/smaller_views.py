@@ -23,7 +23,7 @@ from elastocal.report import blocks as say
 from elastocal.report import identification_view as fitted
 from elastocal.report.figures import NO_ENDS, rows_of_dots
 from elastocal.report.judgement_view import judgement, method_and_weights
-from elastocal.text import listed, printable, rounded, some
+from elastocal.text import listed, load_text, printable, some
 from elastocal.units import Array
 
 if TYPE_CHECKING:
@@ -394,7 +394,7 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
     yield "Markers", listed(table.marker_names, 20)
     forces, sizes = np.unique(table.force, axis=0, return_counts=True)
     loads = [
-        f"{say.load_text(force)}: {say.counted(int(n), 'reading')}"
+        f"{load_text(force)}: {say.counted(int(n), 'reading')}"
         for force, n in zip(forces, sizes, strict=True)
     ]
     yield "Loads", some(loads, 8, "; ", "; {} more")
@@ -403,7 +403,7 @@ def _counts(found: Imported) -> Iterator[tuple[str, str]]:
     if table.time is not None:
         yield "Time", f"{table.time.max():.6g} s from the first reading to the last"
     if found.fit is not None:
-        error = f"{rounded(found.fit.error * 1e3)} mm"
+        error = say.length(found.fit.error)
         yield "Nominal arm", f"readings fit it to {error} (median, base and markers fitted)"
 
 

@@ -107,8 +107,8 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
         wanted.setdefault(choice.name, []).append(choice.where)
     chosen = []
     for name, effect in CATALOGUE.items():
-        places = effect.places(chain, cell)
         asked = wanted.get(name, [])
+        places = effect.places(chain, cell) if asked else ()
         if asked and not places:
             raise InputError(
                 f"{cell.source}: [model] effects: {name} has no place on robot "

@@ -26,6 +26,7 @@ from elastocal.model.effects.base import (
 )
 from elastocal.model.effects.placements import SHORTEST, transverse_axes
 from elastocal.model.evaluate import BatchFunction
+from elastocal.text import rounded
 from elastocal.units import Array
 
 
@@ -151,7 +152,7 @@ class LinkMassError(Effect):
             error = values.get(f"{link}.mass_error")
             nominal = own.mass if cell.model.link_gravity else 0.0
             if error is not None and nominal + error <= 0:
-                reason = f"the mass of {link} would be {nominal + error:.3g} kg"
+                reason = f"the mass of {link} would be {rounded(nominal + error)} kg"
         return reason
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:

@@ -1,1 +1,0 @@
-"""The linear mixed model that identification and diagnosis share."""
