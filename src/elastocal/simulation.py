@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option, require
-from elastocal.measurements import Measurements, visits, with_moves
+from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Conditions, random_table
 from elastocal.model.effects.base import index
@@ -24,7 +24,7 @@ from elastocal.model.manipulator import NOMINAL, Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
 from elastocal.text import did_you_mean, listed
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 POSES = 50  # from which sizes are taken
 # m per rad/(N m) or m/N: what moves a reading by less would move it by a mm only at 1000 rad/(N m),
@@ -153,7 +153,8 @@ def simulate(
 
     Per-row sigmas of `rows` win over the cell's tracker noise, as when identifying; without
     either a reading has none.  At each visit joints settle anew, configurations are off, and
-    positions drift, as the cell's [noise] states.  Positions in m in the tracker frame; rotations
+    positions drift, as the cell's [noise] states, and the readings of a stop are off together by
+    the `repeatability_um` of [design].  Positions in m in the tracker frame; rotations
     and distances where the model observes them.
 
     Raises ElastocalError, with the `remedy`, where a pose has no static equilibrium.
@@ -168,8 +169,13 @@ def simulate(
         settled = replace(rows, q=rows.q + shift[visit])
     found = replace(_read(model, settled, x, rng, True, remedy), q=rows.q)
     if cell.noise.configuration and found.position is not None:
-        off = rng.normal(size=(rows.configuration.max(initial=-1) + 1, 3))[rows.configuration]
-        found = replace(found, position=found.position + cell.noise.configuration * off)
+        found = _off(found, cell.noise.configuration, rows.configuration, rng)
+    if cell.design.repeatability:
+        size = np.full((len(rows), 1), cell.design.repeatability)
+        if model.observe == "deflection":  # as plans count it: of the loaded visit
+            size *= rows.force.any(axis=1, keepdims=True)
+        stop = numbered(rows.configuration, load_states(rows.force))
+        found = _off(found, size, stop, rng)
     if not cell.noise.drift or found.position is None:
         return found
     # Where nobody says when, visits follow each other in the order of the rows.
@@ -181,6 +187,16 @@ def simulate(
     for k, same in enumerate(np.exp(-np.diff(when) / cell.noise.lasting), start=1):
         course[k] = same * course[k - 1] + np.sqrt(1 - same**2) * course[k]
     return replace(found, position=found.position + course[place.ravel()], time=time)
+
+
+def _off(
+    rows: Measurements, size: float | Array, place: IntArray, rng: np.random.Generator
+) -> Measurements:
+    """Readings off by `size` m (standard deviation, each direction), alike at each place (n,)."""
+    off = size * rng.normal(size=(place.max(initial=-1) + 1, 3))[place]
+    if rows.position is None:
+        return replace(rows, distance=np.asarray(rows.distance) + off[:, 0])
+    return replace(rows, position=rows.position + off)
 
 
 def _read(

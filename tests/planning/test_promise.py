@@ -38,18 +38,10 @@ def plan_of(cell: Cell, fixed: Sequence[str] = ()) -> Plan:
     return design(replace(cell, design=design_, workspace=space), options)
 
 
-def campaigns(plan: Plan, truth: NDArray, number: int, scatter: float = 0.0) -> list[Measurements]:
-    """Readings of the plan, each visit off by `scatter` m per direction in all its readings."""
+def campaigns(plan: Plan, truth: NDArray, number: int) -> list[Measurements]:
     cell, model = plan.model.cell, plan.model
     table = expand_plan(as_table(plan.q), tuple(cell.tool.markers), cell.design.repeats, DOWN)
-    found = []
-    for seed in range(number):
-        rng = np.random.default_rng(seed)
-        read = simulate(model, table, truth, rng)
-        off = scatter * rng.normal(size=(len(plan.q), 3))[read.configuration]
-        off *= read.force.any(axis=1)[:, None]  # of a deflection, the loaded visit's
-        found.append(replace(read, position=np.asarray(read.position) + off))
-    return found
+    return [simulate(model, table, truth, seed) for seed in range(number)]
 
 
 def errors_at_test_poses(plan: Plan, found: NDArray, truth: NDArray) -> NDArray:
@@ -125,7 +117,7 @@ def test_an_arm_that_does_not_come_back_to_quite_the_same_place() -> None:
     cell = plan_cell(loads=DOWN[None], poses=15, repeats=2, repeatability=40e-6)
     plan = plan_of(cell)
     truth = plan.model.nominal
-    tables = campaigns(plan, truth, 200, 40e-6)
+    tables = campaigns(plan, truth, 200)
     found = identified(plan, tables, noise="axis+configuration")
     check_promise(plan, found, truth)
     # Who does not count with it is promised far more than is kept.

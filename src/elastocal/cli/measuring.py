@@ -226,7 +226,10 @@ def design(
         say(summary.read_text(encoding="utf-8"), end="")
     else:
         run.answer(plan.to_json, lambda screen: print_report(screen, plan))
-        say(_what_next(cell, output, asked.get("augment"), plan))
+        of = cell if plan.chosen is None else cell_out or "chosen.toml"
+        if plan.chosen is not None and cell_out is None:
+            say("Run it again with --cell-out chosen.toml for the cell that the plan is of.")
+        say(_what_next(of, output, asked.get("augment"), plan))
 
 
 def _resumed(
@@ -252,7 +255,7 @@ def _resumed(
         raise
 
 
-def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> str:
+def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan) -> str:
     from elastocal.planning.plan import load_name
 
     loads = plan.forces[(plan.forces != 0).any(axis=1)]
@@ -261,6 +264,8 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
         names = listed(load_name(force) for force in plan.forces)
         hung = f"with the loads of its note_load ({names}), "
         carried = f" --load {' '.join(f'{value:g}' for value in loads[0])}"
+    if (readings := plan.model.cell.design.repeats) > 1:
+        carried += f" --repeats {readings}"
     added = "" if augment is None else f" (add them to {augment})"
     read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
     return (

@@ -197,8 +197,9 @@ def plan_steps(plan: Plan) -> list[str]:
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
         steps.append(
-            f"{say.counted(together, 'parameter')} will be determined only in sums: more "
-            "markers or load states separate them, more poses like these do not."
+            f"{say.counted(together, 'parameter')} will be determined only in sums, which more "
+            "poses like these do not separate: as expected where they describe the same motion; "
+            "other loads separate compliances, three markers the turn of the tool."
         )
     return [*steps, "Then: elastocal identify with the same cell and the measurements."]
 
@@ -252,6 +253,8 @@ def _chosen_lines(plan: Plan) -> Told:
     if c is not None:
         told = [
             f"{printable(name)} at {at(after)} m instead of {at(before)}"
+            if at(after) != at(before)
+            else f"{printable(name)} stays at {at(before)} m"
             for name, (before, after) in c.places.items()
         ]
         if c.loads is not None:
