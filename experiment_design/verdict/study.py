@@ -1,6 +1,6 @@
 """Is an arm that the verdict trusts at X µm as good as that where nobody measured?
 
-elastocal study experiment_design/verdict [--set campaigns=200]
+elastocal study experiment_design/verdict [--set campaigns=400]
 """
 
 from __future__ import annotations

@@ -361,7 +361,7 @@ def posed(name: str, title: str, caption: str, space: Space) -> say.Figure:
             axes.set_xlabel("x in m")
             axes.set_ylabel(f"{up} in m")
         if space.groups:
-            figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+            figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
     return say.Figure(name, title, draw, 7.0, caption, space=space)
 
