@@ -18,7 +18,7 @@ from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding
-from elastocal.identification.sentences import AT_BOUND, STATE_NOISE, made, more_poses
+from elastocal.identification.sentences import AT_BOUND, made, more_poses
 from elastocal.identification.solve import FAR, Solution
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, numbered
@@ -445,8 +445,12 @@ def _named(result: Calibration) -> list[str]:
 
 
 def _state_noise(result: Calibration) -> str:
-    ask = " elastocal diagnose looks for that either way."
-    return STATE_NOISE if _named(result) else STATE_NOISE + ask
+    keys, ask = "sigma_um, or range_um and transverse_um", "elastocal diagnose looks for that"
+    keys = "distance_um" if result.model.observe == "distance" else keys
+    return (
+        f"State the tracker's noise ([tracker] {keys}): only beside it does the residual say "
+        f"whether the model lacks something.{'' if _named(result) else f' {ask} either way.'}"
+    )
 
 
 def _lacking(result: Calibration) -> str:

@@ -13,10 +13,6 @@ from elastocal.units import display
 
 # What to do about a finding.
 
-STATE_NOISE = (
-    "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
-    "it does the residual say whether the model lacks something."
-)
 AT_BOUND = (
     "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
 )
