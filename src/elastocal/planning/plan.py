@@ -183,8 +183,11 @@ class Certificate:
     @property
     def better_pool(self) -> float | None:
         """The share of the error (√Φ, as people know it) by which a plan of the pool may be
-        better."""
-        return None if self.efficiency_pool is None else 1 - float(np.sqrt(self.efficiency_pool))
+        better, up to the next per mille; none below half of one."""
+        if self.efficiency_pool is None:
+            return None
+        share = 1e3 * (1 - np.sqrt(self.efficiency_pool))
+        return float(np.ceil(share)) / 1e3 if share >= 0.5 else 0.0
 
     @property
     def vain(self) -> bool:
