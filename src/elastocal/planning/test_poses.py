@@ -341,13 +341,13 @@ class _Sources:
                 found.append(part[rules.under(part, self.loads).ok])
                 if sum(map(len, found)) >= most:
                     break
-            q = np.concatenate(found)[:most]
-            if not len(q):
+            if not any(map(len, found)):
                 raise InsufficientDataError(
-                    f"{cell.source}: the cell states no test poses, and its rules allow "
-                    f"none of {count} postures drawn over the joint limits; state "
-                    "[[design.test_pose]], or relax the rules of [workspace]"
+                    f"{cell.source}: the cell states no test poses, and its rules allow no posture "
+                    f"drawn over the joint limits: {rules.advice(rules.every(q, self.loads))}; or "
+                    "state [[design.test_pose]]"
                 )
+            q = np.concatenate(found)[:most]
         return self.poses(q, f"{len(q)} drawn over the joint limits (the cell states none)")
 
     def drawn_in(self, dimension: int, count: int) -> Array:
