@@ -226,7 +226,7 @@ class DesignSpec:
     `levels` joint → values and `per_level` their numbers of poses (for at most one joint); `loads`
     (L, 3) N: forces under which poses are measured, `load_states`: all of them at every pose, or
     chosen ones; `repeats` readings each.  `repeatability` m: standard deviation of a deviation
-    common to a configuration's readings, per direction; `marker_sigma` m per marker instead of the
+    common to the readings of a stop, per direction; `marker_sigma` m per marker instead of the
     tracker's noise; `interest`: parameters, places or effects that D, A, E and O count (default all
     but base and markers); `elsewhere`: the share of the weight that poses all over the joint ranges
     have beside the test poses; `elsewhere_cap`: by how much the test poses may be worse for as

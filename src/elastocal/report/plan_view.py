@@ -158,9 +158,8 @@ def plan_headline(plan: Plan) -> str:
     better = plan.certificate.better_pool
     if better is None or plan.certificate.vain:
         return f"{text}; no bound on the best plan is known."
-    away = 100 * better
     text += "; no other plan from these candidates is "
-    text += "better" if away < 0.05 else f"more than {away:.1f} % better"
+    text += f"more than {100 * better:.1f} % better" if better else "better"
     text += " by the weighted error" if _weighted(plan) else ""
     return f"{text} (certified)."
 

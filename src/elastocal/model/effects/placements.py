@@ -178,14 +178,15 @@ ENCODERS = ("azimuth_sin", "azimuth_cos", "elevation_sin", "elevation_cos")
 class TrackerDistortion(Effect):
     """Range, refraction and angle-encoder errors of a polar instrument at `[tracker] position_m`.
 
-    With azimuth A, elevation E, range r and horizontal range s of the marker: A ← A +
-    azimuth_sin·sin A + azimuth_cos·cos A, E likewise, r ← (1 + scale) r, then z ← z +
-    refraction·s².  Eccentric circles shift an encoder's reading once per turn (rad); a wrong
-    wavelength, air temperature or pressure scales the range (1); a vertical gradient of the air's
-    temperature bends the beam, 1/m (half its curvature, 1 K/m makes 5e-7).  z is vertical.  Source:
+    With azimuth A, elevation E, range r and horizontal range s of the marker:
+    A ← A + azimuth_sin·sin A + azimuth_cos·cos A, E likewise, r ← (1 + scale) r, then
+    z ← z + refraction·s².  Eccentric circles shift an encoder's reading once per turn (rad); a
+    wrong wavelength, air temperature or pressure scales the range (1); a vertical gradient of
+    the air's temperature bends the beam, 1/m (half its curvature, 1 K/m makes 5e-7).  z is
+    vertical.  Distances of a wire or ball-bar have no such errors, hence no place.  Source:
     Muralikrishnan et al. 2009, "ASME B89.4.19 performance evaluation tests and geometric
     misalignments in laser trackers"; Hughes et al. 2011, "Laser tracker error determination using a
-    network measurement". Distances of a wire or ball-bar have no such errors, hence no place.
+    network measurement".
     """
 
     name = "tracker_distortion"
