@@ -242,9 +242,22 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
             # rest where it is singular.
             continue
         better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-        if better and predicts(held, after):
+        if better and predicts(held, after) and not astray(wide, wider, reduction):
             found, reduction, held = wide, wider, after
     return found, reduction
+
+
+def astray(wide: Fit, wider: Reduction, narrow: Reduction) -> bool:
+    """Whether a wider set has an addition that is uncertain by FAR times its typical size or more,
+    on an arm whose errors are no larger than typical.
+
+    It bends to what the model lacks, and leads anywhere off the poses measured.
+    """
+    problem, kept = wide.problem, wider.kept
+    std = residual_sigma(wide, len(kept)) * np.sqrt(np.diag(wide.cofactor()))
+    added = deviates(problem.model)[kept] & ~np.isin(kept, narrow.kept)
+    unknown = (std > FAR * problem.sizes[kept])[added].any()
+    return bool(unknown and not of_this_arm(Solution(wide, wider, np.nan), std)[1])
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.
