@@ -327,9 +327,21 @@ class SumAnswer:
     # How far the gap falls.
 
     @cached_property
-    def _left(self) -> Array:
-        """What the draws of all components leave of the poses that are kept (rows, draws)."""
-        return np.asarray(self.moved[self._poses[0]] @ self._drawn[self._own :])
+    def _true(self) -> Array:
+        """Readings without noise (rows, draws) of the configurations that are kept, each left out.
+
+        θ* is drawn about the fit to the others, as uncertain as that is: what is read there then
+        has the covariance P_cc⁻¹.
+        """
+        kept, _ = self._poses
+        at, configuration = self.at, np.nonzero(self._rows)[0][kept]
+        moved = self._wide.X[self._rows][kept] @ (self._drawn - at.beta[:, None])
+        own, left_out = (
+            np.bincount(configuration, each)
+            for each in ((moved**2).mean(axis=1), self._uncertain[kept])
+        )
+        grown = np.sqrt(np.maximum(left_out / np.maximum(own, 1e-300), 1.0))
+        return self._predicted(at.P, at.u)[:, None] + moved * grown[configuration, None]
 
     @cached_property
     def _uncertain(self) -> Array:
@@ -338,22 +350,37 @@ class SumAnswer:
         uncertain = np.linalg.inv(self.at.P) - V
         return np.asarray(np.diagonal(uncertain, axis1=1, axis2=2)[self._rows])
 
-    def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
-        """Fraction by which the noise-free error of new poses falls by these components.
+    def _predicted(self, P: Array, u: Array) -> Array:
+        """Readings (rows,) of the configurations that are kept, each by a fit to the others."""
+        return (self.found.data.r - each_left_out(P, u))[self._rows][self._poses[0]]
 
-        Before, the error is all that is not in the model; after, what is left of it beside the
-        estimate of these components, and the error of the whole fit in proportion to their part.
+    def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
+        """Fraction by which the noise-free error of new poses falls when these components are added
+        last.
+
+        A configuration c that is left out of a fit is a new pose for it.  Before, the error there
+        is X_c β̂₋c − W_c θ*, after it W_c (θ̂₋c − θ*), with the columns W of all that is held to be
+        true.  What is unexplained is no noise, and stays; so does a change for new readings
+        that fall between its moment and the one that was found.
         """
-        index = self._index(members)
-        kept, _ = self._poses
-        whole = self._left
-        before = self._of_new_poses(whole)
-        estimate = self.moved[np.ix_(kept, index)] @ self._fitted.beta[self._own :][index]
-        after = self._of_new_poses(whole - estimate[:, None])
-        part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
-        # Draws about the mean already hold the error at the poses measured; at others it is more.
-        after = after + min(part, 1.0) * float(self._uncertain.sum() / self._left_out[1].sum())
+        missing = self._not_written
+        before, after = (
+            self._of_new_poses(self._predicted(*self._fitted_without(gone))[:, None] - self._true)
+            + self.supported.unexplained**2
+            for gone in ([*members, *missing], missing)
+        )
+        for k in members:
+            after = after + self._mistimed(k)
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
+
+    @property
+    def _not_written(self) -> Sequence[int]:
+        """Components that no cell has which the answer writes."""
+        return ()
+
+    def _mistimed(self, k: int) -> Array | float:
+        """Mean square in m² by which new readings err for the moment of a change alone."""
+        return 0.0
 
     # Names.
 

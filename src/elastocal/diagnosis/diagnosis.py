@@ -91,9 +91,9 @@ class FoundEffect:
     """An effect held to be real (or, where the verdict is ambiguous, the likeliest of a set).
 
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
-    the 3-D error of noise-free new poses falls when the effect joins the model, with 90 and 95 %
-    intervals.  `settings` are its searched constants (orders, times) by their keys, `sizes` the
-    typical deviations of its parameters from nominal by theirs, where those were estimated.
+    the 3-D error of noise-free new poses falls when the effect joins all others in the model, with
+    90 and 95 % intervals.  `settings` are its searched constants (orders, times) by their keys,
+    `sizes` the typical deviations of its parameters from nominal by theirs, where estimated.
     """
 
     effect: str
@@ -132,7 +132,7 @@ class ComponentShare:
 @dataclass(frozen=True)
 class EffectGroup:
     """One finding: an effect at all the places where it acts, with its share of the gap and the
-    fraction by which the error of new poses falls once all of it is in the model.
+    fraction by which the error of new poses falls when it is added to all the others.
 
     `name` is the effect's, or "gear_errors" for all that goes with a joint's own angle.
     """

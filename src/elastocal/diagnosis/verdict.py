@@ -19,7 +19,6 @@ from elastocal.diagnosis.diagnosis import (
     EffectAt,
     FittedParameter,
     FoundEffect,
-    Interval,
     Location,
     StructureTest,
     Untested,
@@ -35,7 +34,7 @@ from elastocal.diagnosis.effect_search import (
 )
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
-from elastocal.diagnosis.noise_floor import NEW_POSES, each_left_out, mean_square, with_intervals
+from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
@@ -186,21 +185,9 @@ class FewAnswer(SumAnswer):
         """Whether its geometry was looked for from many starts."""
         return isinstance(what, Hypothesis) and bool(what.starts(self.dataset.base.model))
 
-    def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
-        """Fraction by which the noise-free error of new poses falls by these components.
-
-        A configuration c that is left out of a fit is a new pose for it.  Before, the error there
-        is X_c β̂₋c − W_c θ*, after it W_c (θ̂ − θ*), with the columns W of all that is held to be
-        true.  What is unexplained is no noise, and stays; so does a change for new readings
-        that fall between its moment and the one that was found.
-        """
-        before, after = (
-            self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
-            for predicted in self._predicted(members)
-        )
-        for k in members:
-            after = after + self._mistimed(k)
-        return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
+    @property
+    def _not_written(self) -> Sequence[int]:
+        return self._unnamed
 
     def _mistimed(self, k: int) -> Array:
         """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
@@ -253,31 +240,6 @@ class FewAnswer(SumAnswer):
         evidence = grams.of(item.what, tried).evidence(item.what.scales)
         estimates = grams.estimates(item.what, tried, chosen.scales[k])
         return tried, special.softmax(evidence), estimates
-
-    @cached_property
-    def _true(self) -> Array:
-        """Readings without noise (rows, draws), θ* drawn, as uncertain of each configuration as
-        where it is left out: what is read there then has the covariance P_cc⁻¹."""
-        kept, _ = self._poses
-        at, configuration = self.at, np.nonzero(self._rows)[0][kept]
-        W = self._wide.X[self._rows][kept]
-        moved = W @ (self._drawn - at.beta[:, None])
-        own, left_out = (
-            np.bincount(configuration, each)
-            for each in ((moved**2).mean(axis=1), self._uncertain[kept])
-        )
-        grown = np.sqrt(np.maximum(left_out / np.maximum(own, 1e-300), 1.0))
-        return np.asarray((W @ at.beta)[:, None] + moved * grown[configuration, None])
-
-    def _predicted(self, members: Sequence[int]) -> tuple[Array, Array]:
-        """Readings (rows,) of configurations that are left out, as predicted without these and with
-        them; where nothing else is missing, as they are fitted, about which θ* scatters."""
-        kept, _ = self._poses
-        missing, r = self._unnamed, self.found.data.r
-        before = r - each_left_out(*self._fitted_without([*members, *missing]))
-        P, u = self._fitted_without(missing)
-        after = r - each_left_out(P if missing else self._fitted.inverse, u)
-        return before[self._rows][kept], after[self._rows][kept]
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
         """Of the columns by the instrument's noise or, where a geometry is sought, of the exact

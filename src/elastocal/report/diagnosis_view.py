@@ -502,7 +502,7 @@ def cause_table(d: Diagnosis) -> say.ShownTable:
     heads = ("cause", "share", "90 %", "error falls by", "90 %")
     return say.ShownTable(heads, rows, title="Causes of the remaining error", note=(
         "share: part of the squared remaining error that goes when this is added last. error falls "
-        "by: at new poses, if only this is added to the model."
+        "by: at new poses, when this is added to a model with all the others."
         + " A share above 100 %: causes that partly cancel each other." * over
     ))  # fmt: skip
 
