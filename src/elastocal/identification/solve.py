@@ -90,7 +90,7 @@ class Reduction:
 
 def reduce(
     B: Array, sizes: Array, parameters: Sequence[Parameter], sigma: float, threshold: float,
-    ranks: IntArray | None = None,
+    ranks: IntArray | None = None, beside: float = 0.0,
 ) -> Reduction:  # fmt: skip
     """Choose a minimal complete set of columns of the whitened B (rows, parameters), or of its R.
 
@@ -102,7 +102,8 @@ def reduce(
     geometry takes the rest.  There a kept column that would have to deviate by more than FAR for a
     typical deviation of a dropped one is exchanged for that one, which makes the volume of those
     kept larger each time (Gu and Eisenstat 1996, SIAM J. Sci. Comput. 17, 848).
-    `threshold` 0 keeps everything that is structurally independent.
+    `threshold` 0 keeps everything that is structurally independent; what is shorter than `beside`
+    off the span of all others that are kept goes again, the shortest first.
     """
     # The triangular factor has the same geometry as B at any number of rows.
     R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
@@ -125,6 +126,12 @@ def reduce(
         chosen = np.append(chosen, own[far > least])
         basis = linalg.qr(R[:, chosen], mode="economic")[0]
     kept = np.sort(chosen)
+    while beside and len(kept):
+        own = linalg.qr(R[:, kept], mode="r")[0][: len(kept)]
+        apart = 1 / np.linalg.norm(linalg.solve_triangular(own, np.eye(len(kept))), axis=1)
+        if apart.min() >= beside:
+            break
+        kept = np.delete(kept, apart.argmin())
     dropped, mixing = _stood_for(R, kept)
     while by_effect and np.abs(mixing).max(initial=0.0) > FAR:
         k, d = np.unravel_index(np.abs(mixing).argmax(), mixing.shape)
@@ -146,7 +153,8 @@ def _stood_for(R: Array, kept: IntArray) -> tuple[IntArray, Array]:
 # A typical deviation must move the data by this many standard deviations to earn a column:
 # at 1, the variance it adds equals the squared bias it removes.
 WORTH_A_COLUMN = 1.0
-WIDER = (0.1, 0.01, 0.0)
+# One that is FAR from nominal has to: so little for an arm whose errors are larger than typical.
+WIDER = WORTH_A_COLUMN / FAR
 
 
 def residual_sigma(found: Fit, n_parameters: int) -> float:
@@ -156,13 +164,17 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 
 
 def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) -> Reduction:
-    """A minimal complete set of the free columns, as indices into all parameters.
+    """A minimal complete set of the free columns, as indices into all parameters; of a wider one
+    each is known to 1/threshold typical sizes beside all others.
 
     Raises InsufficientDataError where no column is worth keeping.
     """
     observed, free = problem.observations, problem.free
     parameters = tuple(problem.model.parameters[c] for c in free)
-    local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
+    beside = threshold if threshold < WORTH_A_COLUMN else 0.0
+    local = reduce(
+        r_factor.R, problem.sizes[free], parameters, sigma, threshold, beside=beside
+    )  # fmt: skip
     if not len(local.kept):
         raise InsufficientDataError(
             f"{observed.table.source}: the readings do not depend on any parameter of the model; "
@@ -206,8 +218,11 @@ def fits_better(narrow: RFactor, wide: RFactor) -> bool:
     return bool(f_test(narrow.rest**2 - wide.rest**2, more, wide.rest**2, max(dof, 1))[1] < CHANCE)
 
 
+ROUNDS, MOSTLY = 3, 0.5
+
+
 def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
-    """A wider set, up to full rank, where held-out configurations show that it is needed.
+    """A wider set, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
     decides, first on the linearised model, then on the fit that starts at its minimum: from where
@@ -220,12 +235,15 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
         own = observed.configuration, observed.size
         return predicts_better(before, after, problem.weights, *own)
 
-    for threshold in WIDER:
-        sigma = residual_sigma(found, len(reduction.kept))
-        wider = choose(problem, found.of_free, sigma, threshold)
-        own = found.of_free.of_columns(np.searchsorted(problem.free, wider.kept))
+    for _ in range(ROUNDS):
+        every, sigma = found.of_free, residual_sigma(found, len(reduction.kept))
+        least = max(every.rest / np.sqrt(max(every.rows - every.columns, 1)), 1e-12)
+        # What all parameters together explain most of is no noise: a joint has lost its zero.
+        lost = least < MOSTLY * sigma
+        wider = choose(problem, every, least if lost else sigma, WIDER)
+        own = every.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
-            continue
+            break
         held = looked_at(found)[0] if held is None else held
         # Of least length in typical sizes where several are least squares.
         size = problem.sizes[wider.kept]
@@ -233,31 +251,21 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
         start = moved(found.x, wider.kept, step)
         linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
         if not predicts(held, linear):
-            continue
+            break
         try:
             wide = fit_kept(problem, start, wider, max_steps=30)
             after = looked_at(wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
-            # Along an undetermined direction the wide set may leave every valid arm, or come to
-            # rest where it is singular.
-            continue
+            # Along a direction that is hardly determined the wide set may leave every valid arm,
+            # or come to rest where it is singular.
+            break
         better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-        if better and predicts(held, after) and not astray(wide, wider, reduction):
-            found, reduction, held = wide, wider, after
+        if not better or not predicts(held, after):
+            break
+        found, reduction, held = wide, wider, after
+        if not lost:
+            break
     return found, reduction
-
-
-def astray(wide: Fit, wider: Reduction, narrow: Reduction) -> bool:
-    """Whether a wider set has an addition that is uncertain by FAR times its typical size or more,
-    on an arm whose errors are no larger than typical.
-
-    It bends to what the model lacks, and leads anywhere off the poses measured.
-    """
-    problem, kept = wide.problem, wider.kept
-    std = residual_sigma(wide, len(kept)) * np.sqrt(np.diag(wide.cofactor()))
-    added = deviates(problem.model)[kept] & ~np.isin(kept, narrow.kept)
-    unknown = (std > FAR * problem.sizes[kept])[added].any()
-    return bool(unknown and not of_this_arm(Solution(wide, wider, np.nan), std)[1])
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.
