@@ -4,6 +4,7 @@ import importlib.util
 import json
 import os
 from pathlib import Path
+from random import Random
 
 import pytest
 from support.design_commands import elastocal
@@ -48,11 +49,16 @@ def test_wam_is_no_matter_of_geometry_alone(folder):
 
 @LONG
 def test_iiwa_bends_at_its_joints(folder):
-    """Three payloads, one tool point each, springs driven by the measured torques; of more
-    parameters than the readings show, those stay without which the fit settles."""
+    """Of more parameters than the readings show those stay without which the fit settles; half of
+    the poses tell of no link of 357 m."""
+    head, *lines = (folder / "data" / "iiwa7.csv").read_text(encoding="utf-8").splitlines()
+    of = [line.partition(",")[0] for line in lines]
+    half = set(Random(1).sample(list(dict.fromkeys(of)), 190)[95:])
+    some = [line for line, c in zip(lines, of, strict=True) if c in half]
+    (folder / "data" / "half.csv").write_text("\n".join([head, *some, ""]), encoding="utf-8")
     rigid = ran("identify", folder, "iiwa7_rigid.toml", "iiwa7.csv")
     soft = ran("identify", folder, "iiwa7.toml", "iiwa7.csv")
-    one = ran("identify", folder, "iiwa7_joint2.toml", "iiwa7.csv")
+    one = ran("identify", folder, "iiwa7_joint2.toml", "half.csv")
     assert rigid["heldout_rms_um"] == pytest.approx(1600, rel=0.1)
     assert soft["converged"] and soft["predicted_new_poses_um"]["rms"] < 1e4  # not .15 m
     assert soft["heldout_rms_um"] <= 450 and one["heldout_rms_um"] <= 450
