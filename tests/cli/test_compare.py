@@ -9,6 +9,7 @@ import pytest
 from support.design_commands import elastocal
 
 import elastocal as ec
+from elastocal.identification.knowledge import Constraints, LinearEquality
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
 CELL = """\
@@ -140,3 +141,6 @@ def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
     assert ec.compare(*arms, load=[0, 0, 0]).distance.max() < 1e-6
     with pytest.raises(ec.InputError, match=f"{name} is held in table at .* deviations away"):
         ec.compare(arms[0], ec.identify(model, data, fixed=[name]))
+    tied = LinearEquality({"joint4.compliance": 1.0, "joint5.compliance": -1.0})
+    known = ec.Knowledge(constraints=Constraints(equalities=(tied,)))
+    assert ec.compare(*(ec.identify(model, data, knowledge=known) for _ in "12")).p > 0.99

@@ -34,7 +34,7 @@ from scipy import linalg, special
 
 from elastocal.above import Result, checked_arguments
 from elastocal.errors import InsufficientDataError, option, require
-from elastocal.identification.least_squares import drawing_root
+from elastocal.identification.least_squares import correlations
 from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN
@@ -57,6 +57,7 @@ from elastocal.units import Array, IntArray
 SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
 UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
+TIED, SAME = 1e-13, 1e-3  # least eigenvalue of correlations; standard deviations
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
@@ -382,10 +383,16 @@ def _difference(
             f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
             f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
         )
-    root = drawing_root(V)
-    W, target = np.split(
-        linalg.solve_triangular(root, np.column_stack([H, t]), lower=True), [-1], 1
+    rho, unit = correlations(V)
+    value, axes = np.linalg.eigh(rho)
+    # Sums that constraints fix in both do not vary.
+    white = axes.T @ (np.column_stack([H, t]) / unit[:, None])
+    require(
+        bool((np.abs(white[value < TIED, -1]) < SAME).all()),
+        f"constraints fix a sum of parameters at one value in {old.source} and at another in "
+        f"{new.source}; identify both with the same knowledge",
     )
+    W, target = np.split(white / np.sqrt(np.maximum(value, TIED))[:, None], [-1], 1)
     told = both.tolist()
     for k in alone.tolist():
         beside = W[:, told]
@@ -415,9 +422,10 @@ def _tested(
     smallest = min(float(np.min(dofs)), 1e9)
 
     def together(at: list[int]) -> float:
-        t = z[at] / std[at]
-        size = float(t @ np.linalg.solve(V[np.ix_(at, at)] / np.outer(std[at], std[at]), t))
-        return float(special.fdtrc(len(at), smallest, size / len(at)))
+        value, axes = np.linalg.eigh(correlations(V[np.ix_(at, at)])[0])
+        apart = value > 10 * TIED  # the rest is as constraints have it
+        t = (z[at] / std[at]) @ axes[:, apart]
+        return float(special.fdtrc(len(t), smallest, np.mean(t**2 / value[apart])))
 
     def rms(far: Array) -> float:
         return float(np.sqrt((far**2).sum(axis=1).mean()))
