@@ -546,7 +546,8 @@ class Standardised:
         scaled = root / noise
         A = M * scaled
         A *= scaled[:, None]
-        A[np.diag_indices_from(A)] += 1.0
+        # Beside readings that are exact a prior drowns in rounding.
+        A[np.diag_indices_from(A)] += np.maximum(1.0, ROUNDING * np.diag(A))
         # Symmetric, and LAPACK's own way round: nothing is copied.
         L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
         right = scaled * z / noise

@@ -103,3 +103,12 @@ def test_of_a_large_table_a_part_is_looked_at_from_its_first_hour_to_its_last() 
     assert np.ptp(times) > 0.95 * np.ptp(table.time)
     assert np.diff(times).max() < 4 * np.ptp(table.time) / len(times)
     assert thinned(table) == (table, None)
+
+
+def test_exact_distances_are_diagnosed() -> None:
+    """Where the noise is nil, and a prior of base and anchor drowns in rounding."""
+    spec = cell(("base_frame", "distance_sensor", "joint_offset"), observe="distance")
+    unstated = replace(spec.tracker, distance_sigma=None, anchor=None)
+    model = Model.assembled(kr270_chain(), replace(spec, tracker=unstated))
+    q = np.random.default_rng(0).uniform(-1.2, -0.1, (60, 6))
+    assert ec.diagnose(model, ec.simulate(model, q, noise=False)).verdict == "nothing_significant"

@@ -283,7 +283,7 @@ STATED_SPREAD, UNSTATED_SPREAD = 0.5, 3.0
 REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
 JOINT_SPREAD = 0.7
 SHARED, SHARED_SPREAD = 0.2, 1.5
-SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact, and one that is loose
+SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint or reading that is exact, a loose joint
 FARTHEST = 17.0  # logarithms from a start, from an exact joint to a loose one
 LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
 
@@ -376,6 +376,12 @@ class NoisyData:
     def threads(self) -> int:
         """How many work on it: products of large matrices let other threads run."""
         return thread_count() if self.X.size > LARGE else 1
+
+    @property
+    def mean_variance(self) -> float:
+        """Of the readings, as stated, or its shape."""
+        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
+        return float(variances[~self.left_out].mean())
 
     def masked(self, packed: Array) -> Array:
         """Rows that do not count set to zero (C, m, …)."""
@@ -563,7 +569,9 @@ def fit_noise(
         return value, to.T @ slope, to.T @ information @ to
 
     begin: Array = linalg.solve(to, start.logs())
-    found = climb(objective, begin, begin - FARTHEST, begin + FARTHEST, enough, STEPS)[0]
+    low = begin - FARTHEST
+    low[0] = max(low[0], np.log(SMALLEST_NOISE / np.sqrt(data.mean_variance)))
+    found = climb(objective, begin, low, begin + FARTHEST, enough, STEPS)[0]
     return NoiseValues.of(np.exp(to @ found))
 
 
@@ -573,8 +581,8 @@ def balanced(data: NoisyData) -> NoiseValues:
     From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
     """
     used = ~data.left_out
-    square = float((data.r[used] ** 2).mean())
-    shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
+    square = max(float((data.r[used] ** 2).mean()), SMALLEST_NOISE**2)
     moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
     joint = np.clip(np.sqrt(0.5 * square / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
-    return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, np.full_like(joint, SHARED))
+    factor = float(np.sqrt(0.5 * square / data.mean_variance))
+    return NoiseValues(factor, joint, np.full_like(joint, SHARED))
