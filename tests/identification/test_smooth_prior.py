@@ -1,5 +1,7 @@
 """Parameters with a prior beside parameters without one, against textbook formulas."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import optimize
@@ -23,7 +25,7 @@ def drawn(seed: int, scale: tuple[float, ...] = (1.0, 1.0, 1.0), sigma: float = 
 
 
 def linear(B, e) -> LinearRows:
-    return LinearRows(RFactor.of(B, e), STD, GROUP)
+    return LinearRows(RFactor.of(B, e), STD, GROUP, 3)
 
 
 def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]:
@@ -77,3 +79,10 @@ def test_sizes_are_those_of_the_largest_restricted_likelihood(seed):
     # What a group gains is at the variance that goes with its absence, so never more than here.
     worse = marginal(B, e, none, np.arange(FREE))[1] - textbook(at)
     assert found.gain[1] <= worse / 2 + 1e-6
+
+
+def test_a_size_that_is_known_is_not_estimated_away():
+    """What others stand for as well would be nothing, and known to be."""
+    problem = linear(*drawn(0, (0.0, 1.0, 1.0)))
+    assert problem.scales().scale[0] < 0.05
+    assert replace(problem, functions=0).scales().scale[0] > 0.1

@@ -50,6 +50,8 @@ LEAST, MOST = 1e-3, 1e6
 SMALL = 0.05
 # Of log λ above 0: a function may be smaller than stated at no price, but ten times the size costs
 # what a likelihood ratio of 1e8 gains.  Data that hardly show a function know no upper limit.
+# Parameters of known size pay below 0 as well: where others stand for a few of them too, the
+# likelihood has them vanish, and how uncertain they are with them.
 PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
@@ -75,12 +77,13 @@ class LinearRows:
     """Rows linearised: the R factor of [B_f B_s e], e at nominal functions.
 
     `std` (shrunk,) are the prior's standard deviations as declared, `group` (shrunk,) the numbers
-    of the groups.
+    of the groups, of which the first are `functions`, the others parameters of known size.
     """
 
     factor: RFactor
     std: Array
     group: IntArray
+    functions: int
 
     def only(self, kept: IntArray) -> LinearRows:
         """With the ordinary columns `kept` alone: what the others took is the functions' again."""
@@ -100,8 +103,8 @@ class LinearRows:
         return Products(S.T @ S, S.T @ left, float(left @ left), spare)
 
     def scales(self, start: Scales | None = None) -> Scales:
-        """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
-        at the `start` stays so."""
+        """λ and σ² of the largest restricted likelihood, where λ has its PRICE; what is 0 at the
+        `start` stays so."""
         products, n = self.products, int(self.group.max(initial=-1)) + 1
         own = self.group[:, None] == np.arange(n)
 
@@ -111,11 +114,12 @@ class LinearRows:
         def objective(theta: Array) -> tuple[float, Array, Array]:
             """In log σ and the ½ log λ of the groups."""
             value, slope, information = products.objective(variances(theta), 2.0 * own, theta[0])
-            over = np.maximum(2 * theta[1:], 0.0) / PRICE
+            over = 2 * theta[1:] / PRICE
+            over[: self.functions] = np.maximum(over[: self.functions], 0.0)
             slope[1:] += 4 * over / PRICE
             # What is next to nothing has next to no curvature: no step may be taken for it.
             information[np.diag_indices_from(information)] += CURVED
-            at = 1 + np.flatnonzero(over > 0)
+            at = 1 + np.flatnonzero(over)
             information[at, at] += 8 / PRICE**2
             return value + float(over @ over), slope, information
 
@@ -197,7 +201,7 @@ class Posterior:
 
 # The course of the fit.
 
-STEPS = 25
+STEPS = 150  # a few do mostly; springs beside weights that no load tells go along a valley
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUNDS = 6
 # Two readings say the same where what the fit knows of them is that correlated, and their errors
@@ -391,7 +395,7 @@ class _Search:
         f, factor = self.functions, problem.evaluate(x, problem.free).r_factor
         rows, away = factor.augmented.copy(), x[f.columns] - f.nominal
         rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
-        return LinearRows(RFactor(rows, factor.rows), f.std, f.group)
+        return LinearRows(RFactor(rows, factor.rows), f.std, f.group, len(f.groups))
 
     def crossed(self, fit: JointFit, scales: Scales) -> tuple[Array, Array]:
         """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
