@@ -124,16 +124,6 @@ def test_nothing_is_claimed_on_an_arm_without_faults_though_all_is_tried() -> No
     assert len(set(tried)) == len(tried)
 
 
-@pytest.mark.long
-def test_two_effects_are_both_named() -> None:
-    names = ("gear_eccentricity:joint4", "marker_slip:marker:M2")
-    d = diagnosed(*names)
-    assert d.verdict == "explained"
-    assert named(d) == {FAULTS[n].key for n in names}
-    assert [s.step for s in d.budget][-1] == "noise_floor"
-    assert {s.step for s in d.budget} >= set(names)
-
-
 WITHHELD = {
     "gear_eccentricity:joint4": ("transmission", "joint4 angle"),
     "marker_slip:marker:M2": ("tool", "time"),
@@ -169,22 +159,9 @@ def test_the_shape_of_an_unknown_dependence_is_drawn() -> None:
     assert np.mean(np.abs(away) < 3 * sd) > 0.85
 
 
-# What the table records drives the effect as it drove the arm.
-
-
-@pytest.mark.long  # of every day is the golden diagnose_one
-@pytest.mark.parametrize("side", ["load", "load_and_approach"])
-def test_the_readings_tell_the_backlash_model(side: str) -> None:
-    chain, play = kr270_chain(), Fault("backlash", "joint3", {"backlash": 3e-4})
-    table = measured(chain, cell(play_side=side), [play], plan(chain, 40, 3), 3)
-    d = ec.diagnose(Model.assembled(chain, cell()), table)
-    assert play.key in named(d) and d.model_keys.get("play_side", "load") == side
-
-
 @pytest.mark.long
 def test_hysteresis_without_loads_shrinks_the_gap() -> None:
-    """Of an arm whose motors' ratings nobody states: friction that grows with the load has no
-    size and no column."""
+    """Where nobody states the motors' ratings friction that grows with the load has no size."""
     chain, fault = kr270_chain(), FAULTS["hysteresis:joint3"]
     plain = cell(("base_frame", "joint_offset", "marker_position"), link_gravity=False)
     table = plan(chain, 40, 1, np.zeros(3))

@@ -51,8 +51,7 @@ def diagnosis_of(rivals: Mapping[Key, float]) -> Any:
 def campaign(
     half_range: float, *faults: Fault, seed: int = 0, n: int = 30, link_gravity: bool = False
 ) -> tuple[Model, Measurements]:
-    """The plain model and readings of an arm with `faults`, joint 3 within ± `half_range` rad,
-    times a minute apart."""
+    """The plain model and readings of an arm with `faults`, joint 3 within ± `half_range` rad."""
     chain, plain = kr270_chain(), cell(FITTED, sigma=SIGMA, link_gravity=link_gravity)
     rng = np.random.default_rng((seed, 1))
     q = rng.uniform(*finite_ranges(chain, *joint_limits(plain, chain)), (n, 6))

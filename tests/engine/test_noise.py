@@ -89,8 +89,7 @@ def test_an_effect_that_the_parameters_explain_is_left_out():
 
 
 def predicted(r, V, known, i):
-    """Error of the best linear prediction of reading i from the readings `known`, over its own
-    deviation, at fixed V."""
+    """Error of the best prediction of reading i from those `known`, over its deviation, at V."""
     size = r.size
     a = (known[:, None] * size + np.arange(size)).ravel()
     b = i * size + np.arange(size)
