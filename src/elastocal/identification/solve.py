@@ -90,7 +90,7 @@ class Reduction:
 
 def reduce(
     B: Array, sizes: Array, parameters: Sequence[Parameter], sigma: float, threshold: float,
-    ranks: IntArray | None = None, beside: float = 0.0,
+    ranks: IntArray | None = None,
 ) -> Reduction:  # fmt: skip
     """Choose a minimal complete set of columns of the whitened B (rows, parameters), or of its R.
 
@@ -102,8 +102,8 @@ def reduce(
     geometry takes the rest.  There a kept column that would have to deviate by more than FAR for a
     typical deviation of a dropped one is exchanged for that one, which makes the volume of those
     kept larger each time (Gu and Eisenstat 1996, SIAM J. Sci. Comput. 17, 848).
-    `threshold` 0 keeps everything that is structurally independent; what is shorter than `beside`
-    off the span of all others that are kept goes again, the shortest first.
+    `threshold` 0 keeps everything that is structurally independent; of a wider set, below
+    WORTH_A_COLUMN, what is shorter than it beside all others goes again, the shortest first.
     """
     # The triangular factor has the same geometry as B at any number of rows.
     R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
@@ -126,10 +126,10 @@ def reduce(
         chosen = np.append(chosen, own[far > least])
         basis = linalg.qr(R[:, chosen], mode="economic")[0]
     kept = np.sort(chosen)
-    while beside and len(kept):
+    while 0 < threshold < WORTH_A_COLUMN and len(kept):
         own = linalg.qr(R[:, kept], mode="r")[0][: len(kept)]
         apart = 1 / np.linalg.norm(linalg.solve_triangular(own, np.eye(len(kept))), axis=1)
-        if apart.min() >= beside:
+        if apart.min() >= threshold:
             break
         kept = np.delete(kept, apart.argmin())
     dropped, mixing = _stood_for(R, kept)
@@ -164,17 +164,13 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 
 
 def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) -> Reduction:
-    """A minimal complete set of the free columns, as indices into all parameters; of a wider one
-    each is known to 1/threshold typical sizes beside all others.
+    """A minimal complete set of the free columns, as indices into all parameters.
 
     Raises InsufficientDataError where no column is worth keeping.
     """
     observed, free = problem.observations, problem.free
     parameters = tuple(problem.model.parameters[c] for c in free)
-    beside = threshold if threshold < WORTH_A_COLUMN else 0.0
-    local = reduce(
-        r_factor.R, problem.sizes[free], parameters, sigma, threshold, beside=beside
-    )  # fmt: skip
+    local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
     if not len(local.kept):
         raise InsufficientDataError(
             f"{observed.table.source}: the readings do not depend on any parameter of the model; "
