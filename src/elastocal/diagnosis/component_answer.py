@@ -336,23 +336,26 @@ class SumAnswer:
         kept, _ = self._poses
         at, configuration = self.at, np.nonzero(self._rows)[0][kept]
         moved = self._wide.X[self._rows][kept] @ (self._drawn - at.beta[:, None])
+        uncertain = np.linalg.inv(at.P) - self.found.data.V(self.found.noise)
+        variance = np.diagonal(uncertain, axis1=1, axis2=2)[self._rows][kept]
         own, left_out = (
-            np.bincount(configuration, each)
-            for each in ((moved**2).mean(axis=1), self._uncertain[kept])
+            np.bincount(configuration, each) for each in ((moved**2).mean(axis=1), variance)
         )
         grown = np.sqrt(np.maximum(left_out / np.maximum(own, 1e-300), 1.0))
         return self._predicted(at.P, at.u)[:, None] + moved * grown[configuration, None]
 
-    @cached_property
-    def _uncertain(self) -> Array:
-        """Variance (rows,) in m² that the fit itself is uncertain by at poses left out."""
-        V = self.found.data.V(self.found.noise)
-        uncertain = np.linalg.inv(self.at.P) - V
-        return np.asarray(np.diagonal(uncertain, axis1=1, axis2=2)[self._rows])
-
     def _predicted(self, P: Array, u: Array) -> Array:
         """Readings (rows,) of the configurations that are kept, each by a fit to the others."""
         return (self.found.data.r - each_left_out(P, u))[self._rows][self._poses[0]]
+
+    def _error_without(self, gone: Sequence[int]) -> Array:
+        """Mean square (draws,) in m² by which new poses err if these are in no model."""
+        predicted = self._predicted(*self._fitted_without(gone))
+        return self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
+
+    @cached_property
+    def _error(self) -> Array:
+        return self._error_without(self._not_written)
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls when these components are added
@@ -363,14 +366,8 @@ class SumAnswer:
         true.  What is unexplained is no noise, and stays; so does a change for new readings
         that fall between its moment and the one that was found.
         """
-        missing = self._not_written
-        before, after = (
-            self._of_new_poses(self._predicted(*self._fitted_without(gone))[:, None] - self._true)
-            + self.supported.unexplained**2
-            for gone in ([*members, *missing], missing)
-        )
-        for k in members:
-            after = after + self._mistimed(k)
+        before = self._error_without([*members, *self._not_written])
+        after = self._error + sum(self._mistimed(k) for k in members)
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
     @property

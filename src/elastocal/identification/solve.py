@@ -214,7 +214,9 @@ def fits_better(narrow: RFactor, wide: RFactor) -> bool:
     return bool(f_test(narrow.rest**2 - wide.rest**2, more, wide.rest**2, max(dof, 1))[1] < CHANCE)
 
 
-ROUNDS, MOSTLY = 3, 0.5
+# Share of the residual that is noise at least; where all parameters together leave less, a joint
+# has lost its zero.
+MOSTLY = 0.5
 
 
 def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
@@ -224,44 +226,39 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     decides, first on the linearised model, then on the fit that starts at its minimum: from where
     the narrow one ended it may take hundreds of steps.
     """
-    problem, held = found.problem, None
-    observed = problem.observations
+    problem, every = found.problem, found.of_free
+    observed, sigma = problem.observations, residual_sigma(found, len(reduction.kept))
 
     def predicts(before: Array, after: Array) -> bool:
         own = observed.configuration, observed.size
         return predicts_better(before, after, problem.weights, *own)
 
-    for _ in range(ROUNDS):
-        every, sigma = found.of_free, residual_sigma(found, len(reduction.kept))
-        least = max(every.rest / np.sqrt(max(every.rows - every.columns, 1)), 1e-12)
-        # What all parameters together explain most of is no noise: a joint has lost its zero.
-        lost = least < MOSTLY * sigma
-        wider = choose(problem, every, least if lost else sigma, WIDER)
-        own = every.of_columns(np.searchsorted(problem.free, wider.kept))
-        if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
-            break
-        held = looked_at(found)[0] if held is None else held
-        # Of least length in typical sizes where several are least squares.
-        size = problem.sizes[wider.kept]
-        step = size * least_norm(own.R * size, own.projected, cond=own.rows * EPS)
-        start = moved(found.x, wider.kept, step)
-        linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
-        if not predicts(held, linear):
-            break
-        try:
-            wide = fit_kept(problem, start, wider, max_steps=30)
-            after = looked_at(wide)[0]
-        except (ElastocalError, np.linalg.LinAlgError, ValueError):
-            # Along a direction that is hardly determined the wide set may leave every valid arm,
-            # or come to rest where it is singular.
-            break
-        better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-        if not better or not predicts(held, after):
-            break
-        found, reduction, held = wide, wider, after
-        if not lost:
-            break
-    return found, reduction
+    least = max(every.rest / np.sqrt(max(every.rows - every.columns, 1)), 1e-12)
+    lost = least < MOSTLY * sigma
+    wider = choose(problem, every, least if lost else sigma, WIDER)
+    own = every.of_columns(np.searchsorted(problem.free, wider.kept))
+    if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
+        return found, reduction
+    held = looked_at(found)[0]
+    # Of least length in typical sizes where several are least squares.
+    size = problem.sizes[wider.kept]
+    step = size * least_norm(own.R * size, own.projected, cond=own.rows * EPS)
+    start = moved(found.x, wider.kept, step)
+    linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
+    if not predicts(held, linear):
+        return found, reduction
+    try:
+        wide = fit_kept(problem, start, wider, max_steps=30)
+        after = looked_at(wide)[0]
+    except (ElastocalError, np.linalg.LinAlgError, ValueError):
+        # Along a direction that is hardly determined the wide set may leave every valid arm, or
+        # come to rest where it is singular.
+        return found, reduction
+    better = wide.converged and fits_better(found.r_factor, wide.r_factor)
+    if not better or not predicts(held, after):
+        return found, reduction
+    # What its zero hid may be worth a column now; each set is wider than the last.
+    return prefer_wider(wide, wider) if lost else (wide, wider)
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.
