@@ -84,3 +84,16 @@ def test_a_level_measured_once_has_no_held_out_residual():
     assert np.isinf(result.heldout_rms)
     assert any("Some configuration alone determines" in w for w in result.warnings)
     assert result.to_json()["heldout_rms_um"] is None
+
+
+def test_a_pose_that_hardly_any_other_replaces_is_predicted_with_typical_sizes():
+    """Of joint 2 at one angle the others tell the links' directions to metres."""
+    chain, rng = planar_chain(), np.random.default_rng(1)
+    model = Model.assembled(chain, cell_of(("base_frame", "link_geometry")))
+    q = random_poses(chain, 16, 1)
+    q[:, 1] = -0.5 + 1e-4 * rng.normal(size=16)
+    q[4, 1] = 0.7
+    truth = true_values(model, rng)
+    result = identify(model, measured(model, table_at(q, [[0, 0, 0]]), truth, 2e-5, rng))
+    assert 2e-5 < np.linalg.norm(result.held_out[12:15]) < 5e-3
+    assert result.heldout_rms < result.nominal_rms

@@ -23,6 +23,7 @@ from elastocal.identification.residuals import (
     rms_3d,
 )
 from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
+from elastocal.measurements import numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -304,7 +305,40 @@ class Solution:
     def crossed(self) -> tuple[Array, Array]:
         """Residual (rows,) of each configuration under a fit to the others, and leverage (rows,),
         how much each row draws the fit to itself, 0 to 1."""
-        return looked_at(self.fit) if self.held is None else self.held
+        if self.held is not None:
+            return self.held
+        held, leverage = looked_at(self.fit)
+        return held if self.problem.large else self._no_farther(held, leverage), leverage
+
+    def _no_farther(self, held: Array, leverage: Array) -> Array:
+        """`held` (rows,) where the fit to the others leaves a direction open by more than FAR: with
+        typical deviations of what is kept, and of what that stands for, beside it.
+
+        No arm that works is off by as much.  Without the pose that shows it the direction would
+        have no column; fitted all the same it takes the pose metres away.
+        """
+        fit, kept, sizes = self.fit, self.reduction.kept, self.problem.sizes
+        weights, observed = self.problem.weights, self.problem.observations
+        shares = self.reduction.mixing * sizes[self.reduction.dropped]
+        typical = linalg.cholesky(np.diag(sizes[kept] ** 2) + shares @ shares.T, lower=True)
+        B, held, p = fit.B @ typical, held.copy(), len(kept)
+        # What all have in common are columns and rows beside these, and never left out.
+        rows, e = weights.beside_common(B, fit.residual)
+        M, z = rows.T @ rows, rows.T @ e
+        M[:p, :p] += np.eye(p) * (variance := residual_sigma(fit, p) ** 2)
+        z[:p] -= variance * linalg.solve_triangular(
+            typical, (fit.x - self.problem.x0)[kept], lower=True
+        )
+        out = observed.configuration if weights.together is None else weights.together
+        own = np.repeat(numbered(out), observed.size)
+        for c in np.flatnonzero(np.bincount(own, leverage) >= 0.5):
+            at = np.flatnonzero(own == c)
+            V = np.linalg.inv(M - rows[at].T @ rows[at])
+            # Beside a typical deviation one that is open by f of them is by f/√(1 + f²).
+            open_ = variance * np.linalg.eigvalsh(V[:p, :p])[-1] > FAR**2 / (1 + FAR**2)
+            if open_ and np.isfinite(held[at]).all():
+                held[at] = fit.residual[at] - B[at] @ (V @ (z - rows[at].T @ e[at]))[:p]
+        return held
 
 
 def solve(
