@@ -581,22 +581,15 @@ class Standardised:
         return out
 
 
-def beside(
-    M: Array, z: Array, prior: Array, others: IntArray, groups: Sequence[slice]
-) -> list[tuple[Array, Array]]:
-    """Of each of these groups c of columns what the others x, of prior precisions Λ, leave of
-    their normal matrix and right side:
+def beside(M: Array, z: Array, prior: Array, others: IntArray, own: slice) -> tuple[Array, Array]:
+    """Of columns c what the others x, of prior precisions Λ, leave of normal matrix and right side:
 
     A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc and b = z_c − M_cx (M_xx + Λ)⁻¹ z_x.
     """
     L = M[np.ix_(others, others)]
     L[np.diag_indices_from(L)] += prior[others]
     L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)
-    right = np.column_stack([M[np.ix_(others, np.r_[(slice(0, 0), *groups)])], z[others]])
+    right = np.column_stack([M[others, own], z[others]])
     half = linalg.solve_triangular(L, right, lower=True, check_finite=False)
-    out, start = [], 0
-    for c in groups:
-        own = half[:, start : start + c.stop - c.start]
-        out.append((M[c, c] - own.T @ own, z[c] - own.T @ half[:, -1]))
-        start += own.shape[1]
-    return out
+    across = half[:, :-1].T
+    return M[own, own] - across @ across.T, z[own] - across @ half[:, -1]

@@ -458,7 +458,7 @@ def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
     sums, p = posed(data, others, chosen.noise), len(data.precision)
     M, z = sums.products.M, sums.products.z
     prior = data.precision + ROUNDING * np.diag(M)[:p]
-    ((A, b),) = beside(M, z, prior, np.arange(p), [slice(p, len(M))])
+    A, b = beside(M, z, prior, np.arange(p), slice(p, len(M)))
     total, left = 0.0, list(zip(spans_of([c.width for c in others], len(b)), others, strict=True))
     while left:
         blocks = [(A[span, span], b[span]) for span, _ in left]

@@ -673,7 +673,7 @@ def _at_sizes(S: Array, t: Array, sized: Array, span: slice) -> Array:
     that have one."""
     others = np.flatnonzero(sized < np.inf)
     others = others[(others < span.start) | (others >= span.stop)]
-    ((A, b),) = beside(S, t, sized, others, [span])
+    A, b = beside(S, t, sized, others, span)
     values, vectors = np.linalg.eigh(A)
     a, b = np.maximum(values, 0.0), vectors.T @ b
     return at_scales(a[None], b[None, :, None], SIZES)[0, :, 0]
