@@ -25,6 +25,8 @@ import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell.arm_description import CartesianNoise
 from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.verdict import unheard_of
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins
 
@@ -82,6 +84,16 @@ def test_an_interval_holds_the_values_at_other_likely_time_constants() -> None:
         spec = model.cell.model.with_effect(*FAULTS[DRIVEN].key, {"time_constant_s": tau})
         fit = fit_baseline(Model.assembled(model.chain, replace(model.cell, model=spec)), table)
         assert abs(fit.x[fit.model.names.index(p.name)] - p.value) < 1.96 * p.std
+
+
+def test_a_cause_far_larger_than_usual_is_to_be_confirmed() -> None:
+    (model, _), (found,) = campaign(DRIVEN), diagnosed(DRIVEN).effects
+    (p,), effect = found.parameters, CATALOGUE[found.effect]
+    (spec,) = effect.parameters(found.where, model.chain, model.cell)
+    assert spec.typical is not None and not [*unheard_of([found], model)]
+    large = replace(p, value=40 * spec.typical, std=0.1 * spec.typical)
+    (told,) = unheard_of([replace(found, parameters=(large,))], model)
+    assert f"{p.name} (40 times)" in told
 
 
 def test_a_ripple_is_named_with_its_order_and_amplitude() -> None:

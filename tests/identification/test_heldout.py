@@ -64,36 +64,32 @@ def test_a_wider_set_is_needed_where_the_parameters_it_adds_are_something():
     assert sum(needed(6.0) for _ in range(50)) > 35
 
 
+def of_one_angle(effects, apart, forces, **given):
+    """An arm whose joint 2 stands at one angle, `apart` rad about it, but in pose 4."""
+    chain, rng = planar_chain(), np.random.default_rng(1)
+    model = Model.assembled(chain, cell_of(effects, **given))
+    q = random_poses(chain, 12, 1)
+    q[:, 1] = -0.5 + apart * rng.normal(size=12)
+    q[4, 1] = 0.7
+    table, truth = table_at(q, forces), true_values(model, rng)
+    result = identify(model, measured(model, table, truth, 2e-5, rng))
+    return result, np.repeat(table.configuration == 4, 3)
+
+
 def test_a_level_measured_once_has_no_held_out_residual():
     """Joint 2's compliance at a level that only one configuration visits."""
-    chain = planar_chain()
-    levels = {"joint2": (-0.5, 0.7)}
-    nominal = Nominal(joint_compliance=(1e-5,) * 3)
-    effects = ("base_frame", "joint_compliance")
-    model = Model.assembled(chain, cell_of(effects, compliance_levels=levels, nominal=nominal))
-    q = random_poses(chain, 12, 1)
-    q[:, 1] = -0.5
-    q[4, 1] = 0.7
-    rng = np.random.default_rng(1)
-    table = table_at(q, [[0, 0, 0], [0, 0, -300]])
-    truth = true_values(model, rng)
-    result = identify(model, measured(model, table, truth, 2e-5, rng))
+    levels, nominal = {"joint2": (-0.5, 0.7)}, Nominal(joint_compliance=(1e-5,) * 3)
+    given = {"compliance_levels": levels, "nominal": nominal}
+    effects, forces = ("base_frame", "joint_compliance"), [[0, 0, 0], [0, 0, -300]]
+    result, alone = of_one_angle(effects, 0.0, forces, **given)
     assert "joint2.compliance_level2" in result.determined
-    alone = np.repeat(table.configuration == 4, 3)
     assert np.isinf(result.held_out[alone]).all() and np.isfinite(result.held_out[~alone]).all()
-    assert np.isinf(result.heldout_rms)
+    assert np.isinf(result.heldout_rms) and result.to_json()["heldout_rms_um"] is None
     assert any("Some configuration alone determines" in w for w in result.warnings)
-    assert result.to_json()["heldout_rms_um"] is None
 
 
 def test_a_pose_that_hardly_any_other_replaces_is_predicted_with_typical_sizes():
     """Of joint 2 at one angle the others tell the links' directions to metres."""
-    chain, rng = planar_chain(), np.random.default_rng(1)
-    model = Model.assembled(chain, cell_of(("base_frame", "link_geometry")))
-    q = random_poses(chain, 16, 1)
-    q[:, 1] = -0.5 + 1e-4 * rng.normal(size=16)
-    q[4, 1] = 0.7
-    truth = true_values(model, rng)
-    result = identify(model, measured(model, table_at(q, [[0, 0, 0]]), truth, 2e-5, rng))
-    assert 2e-5 < np.linalg.norm(result.held_out[12:15]) < 5e-3
+    result, alone = of_one_angle(("base_frame", "link_geometry"), 1e-4, [[0, 0, 0]])
+    assert 2e-5 < np.linalg.norm(result.held_out[alone]) < 5e-3
     assert result.heldout_rms < result.nominal_rms

@@ -42,6 +42,7 @@ from elastocal.diagnosis.verdict import (
     candidates,
     structure_tests,
     too_small,
+    unheard_of,
     warnings,
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
@@ -253,6 +254,7 @@ def _diagnosed(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
             *warnings(dataset, found, suspects, answer.found.noise),
+            *unheard_of(answers["effects"], base.model),
         ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),

@@ -36,9 +36,12 @@ from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
 from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
+from elastocal.identification.solve import FAR
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import Backlash
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
-from elastocal.text import rounded
+from elastocal.text import listed, rounded
 from elastocal.units import Array, BoolArray
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
@@ -412,6 +415,25 @@ def warnings(
             "record time_s"
         )
     return tuple(out)
+
+
+def unheard_of(found: Sequence[FoundEffect], model: Model) -> Iterator[str]:
+    """Parameters of causes whose whole interval lies more than FAR typical deviations from
+    nominal."""
+    far = list[str]()
+    for f in found:
+        for p in effect_of(f.effect).parameters(f.where, model.chain, model.cell):
+            value = next((v for v in f.parameters if v.name == f"{f.where}.{p.key}"), None)
+            if value is None or not p.typical or p.shrunk:
+                continue
+            off = abs(value.value - p.nominal)
+            if off - special.ndtri(0.975) * value.std > FAR * p.typical:
+                far.append(f"{value.name} ({rounded(off / p.typical, 2)} times)")
+    if far:
+        yield (
+            f"more than {FAR:g} times as large as usual: {listed(far)}; confirm such a cause at the "
+            "arm itself before you rely on its name, as what the catalogue lacks may look like it"
+        )
 
 
 def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Iterator[str]:
