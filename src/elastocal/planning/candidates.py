@@ -245,7 +245,8 @@ def shares_of(cell: Cell, n_poses: int | None = None, asked: str = "") -> IntArr
         require(
             len(each) == levels,
             f"{wish('per_level', f'{where} poses_per_level')} has {len(each)} numbers, but there "
-            f"are {levels} levels",
+            f"are {levels if spec.levels else 'no'} levels; give one number per level, and the "
+            f"levels by {option('levels')} or [design.levels]",
         )
         return np.array(each, dtype=np.int64)
     total = n_poses or spec.poses or DEFAULT
