@@ -453,10 +453,10 @@ def lacks_noise(cell: Cell) -> bool:
 
     Raises InputError where these do not show it: deflections share readings, poses have two units.
     """
-    observed, tracker = cell.model.observe, cell.tracker
-    own = tracker.distance_sigma is not None and observed == "distance"
-    lacks = not own and tracker.noise is None and not cell.design.marker_sigma
-    require(not lacks or observed in ("position", "distance"), _no_noise(cell))
+    if cell.model.observe == "distance":
+        return cell.tracker.distance_sigma is None
+    lacks = cell.tracker.noise is None and not cell.design.marker_sigma
+    require(not lacks or cell.model.observe == "position", _no_noise(cell))
     return lacks
 
 
@@ -472,8 +472,8 @@ def with_noise_of(cell: Cell, done: Calibration) -> tuple[Cell, tuple[str, ...]]
         tracker = replace(cell.tracker, noise=CartesianNoise(np.full(3, sigma)))
         key, along = "sigma_um", " on each axis"
     told = (
-        f"no noise of a reading is stated: the plan takes the {length(sigma)}{along} "
-        f"that the measurements done show; state [tracker] {key} where you know it"
+        f"[tracker] states no {key}: the plan takes the {length(sigma)}{along} that the "
+        "measurements done show; state it where you know it"
     )
     return replace(cell, tracker=tracker), (told,)
 
