@@ -27,6 +27,7 @@ from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
+from elastocal.text import EXACT
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, and what the rest combine with.
@@ -271,10 +272,6 @@ LOOSE, PLACED = 3.0, 0.3
 PLACING, CHOOSING = 1e-12, 1e-2
 # Observations from which on a fit starts from a sample, and how many there are in it.
 MANY, SAMPLE = 2000, 5000
-
-
-# Residuals below this, in m, are rounding: no instrument resolves it, and it tells of no noise.
-EXACT = 1e-11
 
 
 @dataclass(frozen=True)
