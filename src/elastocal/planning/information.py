@@ -36,7 +36,7 @@ from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import SIZE, Observations, available_noise, observe
-from elastocal.simulation import simulate
+from elastocal.simulation import marker_sigmas, simulate
 from elastocal.text import length, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -60,25 +60,6 @@ def plan_forces(cell: Cell) -> Array:
         "[design] loads_N = [[0, 0, -2600]]",
     )
     return np.vstack([np.zeros((1, 3)), forces[loaded]])
-
-
-def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
-    """The table with the cell's own σ per marker, where `[design] marker_sigma_um` states them.
-
-    Raises InputError where some markers have one and others none.
-    """
-    stated = cell.design.marker_sigma
-    if not stated:
-        return table
-    missing = [name for name in table.marker_names if name not in stated]
-    sigmas = wish("marker_sigma", f"{cell.source}: [design] marker_sigma_um")
-    require(
-        not missing,
-        f"{sigmas} states no σ for marker {quoted(missing[0]) if missing else ''}; state one for "
-        "every marker",
-    )
-    sigma = np.array([stated[name] for name in table.marker_names])[table.marker]
-    return replace(table, sigma=np.repeat(sigma[:, None], 3, axis=1), sigma_frame="cartesian")
 
 
 def _no_noise(cell: Cell) -> str:
@@ -482,8 +463,7 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies, or at the
     nominal arm where it does not suffice; the noise is the stated one, as for the poses to come.
     Of smooth functions that of their prior, of the size found, is in it."""
-    if table.sigma is None:
-        table = marker_sigmas(model.cell, table)
+    table = marker_sigmas(model.cell, table)
     sizes = np.array([p.typical if p.shrunk and p.typical else np.inf for p in model.parameters])
     try:
         found = identify(model, table, Options(method="wls", fixed=fixed))
