@@ -169,13 +169,10 @@ def brought(
     for k, broken in zip(own[~verdict.ok], verdict.broken[~verdict.ok], strict=True):
         rule = verdict.rules[int(broken.argmax())].replace("_", " ")
         refused.setdefault(rule, []).append(names[k])
-    told = "; ".join(f"{rule} ({listed(by)})" for rule, by in refused.items() if by)
+    named = "; ".join(f"{rule} ({listed(by)})" for rule, by in refused.items() if by)
     ok, removed = own[verdict.ok], verdict.removed_by | {NO_LEVEL: len(q) - len(own)}
-    if told:
-        told = (
-            f"{table.source}: {len(q) - len(ok)} of {len(q)} poses are refused, by the rule that "
-            f"each breaks first: {told}"
-        )
+    told = f"{table.source}: {len(q) - len(ok)} of {len(q)} poses are refused, by the rule that "
+    told = f"{told}each breaks first: {named}" if named else ""
     if not len(ok):
         levels = "bring poses at the levels of [design.levels], or drop these"
         raise InsufficientDataError(f"{told}; {rules.advice(verdict) if len(own) else levels}")

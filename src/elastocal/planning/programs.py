@@ -234,8 +234,7 @@ def _krl(module: str, told: str, limits: str, steps: Sequence[Step]) -> list[str
     ]
     for kind, values, note in steps:
         if kind == "move":
-            axes = enumerate(np.degrees(values), 1)
-            angles = ", ".join(f"A{i} {number(v, 6)}" for i, v in axes)
+            angles = ", ".join(f"A{i} {number(v, 6)}" for i, v in enumerate(np.degrees(values), 1))
             lines += [f"; {plain(note)}", f"PTP {{{angles}}}"]
         elif kind == "load":
             lines += [f"; {plain(note)}, then start again", "HALT"]
