@@ -162,4 +162,6 @@ def test_readings_that_depend_on_nothing_that_is_fitted():
     """Compliances without any load: not one parameter is seen."""
     model = Model.assembled(planar_chain(), cell_of(("joint_compliance",)))
     told = "do not depend on any parameter.*measure other poses or loads, or choose other effects"
-    refused(model, table_for(model), InsufficientDataError, told)
+    refused(model, (table := table_for(model)), InsufficientDataError, told)
+    table.position[3] += 200.0
+    refused(model, table, InsufficientDataError, "beside the reading of line 5, which is 3.. m off")

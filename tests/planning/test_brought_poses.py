@@ -104,7 +104,6 @@ def test_refused_poses_are_listed_by_the_rule_and_levels_are_kept(tmp_path):
     [
         ('"nowhere.csv"', "nowhere.csv"),
         ('["taught.csv", "taught.csv"]', "candidates takes a whole number >= 1, a file of poses"),
-        ("0", "candidates"),
         ('"broken.csv"', "q6_deg"),
         ('"few.csv"', "few.csv: 1 of 3 poses are refused"),
         ('"off.csv"', "are refused, by the rule that each breaks first: joint limits (A);"),

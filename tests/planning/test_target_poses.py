@@ -157,11 +157,10 @@ def test_places_without_an_allowed_posture_are_told(tmp_path: Path) -> None:
     box = TargetBox(LOWER, UPPER, 8)
     found = poses_of(cell_of(test_box=box), Elbow(100.0))
     other_load = poses_of(cell_of(loads=LOADS, test_box=box), Elbow(-9.0, ()))
-    text = csv("x_mm,y_mm,z_mm", places(found)[:2] * 1e3)
-    path = poses_of(path_cell(tmp_path, text), Elbow(100.0))
-    for told, of in (found, "8"), (other_load, "8"), (path, "2"):
-        assert f"({of} of them in no posture that the work cell allows" in told.source
-    assert path.source.endswith(": line 2, line 3)")
+    path = poses_of(path_cell(tmp_path, csv("x_mm,y_mm,z_mm", 1e3 * places(found))), Elbow(100.0))
+    for told in found, other_load, path:
+        assert "(8 of them in no posture that the work cell allows" in told.source
+    assert path.source.endswith(", line 8, line 9)")
 
 
 def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> None:

@@ -52,8 +52,7 @@ def test_noise_has_the_stated_covariance(tracker, rows):
     exact = simulate(model, plan, model.nominal, 0, noise=False)
     noisy = simulate(model, plan, model.nominal, 3)
     kind = "rows" if rows else ("axis" if tracker is AXIS else "polar")
-    table = replace(noisy, position=exact.position)
-    covariance, _ = position_covariance(table, tracker, kind)
+    covariance, _ = position_covariance(replace(noisy, position=exact.position), tracker, kind)
     error = noisy.position - exact.position
     z = np.linalg.solve(np.linalg.cholesky(covariance), error[..., None])[..., 0]
     for squares, dof in ((z**2).sum(), 900), ((z**2).sum(axis=0), 300):

@@ -63,7 +63,7 @@ def plan_forces(cell: Cell) -> Array:
 
 
 def _no_noise(cell: Cell) -> str:
-    keys = "sigma_um, range_um and transverse_um, or distance_um"
+    keys = "sigma_um, or range_um and transverse_um"
     return (
         f"{cell.source}: a plan needs the noise of a reading; state [tracker] "
         f"{'distance_um' if cell.model.observe == 'distance' else keys}, as the instrument's data "
