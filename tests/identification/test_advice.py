@@ -46,9 +46,8 @@ def test_ill_conditioned():
     even the barely visible directions are worth a column."""
     q = random_poses(planar_chain(), 60, 0)
     q[:, 2] = 0.5 + 2e-4 * q[:, 2]
-    model = Model.assembled(
-        planar_chain(), cell_of(("base_frame", "link_geometry", "marker_position"))
-    )
+    cell = cell_of(("base_frame", "link_geometry", "marker_position"))
+    model = Model.assembled(planar_chain(), cell)
     rng = np.random.default_rng(0)
     result = identify(model, measured(model, table_at(q), true_values(model, rng), 1e-10, rng))
     (warning,) = (w for w in result.warnings if w.startswith("Ill-conditioned (condition number"))

@@ -82,9 +82,8 @@ CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];"""
 
 def program(tmp_path, text, preset):
     files = {"p.csv": "x,y,z\n1,2,3\n4,5,6\n", "f": text}
-    return imported(
-        tmp_path, files, f'{POINT}[[source]]\npreset = "{preset}"\n[join]\nby = "order"\n'
-    )
+    mapping = f'{POINT}[[source]]\npreset = "{preset}"\n[join]\nby = "order"\n'
+    return imported(tmp_path, files, mapping)
 
 
 @pytest.mark.parametrize(("text", "preset", "lines"), [(KRL, "kuka", [3]), (RAPID, "abb", [3, 4])])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,16 +135,14 @@ class Elbow:
 
     def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
         assert force.shape == (len(q), 3)
-        return type(
-            "Verdict", (), {"ok": (q[:, 2] > self.least) & np.isin(force[:, 2], self.forces)}
-        )
+        return SimpleNamespace(ok=(q[:, 2] > self.least) & np.isin(force[:, 2], self.forces))
 
 
 class Wrist:
     """Allows joint 6 in a narrow range: one posture in forty."""
 
     def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
-        return type("Verdict", (), {"ok": np.abs(q[:, 5] - 3.0) < 0.15})
+        return SimpleNamespace(ok=np.abs(q[:, 5] - 3.0) < 0.15)
 
 
 def test_a_rare_posture_that_the_cell_allows_is_found() -> None:
