@@ -41,7 +41,7 @@ def poses(model: ec.Model) -> np.ndarray:
     return np.clip(lower, -2, 2) + span * np.random.default_rng(1).random((20, len(lower)))
 
 
-ABSURD = [10**12, -1.5, float("nan"), 1e300, "", b"x", [], [[]], {}, {1: 2}, object(), 1j, len]
+ABSURD = [10**12, -1.5, np.nan, 1e300, "", b"x", [], [[]], {}, {1: 2}, 1j, len, np.array(3)]
 CALLS: dict[str, Any] = {
     "table": (["q", "force", "position"], lambda m, d, f, **k: m.table(**{"q": d.q[:2]} | k)),
     "pose": (["q", "x", "load"], lambda m, d, f, **k: m.pose(**{"q": d.q[0]} | k)),

@@ -258,11 +258,12 @@ def _text(value: Any) -> bool:
     return isinstance(value, str)
 
 
-def _list_of(check: Check, least: int = 0) -> Check:
+def _list_of(check: Check, least: int = 0, most: float = math.inf) -> Check:
     def checked(value: Any) -> bool:
         several = isinstance(value, Collection) and not isinstance(value, str | bytes)
-        flat = several and getattr(value, "ndim", 1) == 1
-        return flat and least <= len(value) and all(map(check, value))
+        # An array of numpy without an axis is a collection too, and has no length.
+        sized = several and getattr(value, "ndim", 1) > 0
+        return sized and least <= len(value) <= most and all(map(check, value))
 
     return checked
 
@@ -294,9 +295,7 @@ KINDS: dict[str, tuple[str, Check]] = {
     "Mapping[str, float]": ("numbers by name", _by_name(_number)),
     "Mapping[str, Sequence[float]]": ("a list of numbers by name", _by_name(_list_of(_number, 1))),
     "Mapping": ("a Mapping", lambda v: isinstance(v, Mapping)),
-    "tuple[ArrayLike, ArrayLike]": (
-        "two corners", lambda v: isinstance(v, Collection) and len(v) == 2 and all(map(_array, v)),
-    ),
+    "tuple[ArrayLike, ArrayLike]": ("two corners", _list_of(_array, 2, 2)),
     "Progress": ("a function", callable),
     "None": ("None", lambda v: v is None),
     "Any": ("anything", lambda v: True),

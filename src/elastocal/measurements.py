@@ -466,7 +466,9 @@ def _wrong_count(header: Sequence[str], family: Family) -> str:
     n = len(family.units)
     found = {t: f"q{m[2]}" for t in header if (m := NUMBERED.fullmatch(t)) and m[1] == "q"}
     stems = set(found.values())
-    missing = [family.columns(stem)[0] for stem in family.units if stem not in stems]
+    unit = next(iter(found), "deg").rpartition("_")[2]
+    missing = [max(family.columns(stem), key=lambda column: column.endswith(unit))
+               for stem in family.units if stem not in stems]  # fmt: skip
     names = f" ({listed(found, 8)})" if found else ""
     way = f"add {listed(missing, 8)}" if missing else (
         "drop the columns too many, or use the cell of the right robot")  # fmt: skip

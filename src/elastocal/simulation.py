@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.errors import InputError, option, require
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError, option, require, wish
 from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Conditions, random_table
@@ -23,7 +24,7 @@ from elastocal.model.effects.compliances import (
 from elastocal.model.manipulator import NOMINAL, Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
-from elastocal.text import did_you_mean, listed
+from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
 POSES = 50  # from which sizes are taken
@@ -145,17 +146,34 @@ def expand_plan(
     return with_moves(rows)
 
 
+def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
+    """The table with the cell's own σ per marker, where `[design] marker_sigma_um` states them and
+    the table none.
+
+    Raises InputError where some markers have one and others none.
+    """
+    stated = cell.design.marker_sigma
+    if not stated or table.sigma is not None or cell.model.observe == "distance":
+        return table
+    sigmas = wish("marker_sigma", f"{cell.source}: [design] marker_sigma_um")
+    for name in table.marker_names:
+        told = f"{sigmas} states no σ for marker {quoted(name)}; state one for every marker"
+        require(name in stated, told)
+    sigma = np.array([stated[name] for name in table.marker_names])[table.marker]
+    return replace(table, sigma=np.repeat(sigma[:, None], 3, axis=1), sigma_frame="cartesian")
+
+
 def simulate(
     model: Model, rows: Measurements, x: Array, rng: np.random.Generator | int, noise: bool = True,
     remedy: str = NOMINAL,
 ) -> Measurements:  # fmt: skip
     """Readings of the model at parameter values x for every row, with the cell's noise.
 
-    Per-row sigmas of `rows` win over the cell's tracker noise, as when identifying; without
-    either a reading has none.  At each visit joints settle anew, configurations are off, and
-    positions drift, as the cell's [noise] states, and the readings of a stop are off together by
-    the `repeatability_um` of [design].  Positions in m in the tracker frame; rotations
-    and distances where the model observes them.
+    Per-row sigmas of `rows` win over the `marker_sigma_um` of [design], which becomes such, and
+    this over the cell's tracker noise; without any a reading has none.  At each visit joints
+    settle anew, configurations are off, and positions drift, as the cell's [noise] states, and the
+    readings of a stop are off together by the `repeatability_um` of [design].  Positions in m in
+    the tracker frame; rotations and distances where the model observes them.
 
     Raises ElastocalError, with the `remedy`, where a pose has no static equilibrium.
     """
@@ -163,6 +181,7 @@ def simulate(
     if not noise:
         return _read(model, rows, x, rng, False, remedy)
     cell, n_joints, visit = model.cell, model.chain.n_joints, visits(rows)
+    rows = marker_sigmas(cell, rows)
     settled, scatter = rows, cell.noise.of_joints(n_joints)
     if scatter.any():
         shift = rng.normal(size=(visit.max(initial=-1) + 1, n_joints)) * scatter

@@ -80,15 +80,21 @@ def size_of(p: float) -> str:
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
-def length(metres: float) -> str:
+# A length or residual below this, in m, is rounding: no instrument resolves it.
+EXACT = 1e-11
+
+
+def length(metres: float, digits: int = 3) -> str:
     """A position error: µm below 1 mm, mm below 1 m, "not available" where there is no number."""
     if not math.isfinite(metres):
         return "not available"
+    if abs(metres) < EXACT:
+        return "0 µm"
     if abs(metres) < 0.9995e-3:
-        return f"{significant(metres * 1e6)} µm"
+        return f"{significant(metres * 1e6, digits)} µm"
     if abs(metres) < 0.9995:
-        return f"{significant(metres * 1e3)} mm"
-    return f"{significant(metres)} m"
+        return f"{significant(metres * 1e3, digits)} mm"
+    return f"{significant(metres, digits)} m"
 
 
 def newtons(force: Iterable[float]) -> str:

@@ -78,5 +78,5 @@ def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:
     cell.write_text(text.replace("sigma_um = 10", ""))
     for words in (("next", cell, data), ("design", cell, "--augment", data, "--poses", 3)):
         answer = json.loads(elastocal(*words, "-o", plan, "--json", *FEW).output)
-        (told,) = (w for w in answer.get("plan", answer)["warnings"] if "no noise" in w)
+        (told,) = (w for w in answer.get("plan", answer)["warnings"] if "states no" in w)
         assert 30 < float(told.split("takes the ")[1].split()[0]) < 50, told

@@ -46,9 +46,8 @@ def test_ill_conditioned():
     even the barely visible directions are worth a column."""
     q = random_poses(planar_chain(), 60, 0)
     q[:, 2] = 0.5 + 2e-4 * q[:, 2]
-    model = Model.assembled(
-        planar_chain(), cell_of(("base_frame", "link_geometry", "marker_position"))
-    )
+    cell = cell_of(("base_frame", "link_geometry", "marker_position"))
+    model = Model.assembled(planar_chain(), cell)
     rng = np.random.default_rng(0)
     result = identify(model, measured(model, table_at(q), true_values(model, rng), 1e-10, rng))
     (warning,) = (w for w in result.warnings if w.startswith("Ill-conditioned (condition number"))
@@ -162,4 +161,6 @@ def test_readings_that_depend_on_nothing_that_is_fitted():
     """Compliances without any load: not one parameter is seen."""
     model = Model.assembled(planar_chain(), cell_of(("joint_compliance",)))
     told = "do not depend on any parameter.*measure other poses or loads, or choose other effects"
-    refused(model, table_for(model), InsufficientDataError, told)
+    refused(model, (table := table_for(model)), InsufficientDataError, told)
+    table.position[3] += 200.0
+    refused(model, table, InsufficientDataError, "beside the reading of line 5, which is 3.. m off")

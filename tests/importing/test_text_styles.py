@@ -8,13 +8,13 @@ from elastocal.errors import InputError
 from elastocal.units import convert, split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]
-HEADER = [*(f"Gelenkstück {i}" for i in (1, 2, 3)), "X [mm]", "Y [mm]", "Z [mm]"]
+HEADER = ["Punkt", *(f"Gelenkstück{i}" for i in (1, 2, 3)), "X[mm]", "Y[mm]", "Z[mm]"]
 MAPPING = """
 [[source]]
 [source.text]
 {text}
 [source.columns]
-"q#_deg" = "Gelenkstück #"
+"q#_deg" = "Gelenkstück#"
 x_mm = "X"
 y_mm = "Y"
 z_mm = "Z"
@@ -25,7 +25,7 @@ def text_of(delimiter, decimal, thousands=""):
     lines = [delimiter.join(HEADER)]
     for row in ROWS:
         cells = [f"{v:,}".replace(",", thousands and "T").replace(".", decimal) for v in row]
-        lines.append(delimiter.join(cells).replace("T", thousands))
+        lines.append(delimiter.join(["links 1", *cells]).replace("T", thousands))
     return "\n".join(lines) + "\n"
 
 
@@ -50,7 +50,7 @@ def test_styles_of_tables(tmp_path, delimiter, decimal, encoding, thousands):
         text = text.replace(" ", "\u202f").replace("-", "−")
     text = text.encode(encoding)
     if thousands:
-        with pytest.raises(InputError, match=r"a.csv, line 2, column X.\[mm\].*1.{1,6}234.5"):
+        with pytest.raises(InputError, match=r"a.csv, line 2, column X\[mm\].*1.{1,6}234.5"):
             imported(tmp_path, {"a.csv": text}, MAPPING.format(text=""))
     told = f'thousands = "{thousands}"' if thousands else ""
     check(imported(tmp_path, {"a.csv": text}, MAPPING.format(text=told)))
@@ -59,7 +59,7 @@ def test_styles_of_tables(tmp_path, delimiter, decimal, encoding, thousands):
 def test_preamble_repeated_headers_footers_and_rows_without_a_value(tmp_path):
     lines = text_of(";", ",").splitlines()
     lines = ["Report; of today", "", *lines[:2], lines[0], lines[2], "2 points exported"]
-    files = {"a.csv": "\n".join([*lines, "12;n.v.;1;1;2;3"])}
+    files = {"a.csv": "\n".join([*lines, "P 3;12;n.v.;1;1;2;3"])}
     with pytest.raises(InputError, match=r"line 7: 1 columns.*ignore"):
         imported(tmp_path, files, MAPPING.format(text=""))
     text = "ignore = 'exported$'\nmissing = ['n.v.']"
@@ -67,7 +67,7 @@ def test_preamble_repeated_headers_footers_and_rows_without_a_value(tmp_path):
     check(found)
     ignored = found.understood[0]["ignored"]
     assert [line for line, _ in ignored] == [1, 5, 7, 8]
-    assert ignored[-1][1] == "no value in column Gelenkstück 2"
+    assert ignored[-1][1] == "no value in column Gelenkstück2"
 
 
 POINT = '[[source]]\nrole = "points"\ncolumns = {x_mm = "x", y_mm = "y", z_mm = "z"}\n'
@@ -82,9 +82,8 @@ CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];"""
 
 def program(tmp_path, text, preset):
     files = {"p.csv": "x,y,z\n1,2,3\n4,5,6\n", "f": text}
-    return imported(
-        tmp_path, files, f'{POINT}[[source]]\npreset = "{preset}"\n[join]\nby = "order"\n'
-    )
+    mapping = f'{POINT}[[source]]\npreset = "{preset}"\n[join]\nby = "order"\n'
+    return imported(tmp_path, files, mapping)
 
 
 @pytest.mark.parametrize(("text", "preset", "lines"), [(KRL, "kuka", [3]), (RAPID, "abb", [3, 4])])

@@ -104,17 +104,16 @@ def test_refused_poses_are_listed_by_the_rule_and_levels_are_kept(tmp_path):
     [
         ('"nowhere.csv"', "nowhere.csv"),
         ('["taught.csv", "taught.csv"]', "candidates takes a whole number >= 1, a file of poses"),
-        ("0", "candidates"),
         ('"broken.csv"', "q6_deg"),
-        ('"few.csv"', "the cell allows 2 there; bring more"),
-        ('"off.csv"', "the cell allows none of its 1 poses"),
+        ('"few.csv"', "few.csv: 1 of 3 poses are refused"),
+        ('"off.csv"', "are refused, by the rule that each breaks first: joint limits (A);"),
     ],
 )
 def test_every_mistake_is_told_before_anything_is_written(tmp_path, candidates, told):
     taught(tmp_path)
-    taught(tmp_path, 2, name="few.csv")
+    taught(tmp_path, 2, more=["far,0,-30,0,0,0,999"], name="few.csv")
     (tmp_path / "broken.csv").write_text("configuration,q1_deg\n1,0\n", encoding="utf-8")
-    (tmp_path / "off.csv").write_text(f"configuration,{','.join(JOINTS)}\n1,0,0,0,0,0,999\n")
+    (tmp_path / "off.csv").write_text(f"configuration,{','.join(JOINTS)}\nA,0,0,0,0,0,999\n")
     result = design(write_cell(tmp_path, altered(DEFLECTION, candidates=candidates)))
     assert result.exit_code in (1, 2) and told in result.stderr.replace("\n", " ")
     assert not (tmp_path / "plan.csv").exists()

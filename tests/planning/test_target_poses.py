@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,16 +135,14 @@ class Elbow:
 
     def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
         assert force.shape == (len(q), 3)
-        return type(
-            "Verdict", (), {"ok": (q[:, 2] > self.least) & np.isin(force[:, 2], self.forces)}
-        )
+        return SimpleNamespace(ok=(q[:, 2] > self.least) & np.isin(force[:, 2], self.forces))
 
 
 class Wrist:
     """Allows joint 6 in a narrow range: one posture in forty."""
 
     def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
-        return type("Verdict", (), {"ok": np.abs(q[:, 5] - 3.0) < 0.15})
+        return SimpleNamespace(ok=np.abs(q[:, 5] - 3.0) < 0.15)
 
 
 def test_a_rare_posture_that_the_cell_allows_is_found() -> None:
@@ -153,13 +152,14 @@ def test_a_rare_posture_that_the_cell_allows_is_found() -> None:
     np.testing.assert_allclose(places(found), places(free), atol=4e-6)
 
 
-def test_places_without_an_allowed_posture_are_told() -> None:
-    found = poses_of(cell_of(test_box=TargetBox(LOWER, UPPER, 8)), Elbow(100.0))
-    assert "(8 of them in no posture that the work cell allows)" in found.source
-    other_load = poses_of(
-        cell_of(loads=LOADS, test_box=TargetBox(LOWER, UPPER, 8)), Elbow(-9.0, ())
-    )
-    assert "(8 of them in no posture" in other_load.source
+def test_places_without_an_allowed_posture_are_told(tmp_path: Path) -> None:
+    box = TargetBox(LOWER, UPPER, 8)
+    found = poses_of(cell_of(test_box=box), Elbow(100.0))
+    other_load = poses_of(cell_of(loads=LOADS, test_box=box), Elbow(-9.0, ()))
+    path = poses_of(path_cell(tmp_path, csv("x_mm,y_mm,z_mm", 1e3 * places(found))), Elbow(100.0))
+    for told in found, other_load, path:
+        assert "(8 of them in no posture that the work cell allows" in told.source
+    assert path.source.endswith(", line 8, line 9)")
 
 
 def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> None:

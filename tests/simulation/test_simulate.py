@@ -15,6 +15,7 @@ from elastocal.cell.arm_description import (
     Tracker,
     Unsteadiness,
 )
+from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.errors import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import position_covariance
@@ -36,24 +37,27 @@ def chi2_band(dof, level=1e-3):
     return stats.chi2.ppf(level / 2, dof), stats.chi2.isf(level / 2, dof)
 
 
-@pytest.mark.parametrize(("tracker", "rows"), [(AXIS, None), (POLAR, None), (AXIS, "polar")])
+@pytest.mark.parametrize(
+    ("tracker", "rows"), [(AXIS, None), (POLAR, None), (AXIS, "polar"), (POLAR, "of M1")]
+)
 def test_noise_has_the_stated_covariance(tracker, rows):
     """Whitened by the stated covariance, 900 errors are χ²(900), each component's 300 χ²(300)."""
-    model = model_with(tracker)
+    own = DesignSpec(marker_sigma={"M1": 7e-5} if rows == "of M1" else {})
+    cell = replace(cell_of(GEOMETRY, tracker=tracker), design=own)
+    model = Model.assembled(planar_chain(), cell)
     plan = plan_of(model, 300)
-    if rows:
+    if rows == "polar":
         sigma = 10.0 ** np.random.default_rng(2).uniform(-6, -4, (300, 3))
         plan = replace(plan, sigma=sigma, sigma_frame=rows)
     exact = simulate(model, plan, model.nominal, 0, noise=False)
     noisy = simulate(model, plan, model.nominal, 3)
     kind = "rows" if rows else ("axis" if tracker is AXIS else "polar")
-    covariance, _ = position_covariance(exact, tracker, kind)
+    covariance, _ = position_covariance(replace(noisy, position=exact.position), tracker, kind)
     error = noisy.position - exact.position
     z = np.linalg.solve(np.linalg.cholesky(covariance), error[..., None])[..., 0]
-    low, high = chi2_band(900)
-    assert low < (z**2).sum() < high
-    low, high = chi2_band(300, 1e-3 / 3)
-    assert ((z**2).sum(axis=0) > low).all() and ((z**2).sum(axis=0) < high).all()
+    for squares, dof in ((z**2).sum(), 900), ((z**2).sum(axis=0), 300):
+        low, high = chi2_band(dof, 1e-3 * dof / 900)
+        assert np.all(low < squares) and np.all(squares < high)
     assert abs(z.mean()) < 4 / np.sqrt(900)
 
 

@@ -431,8 +431,8 @@ def unheard_of(found: Sequence[FoundEffect], model: Model) -> Iterator[str]:
                 far.append(f"{value.name} ({rounded(off / p.typical, 2)} times)")
     if far:
         yield (
-            f"more than {FAR:g} times as large as usual: {listed(far)}; confirm such a cause at the "
-            "arm itself before you rely on its name, as what the catalogue lacks may look like it"
+            f"more than {FAR:g} times as large as usual: {listed(far)}; confirm such a cause at "
+            "the arm before you rely on its name, as what the catalogue lacks may look like it"
         )
 
 

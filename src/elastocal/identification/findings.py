@@ -35,7 +35,7 @@ from elastocal.model.effects.compliances import (
 )
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
-from elastocal.text import counted, listed, rounded
+from elastocal.text import EXACT, counted, listed, rounded
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.
@@ -574,7 +574,8 @@ def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
     # it: at 25 poses held / (fitted · expected) has a standard deviation of 0.04.
     expected = _overfitted(result)
     flatters = expected > FLATTERS or held > FLATTERS * expected * fitted
-    if flatters and held < math.inf and result.noise.drift is None and not (placed and explained):
+    flatters = flatters and EXACT < held < math.inf and not (placed and explained)
+    if flatters and result.noise.drift is None:
         yield _care("fit_flatters", heldout_rms_um=held, residual_rms_um=fitted)
     if held < nominal < LITTLE * held < math.inf and not placed:
         yield _care("little_gain", heldout_rms_um=held, nominal_rms_um=nominal)

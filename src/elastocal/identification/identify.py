@@ -714,7 +714,8 @@ def _published(course: Course, start: Solution) -> MethodResult:
         key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
         group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
     size = start.problem.sizes[fit.columns]
-    last = published.eq14(fit.B * size, fit.residual, group)[-1]
+    with said_of(f"{observed.table.source}: {option('method', method)}"):
+        last = published.eq14(fit.B * size, fit.residual, group)[-1]
     text = "weights of eq. (14), σ " + ("by group" if group is not None else "of each residual")
     weights = Weights(method, sparse.csr_array(sparse.diags_array(last.weights)), False, text)
     fitted = good if len(observed.lead) < len(good) else np.ones_like(good)

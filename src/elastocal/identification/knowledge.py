@@ -63,10 +63,6 @@ class Matrix:
         both = np.outer(d, d)
         return Matrix(self.label, constant * both, slopes * both, self.balance * d)
 
-    def shortfall(self, x: Array) -> float:
-        """How far the smallest eigenvalue of M(x) lies below zero; 0 where M(x) ⪰ 0."""
-        return max(0.0, -float(np.linalg.eigvalsh(self.at(x))[0]))
-
 
 @dataclass(frozen=True)
 class System:
@@ -115,7 +111,7 @@ class System:
             constant, slopes = m.at(rest), m.slopes[columns]
             if slopes.any():
                 matrices.append(replace(m, constant=constant, slopes=slopes))
-            elif m.shortfall(rest) > ROUND_OFF * float(np.abs(constant).max(initial=0.0)):
+            elif -np.linalg.eigvalsh(constant)[0] > ROUND_OFF * np.abs(constant).max(initial=0.0):
                 raise InputError(
                     f"'{m.label}' is not positive semidefinite, and every parameter in it is held; "
                     "free one of them or drop the matrix"

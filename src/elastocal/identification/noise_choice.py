@@ -110,7 +110,7 @@ class NoisyReadings:
         own = [d for d in found if d.part == CONFIGURATION]
         if CONFIGURATION in self.kind.parts and not own:
             raise InputError(
-                f"'{self.kind.own}+{CONFIGURATION}' needs repeats or several markers in a "
+                f"{option('noise', self.kind.name)} needs repeats or several markers in a "
                 "configuration; this table has one reading in each"
             )
         if len(self.sets.contrasts) * self.readings.size < FEWEST_TELLING:

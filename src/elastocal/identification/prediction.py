@@ -30,7 +30,7 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.solve import EXACT, Solution, deviates, reduce
+from elastocal.identification.solve import Solution, deviates, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
@@ -38,6 +38,7 @@ from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVi
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
+from elastocal.text import EXACT
 from elastocal.units import Array, BoolArray, IntArray, microns
 
 # What the identification knows of where the tool will be, and what it does not.

@@ -28,6 +28,7 @@ from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
+from elastocal.text import EXACT, length
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, and what the rest combine with.
@@ -164,6 +165,9 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
     return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
 
 
+FAR_OFF = 10.0  # times the median, which is more than any noise is
+
+
 def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) -> Reduction:
     """A minimal complete set of the free columns, as indices into all parameters.
 
@@ -173,10 +177,15 @@ def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) 
     parameters = tuple(problem.model.parameters[c] for c in free)
     local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
     if not len(local.kept):
-        raise InsufficientDataError(
-            f"{observed.table.source}: the readings do not depend on any parameter of the model; "
-            "measure other poses or loads, or choose other effects"
-        )
+        off = problem.residual(problem.x0).reshape(-1, observed.size)[:, :3]
+        far = np.linalg.norm(off, axis=1)
+        told = "the readings do not depend on any parameter of the model; measure other poses or "
+        told += "loads, or choose other effects"
+        if far.max() > FAR_OFF * np.median(far):
+            line = observed.table.row[observed.lead[far.argmax()]]
+            told = f"no parameter shows beside the reading of line {line}, which is "
+            told += f"{length(far.max())} off: correct it, or drop it"
+        raise InsufficientDataError(f"{observed.table.source}: {told}")
     return replace(
         local, kept=free[local.kept], dropped=free[local.dropped], invisible=free[local.invisible]
     )
@@ -272,10 +281,6 @@ LOOSE, PLACED = 3.0, 0.3
 PLACING, CHOOSING = 1e-12, 1e-2
 # Observations from which on a fit starts from a sample, and how many there are in it.
 MANY, SAMPLE = 2000, 5000
-
-
-# Residuals below this, in m, are rounding: no instrument resolves it, and it tells of no noise.
-EXACT = 1e-11
 
 
 @dataclass(frozen=True)

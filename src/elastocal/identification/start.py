@@ -349,25 +349,24 @@ def check_limits(model: Model, table: Measurements) -> None:
     revolute = np.array([k == "revolute" for k in model.chain.kinds])
     wound = np.abs(table.q[:, revolute]) > 4 * np.pi
     if wound.any():
-        i = int(np.flatnonzero(wound.any(axis=1))[0])
+        (i, *more), remedy = np.flatnonzero(wound.any(axis=1)).tolist(), "correct the line"
+        if 2 * len(more) >= len(table) - 1:
+            remedy = "these are probably degrees in a column named …_rad: rename it to …_deg"
         raise InputError(
             f"{table.source}, line {table.row[i]}: a joint stands at "
-            f"{rounded(np.abs(table.q[i]).max(), 4)} rad, more than two turns "
-            f"({int(wound.any(axis=1).sum())} lines); these are probably degrees in a column "
-            "named …_rad: rename it to …_deg"
+            f"{rounded(np.abs(table.q[i]).max(), 4)} rad, more than two turns ({1 + len(more)} of "
+            f"{len(table)} lines); {remedy}"
         )
     beyond = beyond_limits(model.cell, model.chain, table.q, OVERSHOOT, 4)
     if beyond is not None:
         rows, _, told = beyond
-        hint = (
-            "; most lines are beyond: probably degrees given as radians (or the reverse), or "
-            "another robot"
-            if 2 * len(rows) > len(table)
-            else "; correct the line or the limits"
-        )
+        hint = "correct the line or the limits"
+        if 2 * len(rows) > len(table):
+            hint = "most lines are beyond: probably degrees given as radians (or the reverse), or "
+            hint += "another robot"
         raise InputError(
             f"{table.source}, line {table.row[rows[0]]}: {told} ({len(rows)} of {len(table)} "
-            f"lines){hint}"
+            f"lines); {hint}"
         )
 
 
@@ -377,18 +376,20 @@ def _check_units(model: Model, table: Measurements) -> None:
         return
     if len(table) > SOME:  # some of many readings tell it as well
         table = table.take(np.linspace(0, len(table) - 1, SOME).astype(np.int64))
-    reach = _reach(model, table)
-    extent = float(np.linalg.norm(np.ptp(np.asarray(table.position), axis=0)))
+    reach, position = _reach(model, table), np.asarray(table.position)
+    extent = float(np.linalg.norm(np.ptp(position, axis=0)))
     if reach < SAME or extent < SAME:
         return
     ratio = extent / reach
+    # That of most: one that is far off, as by a slip of the key, tells of no unit.
+    usual = 2 * np.median(np.linalg.norm(position - np.median(position, axis=0), axis=1)) / reach
     small = ratio >= 3 and "prismatic" not in model.chain.kinds
     if small and np.abs(table.q).max() <= SMALL_ANGLE and (
         # The arm hardly moves, and turned back it moves as measured.
         1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
     ):  # fmt: skip
         cause = "the joint angles are probably radians in columns named …_deg: rename to …_rad"
-    elif ratio > EXTENT_FACTOR:
+    elif ratio > EXTENT_FACTOR and usual > EXTENT_FACTOR:
         cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
     elif ratio < 1 / EXTENT_FACTOR:
         cause = "the positions are probably metres in columns named …_mm: rename to …_m"

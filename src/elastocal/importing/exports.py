@@ -235,7 +235,9 @@ def _by_numbers(content: Numbered) -> list[str]:
         counts = sorted(sum(bool(NUMBER.fullmatch(cell)) for cell in cells) for cells in lines)
         return counts[len(counts) // 2]
 
-    return sorted(DELIMITER_NAMES, key=numbers, reverse=True)
+    found = {delimiter: numbers(delimiter) for delimiter in DELIMITER_NAMES}
+    found["space"] *= not found["tab"]  # between tabs blanks are part of names
+    return sorted(found, key=lambda delimiter: found[delimiter], reverse=True)
 
 
 # A number in any style, and blanks and apostrophes in it as office programs write them.
@@ -591,11 +593,14 @@ def _rows(
     kept, ignored = list[tuple[int, list[str], str]](), list[tuple[int, str]]()
     read: dict[str, list[list[float]]] = {marker: [] for marker in columns}
     for number, row in table.rows:
-        if max(widest.index) >= len(row):
+        at = max(widest.index) + 1
+        what = f"{widest.key} is column {at} ({widest.header})" if at > len(row) else ""
+        if table.header and any(row[len(table.header) :]):  # which of them is more, nobody knows
+            what = f"the header has {len(table.header)} ({table.layout})"
+        if what:
             raise InputError(
-                f"{name}, line {number}: {len(row)} columns, but {widest.key} "
-                f"is column {max(widest.index) + 1} ({widest.header}); correct the line, "
-                "or pass over such lines with ignore in [source.text]"
+                f"{name}, line {number}: {len(row)} columns, but {what}; correct the line or the "
+                "delimiter, or pass over such lines with ignore in [source.text]"
             )
         for marker, own in columns.items():
             found = []

@@ -165,25 +165,17 @@ def brought(
     own = np.flatnonzero(off <= LEVEL_SLACK)
     own = own[np.argsort(group[own], kind="stable")]
     verdict = rules.under(q[own], forces)
-    where = f"{table.source}: the cell allows none of its {len(q)} poses"
-    if not len(own):
-        raise InsufficientDataError(
-            f"{where}, as none stands at a level of joint{(space.held or 0) + 1}; bring poses at "
-            "the levels of [design.levels], or drop these"
-        )
-    if not verdict.ok.any():
-        raise InsufficientDataError(f"{where}; {rules.advice(verdict)}")
     refused = {NO_LEVEL: [names[k] for k in np.flatnonzero(off > LEVEL_SLACK)]}
     for k, broken in zip(own[~verdict.ok], verdict.broken[~verdict.ok], strict=True):
         rule = verdict.rules[int(broken.argmax())].replace("_", " ")
         refused.setdefault(rule, []).append(names[k])
-    told = "; ".join(f"{rule} ({listed(by)})" for rule, by in refused.items() if by)
+    named = "; ".join(f"{rule} ({listed(by)})" for rule, by in refused.items() if by)
     ok, removed = own[verdict.ok], verdict.removed_by | {NO_LEVEL: len(q) - len(own)}
-    if told:
-        told = (
-            f"{table.source}: {len(q) - len(ok)} of {len(q)} poses are refused, by the rule that "
-            f"each breaks first: {told}"
-        )
+    told = f"{table.source}: {len(q) - len(ok)} of {len(q)} poses are refused, by the rule that "
+    told = f"{told}each breaks first: {named}" if named else ""
+    if not len(ok):
+        levels = "bring poses at the levels of [design.levels], or drop these"
+        raise InsufficientDataError(f"{told}; {rules.advice(verdict) if len(own) else levels}")
     new = ok
     if pins is not None and len(pins.q):
         near = np.abs(q[ok, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
@@ -245,7 +237,8 @@ def shares_of(cell: Cell, n_poses: int | None = None, asked: str = "") -> IntArr
         require(
             len(each) == levels,
             f"{wish('per_level', f'{where} poses_per_level')} has {len(each)} numbers, but there "
-            f"are {levels} levels",
+            f"are {levels if spec.levels else 'no'} levels; give one number per level, and the "
+            f"levels by {option('levels')} or [design.levels]",
         )
         return np.array(each, dtype=np.int64)
     total = n_poses or spec.poses or DEFAULT
@@ -257,9 +250,10 @@ def shares_of(cell: Cell, n_poses: int | None = None, asked: str = "") -> IntArr
     return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
 
 
-def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
+def check_available(cell: Cell, available: IntArray, shares: IntArray, refused: str) -> None:
     """Raise where a level has fewer candidates, `available` (L,), than poses: InputError where too
-    few were asked for, InsufficientDataError where too few are feasible."""
+    few were asked for, InsufficientDataError where too few are feasible, or brought and not
+    `refused`."""
     short = np.flatnonzero(available < shares)
     if not len(short):
         return
@@ -269,8 +263,9 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
     where += level if len(shares) > 1 else ""
     if (taught := cell.design.taught) is not None:
         raise InsufficientDataError(
-            f"{where}, but of the poses of {taught} the cell allows {available[k]} there; bring "
-            f'more, draw others beside them (candidates = ["{taught.name}", 500]), or plan fewer'
+            f"{where}, but of the poses of {taught} the cell allows {available[k]} there"
+            f"{f' ({refused})' * bool(refused)}; bring more, draw others beside them (candidates = "
+            f'["{taught.name}", 500]), or plan fewer'
         )
     asked = drawn // len(shares) + (k < drawn % len(shares))
     require(

@@ -261,7 +261,7 @@ class _Design:
         targets, region = self.targets()
         q, group, counts = self._candidates()
         for wanted in planned:
-            check_available(self.cell, np.bincount(group), wanted)
+            check_available(self.cell, np.bincount(group), wanted, self.refused)
         known = self.known()
         progress("information of the candidates")
         setup = set_up(
@@ -352,8 +352,8 @@ class _Design:
         state = self.checkpoint.finished("candidates", self._drawn)
         names = zip(state["q"], state["names"], strict=False)  # of those brought, which come first
         self.taught = {q.tobytes(): str(name) for q, name in names}
-        if told := str(state["told"]):
-            self.warnings.append(told)
+        self.refused = str(state["told"])
+        self.warnings += [self.refused] * bool(self.refused)
         return state["q"], state["group"], CandidateCounts(**json.loads(str(state["counts"])))
 
     def _drawn(self) -> State:

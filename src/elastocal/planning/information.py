@@ -36,7 +36,7 @@ from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import SIZE, Observations, available_noise, observe
-from elastocal.simulation import simulate
+from elastocal.simulation import marker_sigmas, simulate
 from elastocal.text import length, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -62,27 +62,8 @@ def plan_forces(cell: Cell) -> Array:
     return np.vstack([np.zeros((1, 3)), forces[loaded]])
 
 
-def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
-    """The table with the cell's own σ per marker, where `[design] marker_sigma_um` states them.
-
-    Raises InputError where some markers have one and others none.
-    """
-    stated = cell.design.marker_sigma
-    if not stated:
-        return table
-    missing = [name for name in table.marker_names if name not in stated]
-    sigmas = wish("marker_sigma", f"{cell.source}: [design] marker_sigma_um")
-    require(
-        not missing,
-        f"{sigmas} states no σ for marker {quoted(missing[0]) if missing else ''}; state one for "
-        "every marker",
-    )
-    sigma = np.array([stated[name] for name in table.marker_names])[table.marker]
-    return replace(table, sigma=np.repeat(sigma[:, None], 3, axis=1), sigma_frame="cartesian")
-
-
 def _no_noise(cell: Cell) -> str:
-    keys = "sigma_um, range_um and transverse_um, or distance_um"
+    keys = "sigma_um, or range_um and transverse_um"
     return (
         f"{cell.source}: a plan needs the noise of a reading; state [tracker] "
         f"{'distance_um' if cell.model.observe == 'distance' else keys}, as the instrument's data "
@@ -453,10 +434,10 @@ def lacks_noise(cell: Cell) -> bool:
 
     Raises InputError where these do not show it: deflections share readings, poses have two units.
     """
-    observed, tracker = cell.model.observe, cell.tracker
-    own = tracker.distance_sigma is not None and observed == "distance"
-    lacks = not own and tracker.noise is None and not cell.design.marker_sigma
-    require(not lacks or observed in ("position", "distance"), _no_noise(cell))
+    if cell.model.observe == "distance":
+        return cell.tracker.distance_sigma is None
+    lacks = cell.tracker.noise is None and not cell.design.marker_sigma
+    require(not lacks or cell.model.observe == "position", _no_noise(cell))
     return lacks
 
 
@@ -472,8 +453,8 @@ def with_noise_of(cell: Cell, done: Calibration) -> tuple[Cell, tuple[str, ...]]
         tracker = replace(cell.tracker, noise=CartesianNoise(np.full(3, sigma)))
         key, along = "sigma_um", " on each axis"
     told = (
-        f"no noise of a reading is stated: the plan takes the {length(sigma)}{along} "
-        f"that the measurements done show; state [tracker] {key} where you know it"
+        f"[tracker] states no {key}: the plan takes the {length(sigma)}{along} that the "
+        "measurements done show; state it where you know it"
     )
     return replace(cell, tracker=tracker), (told,)
 
@@ -482,8 +463,7 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies, or at the
     nominal arm where it does not suffice; the noise is the stated one, as for the poses to come.
     Of smooth functions that of their prior, of the size found, is in it."""
-    if table.sigma is None:
-        table = marker_sigmas(model.cell, table)
+    table = marker_sigmas(model.cell, table)
     sizes = np.array([p.typical if p.shrunk and p.typical else np.inf for p in model.parameters])
     try:
         found = identify(model, table, Options(method="wls", fixed=fixed))

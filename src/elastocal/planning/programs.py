@@ -95,7 +95,8 @@ def program_name(text: str) -> str:
     return f"{name}_plan"[:LONGEST_NAME] if name.lower() in RESERVED or name == "p" else name
 
 
-def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
+def driven(steps: Sequence[Step], lower: Array, upper: Array) -> list[Step]:
+    """The steps, with moves to a limit so far inside that their last digit lies inside too."""
     for k, (kind, values, _) in enumerate(steps):
         if kind == "measure":
             require(0 <= values[0] <= LONGEST_STOP, f"a stop of {values[0]:g} s; give 0 to 86400 s")
@@ -108,6 +109,8 @@ def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
                 f"step {k + 1} moves joint {j + 1} to {value:.6g}°, outside its limits "
                 f"[{low:.6g}, {high:.6g}]°; give poses inside them",
             )
+    inner = lower + DIGIT, upper - DIGIT
+    return [(kind, np.clip(v, *inner) if kind == "move" else v, note) for kind, v, note in steps]
 
 
 def limits_text(lower: Array, upper: Array) -> str:
@@ -122,6 +125,7 @@ def limits_text(lower: Array, upper: Array) -> str:
 # What was written, read back.
 
 SAME = 1e-6  # rad, between a value of the plan and of the program
+DIGIT = 1e-8  # rad, more than half of the last digit of a program, 1e-6° or 1e-9 rad
 LONGEST_STOP = 86_400.0  # s
 _NUMBER = r"-?[0-9]+(?:\.[0-9]+)?"
 _NOTE = r"[ !#-\[\]-~]*"  # printable ASCII without quotation marks and backslashes
@@ -200,8 +204,7 @@ def robot_program(
     order of the chain.  Read back, it is the plan, or an ElastocalError."""
     language, write = LANGUAGES[suffix.lower()]
     check_six_axes(chain, language)
-    steps = steps_of(execution, configurations, forces)
-    check_driven(steps, *limits)
+    steps = driven(steps_of(execution, configurations, forces), *limits)
     told = f"elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}"
     text = "\n".join(write(program_name(name), told, limits_text(*limits), steps)) + "\n"
     check_program(text, steps)
@@ -231,8 +234,7 @@ def _krl(module: str, told: str, limits: str, steps: Sequence[Step]) -> list[str
     ]
     for kind, values, note in steps:
         if kind == "move":
-            axes = enumerate(np.degrees(values), 1)
-            angles = ", ".join(f"A{i} {number(v, 6)}" for i, v in axes)
+            angles = ", ".join(f"A{i} {number(v, 6)}" for i, v in enumerate(np.degrees(values), 1))
             lines += [f"; {plain(note)}", f"PTP {{{angles}}}"]
         elif kind == "load":
             lines += [f"; {plain(note)}, then start again", "HALT"]

@@ -252,9 +252,10 @@ class _Sources:
             assert position is not None  # _columns: joints or positions
             rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()
             headers = ", ".join(column.header for column in columns["position"])
+            lines = [f"{raw.noun} {number}" for number in raw.row]
             q, more = self.reached(
                 position, rotation, spec, force,
-                lambda t: f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place",
+                lambda t: f"{raw.source}, {lines[t]}, columns {headers}: the place", lines,
             )  # fmt: skip
             source += more
         return self.poses(q, source, spec, force, weight)
@@ -268,13 +269,14 @@ class _Sources:
         q, more = self.reached(
             position, rotation, box, None,
             lambda t: "{} [{:.3f}, {:.3f}, {:.3f}] m in it".format(where, *position[t]),
-            f"make the box smaller, {'' if turned is None else 'leave out rpy_deg, '}",
+            remedy=f"make the box smaller, {'' if turned is None else 'leave out rpy_deg, '}",
         )  # fmt: skip
         return self.poses(q, f"{box.count} in [design.test_box]{more}", box)
 
     def reached(
         self, position: Array, rotation: Array | None, spec: TargetPath | TargetBox,
-        force: Array | None, place_of: Callable[[int], str], remedy: str = "",
+        force: Array | None, place_of: Callable[[int], str],
+        lines: Sequence[str] = (), remedy: str = "",
     ) -> tuple[Array, str]:  # fmt: skip
         """Postures (T, n) with the point at places (T, 3) m of the data's frame, the flange at
         `rotation` (T, 3, 3), None for any, each the first one found that the rules allow under
@@ -309,7 +311,8 @@ class _Sources:
             stuck = stuck[~some]
             if not len(stuck):
                 return q, ""
-        return q, f" ({len(stuck)} of them in no posture that the work cell allows)"
+        which = f": {listed(lines[int(t)] for t in stuck)}" if lines else ""
+        return q, f" ({len(stuck)} of them in no posture that the work cell allows{which})"
 
     def _far(self, found: Postures, t: int, at: str, remedy: str) -> str:
         distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])

@@ -220,8 +220,9 @@ def typeset(text: str) -> str:
 
 
 def capital(text: str) -> str:
-    """As a sentence begins; a symbol such as p or ρ₀ stays as it is."""
-    return text if text[1:2] in (" ", "₀") else f"{text[:1].upper()}{text[1:]}"
+    """As a sentence begins; symbols, files and parameters (p, ρ₀, data.csv) stay as they are."""
+    named = re.match(r"\S(\s|₀|$)|\S*([\d_]|[./]\w)", text)
+    return text if named else f"{text[:1].upper()}{text[1:]}"
 
 
 def sentence(text: str) -> str:

@@ -293,7 +293,7 @@ def sensitivity(d: Diagnosis) -> list[str]:
     lines = []
     if math.isfinite(d.smallest_seen):
         lines.append(
-            f"effects above about {say.significant(d.smallest_seen * 1e6, 2)} µm rms at the "
+            f"effects above about {say.length(d.smallest_seen, 2)} rms at the "
             "markers, not absorbed by fitted parameters, would have been found."
         )
     visible = [c for c in d.candidates if c.visible]

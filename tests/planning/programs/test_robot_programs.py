@@ -111,14 +111,14 @@ def test_a_joint_value_outside_the_limits_is_refused(chain, write):
 @pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_a_program_read_back_is_the_plan_to_a_millionth_of_a_radian(chain, write):
     execution = execution_of(chain, home=HOME, both_directions=True)
-    text = write(execution, chain)
-    steps = list(steps_of(execution, NAMES, FORCES))
-    check_program(text, steps)
-    moves = [values for kind, values in program_steps(text) if kind == "move"]
-    assert np.abs(np.array(moves) - planned(execution)).max() < 1e-7
+    lower, upper = (f(planned(execution), axis=0) for f in (np.min, np.max))
+    text = write(execution, chain, limits=(lower, upper))
+    check_program(text, steps := steps_of(execution, NAMES, FORCES))
+    moves = np.array([values for kind, values in program_steps(text) if kind == "move"])
+    assert np.abs(moves - planned(execution)).max() < 1e-7
+    assert ((lower <= moves) & (moves <= upper)).all()
     move = next(line for line in text.splitlines() if re.search(r"[\[{].*-?\d\.\d{3}", line))
-    value = re.search(r"\d\.\d{3}", move)
-    digit = value.end() - 1
+    digit = re.search(r"\d\.\d{3}", move).end() - 1
     moved = move[:digit] + str((int(move[digit]) + 5) % 10) + move[digit + 1 :]
     wait = next(line for line in text.splitlines() if "WAIT" in line or "sleep" in line)
     for wrong in (
