@@ -273,7 +273,8 @@ def _compared(
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
-    names, z, V, hidden = _difference(old, new, [n for n in before.model.names if n in own])
+    of_arm = [name for name in before.model.names if name in own]
+    names, z, V, by_model, hidden = _difference(old, new, of_arm)
     if hidden:
         left[BY_ONE] += hidden
     if not names:
@@ -302,7 +303,7 @@ def _compared(
     columns = [before.model.names.index(name) for name in names]
     B = tool.sensitivity([row[settled] for row in rows], table.q[settled])[..., columns]
     chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
-    changes, p = _tested(old, new, names, functions, z, V, level, B)
+    changes, p = _tested(old, new, names, functions, z, V, by_model, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
         forces, whose, {*old.determined} & own != {*new.determined} & own, dict(left),
@@ -313,15 +314,17 @@ def _estimates(
     arm: CalibratedArm, own: list[str], free: list[str]
 ) -> tuple[IntArray, Array, Array, Array]:
     """Which of the parameters `own` are `free` (k,), y (k,) and A (k, own) with y = A X + ε, and
-    the covariance (k, k) of ε: noise, and what was left open of the set-up.
+    the covariances (2, k, k) of ε, by the noise model and by the scatter of configurations: noise,
+    and what was left open of the set-up.
 
     Raises InputError where the covariance has no numbers.
     """
     kept = np.array([k for k, name in enumerate(own) if name in free], dtype=np.int64)
     at = [arm.determined.index(own[k]) for k in kept]
-    A, V, values = np.eye(len(own))[kept], arm.covariance[np.ix_(at, at)], arm.values
+    V = np.stack([arm.covariance, _errors(arm)[0]])[:, at][..., at]
+    A, values = np.eye(len(own))[kept], arm.values
     require(
-        bool(np.isfinite(V).all() and (np.diag(V) > 0).all()),
+        bool(np.isfinite(V).all() and (np.diagonal(V, axis1=1, axis2=2) > 0).all()),
         f"{arm.source}: its covariance has no numbers, or negative variances, for "
         f"{', '.join(own[:3])} …; identify anew",
     )
@@ -343,8 +346,9 @@ def _left_open(arm: CalibratedArm) -> Iterator[tuple[str, Array, float]]:
 
 def _difference(
     old: CalibratedArm, new: CalibratedArm, own: list[str]
-) -> tuple[list[str], Array, Array, list[str]]:
-    """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows.
+) -> tuple[list[str], Array, Array, Array, list[str]]:
+    """Names, ẑ (p,), Cov ẑ (p, p), that by the noise models alone, and which of `own` one campaign
+    alone shows.
 
     Raises InputError where users held a parameter at two values, or at one that the other campaign
     contradicts, or a covariance has no numbers.
@@ -363,16 +367,22 @@ def _difference(
     # What both determined drops out of the differences, whatever it is: T of all estimates.
     of, side = np.append(first, second), np.repeat([-1.0, 1.0], [len(first), len(second)])
     T = np.vstack([(both[:, None] == of) * side, alone[:, None] == of])
-    size, unknown, nominal = np.zeros(len(own)), np.zeros(len(own)), old.model.nominal
-    unknown[of] = UNKNOWN * np.sqrt(np.append(np.diag(V1), np.diag(V2)))
+    size, unknown = np.zeros((2, len(own)))
+    nominal = old.model.nominal[[old.model.names.index(name) for name in own]]
+    unknown[of] = UNKNOWN * np.sqrt(np.append(np.diag(V1[0]), np.diag(V2[0])))
     for name, _, typical in (*_left_open(old), *_left_open(new)):
         if name in own:
             k = own.index(name)
-            size[k] = max(size[k], typical or unknown[k])
+            # A session that determined it may have found it larger than typical.
+            found = max(abs(arm.values[own[k]] - nominal[k]) for arm in (old, new))
+            size[k] = max(size[k], float(np.hypot(typical, found)) if typical else unknown[k])
     G, H = T @ np.vstack([A1, A2]), T[:, len(first) :] @ A2
     G[:, both] = 0.0
-    t = T @ np.append(y1, y2) - G @ nominal[[old.model.names.index(name) for name in own]]
-    V = T @ linalg.block_diag(V1, V2) @ T.T + (G * size**2) @ G.T
+    t = T @ np.append(y1, y2) - G @ nominal
+    V, scatter = (
+        T @ linalg.block_diag(*each) @ T.T + (G * size**2) @ G.T
+        for each in zip(V1, V2, strict=True)
+    )
     # What the other held at a value that is no matter of chance, of as many as are held.
     spread, held = np.sqrt(np.diag(V)), max(int((size[alone] == 0).sum()), 1)
     most = -float(special.ndtri(LEVEL / held / 2))
@@ -392,7 +402,8 @@ def _difference(
         f"constraints fix a sum of parameters at one value in {old.source} and at another in "
         f"{new.source}; identify both with the same knowledge",
     )
-    W, target = np.split(white / np.sqrt(np.maximum(value, TIED))[:, None], [-1], 1)
+    white /= np.sqrt(np.maximum(value, TIED))[:, None]
+    W, target = np.split(white, [-1], 1)
     told = both.tolist()
     for k in alone.tolist():
         beside = W[:, told]
@@ -405,12 +416,13 @@ def _difference(
     shares = np.abs(np.vstack([A1, A2])[np.isin(of, np.intersect1d(alone, told))]) * size
     covered = (shares > STANDS_FOR * shares.max(axis=1, initial=0.0)[:, None]).any(axis=0)
     hidden = [own[k] for k in alone if k not in told and not covered[k]]
-    return [own[k] for k in told], (half @ target)[:, 0], half @ half.T, hidden
+    K = half @ (axes / np.sqrt(np.maximum(value, TIED))).T / unit
+    return [own[k] for k in told], (half @ target)[:, 0], K @ scatter @ K.T, half @ half.T, hidden
 
 
 def _tested(
     old: CalibratedArm, new: CalibratedArm, names: list[str], functions: dict[str, str], z: Array,
-    V: Array, level: float, B: Array,
+    V: Array, by_model: Array, level: float, B: Array,
 ) -> tuple[tuple[ParameterChange, ...], float]:  # fmt: skip
     """Each parameter and each smooth function by Holm's rule, and p of all together.  `functions`:
     parameter → that which it is part of; `B` (poses, 3, p) in m per unit at the tool."""
@@ -418,14 +430,17 @@ def _tested(
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
     nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
-    alone = 2 * special.stdtr(np.maximum(nu, 1.0), -np.abs(z) / std)
-    smallest = min(float(np.min(dofs)), 1e9)
+    nu = np.clip(nu, 1.0, 1e9)
+    alone = 2 * special.stdtr(nu, -np.abs(z) / std)
 
     def together(at: list[int]) -> float:
-        value, axes = np.linalg.eigh(correlations(V[np.ix_(at, at)])[0])
+        rho, unit = correlations(by_model[np.ix_(at, at)])
+        value, axes = np.linalg.eigh(rho)
         apart = value > 10 * TIED  # the rest is as constraints have it
-        t = (z[at] / std[at]) @ axes[:, apart]
-        return float(special.fdtrc(len(t), smallest, np.mean(t**2 / value[apart])))
+        white = axes[:, apart] / np.sqrt(value[apart]) / unit[:, None]
+        C, square = white.T @ V[np.ix_(at, at)] @ white, float(((z[at] @ white) ** 2).sum())
+        mean, dof = np.trace(C), float((nu[at] ** -0.5).mean() ** -2)
+        return float(special.fdtrc(mean**2 / (C**2).sum(), dof, square / mean))
 
     def rms(far: Array) -> float:
         return float(np.sqrt((far**2).sum(axis=1).mean()))
@@ -454,8 +469,18 @@ def _tested(
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
-    """Of each parameter; an older result states no degrees of freedom: normal."""
-    variance = dict(zip(arm.determined, np.maximum(np.diag(arm.covariance), 0.0), strict=True))
+    covariance, dof = _errors(arm)
+    each = zip(np.maximum(np.diag(covariance), 0.0), dof, strict=True)
+    known = dict(zip(arm.determined, each, strict=True))
+    found = np.array([known.get(name, (0.0, np.inf)) for name in names])
+    return found[:, 0], found[:, 1]
+
+
+def _errors(arm: CalibratedArm) -> tuple[Array, Array]:
+    """Covariance of the estimates and its degrees of freedom: by configurations alone, else by the
+    noise model; where an older result states none, normal."""
+    if arm.scatter is not None:
+        return arm.scatter.covariance, arm.scatter.dof
     stated = {str(entry["name"]): entry.get("dof") for entry in arm.entries}
-    each = [(variance.get(name, 0.0), float(stated.get(name) or np.inf)) for name in names]
-    return np.array(each)[:, 0], np.array(each)[:, 1]
+    dof = np.array([float(stated.get(name) or np.inf) for name in arm.determined])
+    return arm.covariance, dof

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from elastocal.errors import ElastocalError, option, said_of
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import judged
+from elastocal.identification.findings import is_noise, judged
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
@@ -76,7 +76,7 @@ from elastocal.identification.start import (
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.model.arm import Parameter
-from elastocal.model.calibrated import ShownPoses
+from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.manipulator import Model
@@ -285,6 +285,8 @@ def summarise(
     errors = None if test is None else _test_errors(model, result, test)
     result = replace(result, predicted=predicted, test=errors)
     result = judged(result, solution, every.problem.observations.table)
+    if not is_noise(result.findings) and not every.exact:
+        result = replace(result, scatter=_scatter(result, solution, course.options))
     told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
@@ -318,6 +320,18 @@ def uncertainty_of(
     each = variance_of(B[:, :3], covariance)
     code = numbered(observed.configuration)
     return np.asarray(np.sqrt(np.bincount(code, each) / np.bincount(code)))
+
+
+def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatter | None:
+    """What a model lacks is larger at some poses than at others, and no noise of the readings.
+
+    None where something else than the readings holds estimates, where configurations err alike in
+    time, and where one of them alone holds a parameter."""
+    alike = result.weights.together is not None
+    if alike or result.prior_share or result.smooth or result.active or options.intervals != "auto":
+        return None
+    found = spread_of(solution, "cr2", None)
+    return Scatter(found.matrix, found.dof) if found.dof.all() else None
 
 
 SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it

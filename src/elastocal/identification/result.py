@@ -39,6 +39,7 @@ from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
     OpenParameters,
+    Scatter,
     ShownPoses,
     mostly_prior,
     nominal_flange_rows,
@@ -55,7 +56,7 @@ LENGTHS = ("residual_rms", "heldout_rms", "heldout_all_rms", "nominal_rms")
 AS_THEY_ARE = (
     "residual_summary", "prior_share", "converged", "outliers", "excluded", "copies",
     "autocorrelation", "warnings", "findings", "method", "combinations", "covariance",
-    "correlations", "dof", "noise", "faulty_report", "test",
+    "correlations", "dof", "noise", "faulty_report", "test", "scatter",
 )  # fmt: skip
 LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
 
@@ -289,6 +290,8 @@ class Calibration(scrutiny.FoundFit, Result):
         noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
             "visits" have in common.
         shown: How sure the fit is where it was measured; None of a large table.
+        scatter: The covariance that configurations alone tell, where no noise that is known
+            explains the residual.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -326,6 +329,7 @@ class Calibration(scrutiny.FoundFit, Result):
     predicted: PredictedError | None = None
     copies: tuple[int, ...] = ()
     shown: ShownPoses | None = None
+    scatter: Scatter | None = None
 
     @property
     def covariance(self) -> Array:
@@ -522,7 +526,7 @@ class Calibration(scrutiny.FoundFit, Result):
             self.model, self.x, self.determined, self.covariance, self.observations.table.source,
             tuple(map(_estimate_json, self.estimates)), self.left, lacking,
             measured_loads(self.observations), self.shown, measured_visits(self.observations),
-            mostly_prior(self.prior_share),
+            mostly_prior(self.prior_share), self.scatter,
         )  # fmt: skip
 
     @cached_property
