@@ -5,11 +5,16 @@ up anew each time and count for neither) and V₁, V₂ their covariances,
 
     z = x₂ − x₁,    Cov z = V₁ + V₂,
 
-since two campaigns err independently.  All of z together: zᵀ (V₁ + V₂)⁻¹ z / p against F(p, ν), ν
-the smaller of the campaigns' degrees of freedom.  Each alone: |z_k| / s_k against Student's t with
-Welch and Satterthwaite's degrees of freedom, and by Holm's rule, so that with probability 1 − level
-no parameter is called changed that is not.  The coefficients of a smooth function are one thing,
-tested together as all of z are.
+since two campaigns err independently.  V is that of the noise model, N, where what is known of the
+noise explains the residual.  Else part of it is what the model lacks, larger at some poses than at
+others, and V is the `scatter` of configurations (CR2), which are drawn anew in each campaign.
+
+Each alone: |z_k| / s_k against Student's t with Welch and Satterthwaite's degrees of freedom ν_k,
+and by Holm's rule, so that with probability 1 − level no parameter is called changed that is not.
+All together, without inverting a V that few configurations tell, zᵀ N⁻¹ z / tr C against
+F(tr² C / tr C², ν), C = N^-½ V N^-½, of p where V is N (Box 1954; Brunner, Dette and Munk 1997, J.
+Am. Stat. Assoc. 92, 1494); ν^-½ is the mean of ν_k^-½, as of variances that err together.  The
+coefficients of a smooth function are one thing, tested together as all of z are.
 
 A campaign determines sums: a parameter with shares M of those that its poses do not tell from it,
 
@@ -273,8 +278,7 @@ def _compared(
     table = random_table(before.model, conditions, poses, seed)
     # Where the tool is predicted to be; what is read there counts for nothing.
     table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
-    of_arm = [name for name in before.model.names if name in own]
-    names, z, V, by_model, hidden = _difference(old, new, of_arm)
+    names, z, V, hidden = _difference(old, new, [n for n in before.model.names if n in own])
     if hidden:
         left[BY_ONE] += hidden
     if not names:
@@ -302,8 +306,8 @@ def _compared(
         )
     columns = [before.model.names.index(name) for name in names]
     B = tool.sensitivity([row[settled] for row in rows], table.q[settled])[..., columns]
-    chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
-    changes, p = _tested(old, new, names, functions, z, V, by_model, level, B)
+    chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V[1], B))
+    changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
         forces, whose, {*old.determined} & own != {*new.determined} & own, dict(left),
@@ -314,14 +318,13 @@ def _estimates(
     arm: CalibratedArm, own: list[str], free: list[str]
 ) -> tuple[IntArray, Array, Array, Array]:
     """Which of the parameters `own` are `free` (k,), y (k,) and A (k, own) with y = A X + ε, and
-    the covariances (2, k, k) of ε, by the noise model and by the scatter of configurations: noise,
-    and what was left open of the set-up.
+    N and V (2, k, k) of ε: noise, and what was left open of the set-up.
 
     Raises InputError where the covariance has no numbers.
     """
     kept = np.array([k for k, name in enumerate(own) if name in free], dtype=np.int64)
     at = [arm.determined.index(own[k]) for k in kept]
-    V = np.stack([arm.covariance, _errors(arm)[0]])[:, at][..., at]
+    V = np.stack([arm.covariance, _covariance(arm)])[:, at][..., at]
     A, values = np.eye(len(own))[kept], arm.values
     require(
         bool(np.isfinite(V).all() and (np.diagonal(V, axis1=1, axis2=2) > 0).all()),
@@ -346,9 +349,8 @@ def _left_open(arm: CalibratedArm) -> Iterator[tuple[str, Array, float]]:
 
 def _difference(
     old: CalibratedArm, new: CalibratedArm, own: list[str]
-) -> tuple[list[str], Array, Array, Array, list[str]]:
-    """Names, ẑ (p,), Cov ẑ (p, p), that by the noise models alone, and which of `own` one campaign
-    alone shows.
+) -> tuple[list[str], Array, Array, list[str]]:
+    """Names, ẑ (p,), N and V of it (2, p, p), and which of `own` one campaign alone shows.
 
     Raises InputError where users held a parameter at two values, or at one that the other campaign
     contradicts, or a covariance has no numbers.
@@ -379,12 +381,10 @@ def _difference(
     G, H = T @ np.vstack([A1, A2]), T[:, len(first) :] @ A2
     G[:, both] = 0.0
     t = T @ np.append(y1, y2) - G @ nominal
-    V, scatter = (
-        T @ linalg.block_diag(*each) @ T.T + (G * size**2) @ G.T
-        for each in zip(V1, V2, strict=True)
-    )
+    V = np.stack([T @ linalg.block_diag(*both) @ T.T for both in zip(V1, V2, strict=True)])
+    V += (G * size**2) @ G.T
     # What the other held at a value that is no matter of chance, of as many as are held.
-    spread, held = np.sqrt(np.diag(V)), max(int((size[alone] == 0).sum()), 1)
+    spread, held = np.sqrt(np.diag(V[1])), max(int((size[alone] == 0).sum()), 1)
     most = -float(special.ndtri(LEVEL / held / 2))
     for k, off in zip(alone.tolist(), (t / spread)[len(both) :].tolist(), strict=True):
         one, other = (new, old) if k in first else (old, new)
@@ -393,17 +393,17 @@ def _difference(
             f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
             f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
         )
-    rho, unit = correlations(V)
+    rho, unit = correlations(V[0])
     value, axes = np.linalg.eigh(rho)
     # Sums that constraints fix in both do not vary.
-    white = axes.T @ (np.column_stack([H, t]) / unit[:, None])
+    white = axes.T / unit
     require(
-        bool((np.abs(white[value < TIED, -1]) < SAME).all()),
+        bool((np.abs(white[value < TIED] @ t) < SAME).all()),
         f"constraints fix a sum of parameters at one value in {old.source} and at another in "
         f"{new.source}; identify both with the same knowledge",
     )
     white /= np.sqrt(np.maximum(value, TIED))[:, None]
-    W, target = np.split(white, [-1], 1)
+    W = white @ H
     told = both.tolist()
     for k in alone.tolist():
         beside = W[:, told]
@@ -416,16 +416,18 @@ def _difference(
     shares = np.abs(np.vstack([A1, A2])[np.isin(of, np.intersect1d(alone, told))]) * size
     covered = (shares > STANDS_FOR * shares.max(axis=1, initial=0.0)[:, None]).any(axis=0)
     hidden = [own[k] for k in alone if k not in told and not covered[k]]
-    K = half @ (axes / np.sqrt(np.maximum(value, TIED))).T / unit
-    return [own[k] for k in told], (half @ target)[:, 0], K @ scatter @ K.T, half @ half.T, hidden
+    K = half @ white
+    return [own[k] for k in told], K @ t, K @ V @ K.T, hidden
 
 
 def _tested(
     old: CalibratedArm, new: CalibratedArm, names: list[str], functions: dict[str, str], z: Array,
-    V: Array, by_model: Array, level: float, B: Array,
+    spread: Array, level: float, B: Array,
 ) -> tuple[tuple[ParameterChange, ...], float]:  # fmt: skip
     """Each parameter and each smooth function by Holm's rule, and p of all together.  `functions`:
-    parameter → that which it is part of; `B` (poses, 3, p) in m per unit at the tool."""
+    parameter → that which it is part of; `spread`: N and V (2, p, p) of z; `B` (poses, 3, p) in m
+    per unit at the tool."""
+    N, V = spread
     std = np.sqrt(np.diag(V))
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
@@ -434,7 +436,7 @@ def _tested(
     alone = 2 * special.stdtr(nu, -np.abs(z) / std)
 
     def together(at: list[int]) -> float:
-        rho, unit = correlations(by_model[np.ix_(at, at)])
+        rho, unit = correlations(N[np.ix_(at, at)])
         value, axes = np.linalg.eigh(rho)
         apart = value > 10 * TIED  # the rest is as constraints have it
         white = axes[:, apart] / np.sqrt(value[apart]) / unit[:, None]
@@ -469,18 +471,15 @@ def _tested(
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
-    covariance, dof = _errors(arm)
-    each = zip(np.maximum(np.diag(covariance), 0.0), dof, strict=True)
-    known = dict(zip(arm.determined, each, strict=True))
-    found = np.array([known.get(name, (0.0, np.inf)) for name in names])
-    return found[:, 0], found[:, 1]
+    variances = np.maximum(np.diag(_covariance(arm)), 0.0)
+    if (scatter := arm.scatter) is not None:
+        dofs = dict(zip(arm.determined, scatter.dof.tolist(), strict=True))
+    else:  # an older result states none: normal
+        dofs = {str(entry["name"]): float(entry.get("dof") or np.inf) for entry in arm.entries}
+    variance = dict(zip(arm.determined, variances, strict=True))
+    each = [(variance.get(name, 0.0), dofs.get(name, np.inf)) for name in names]
+    return np.array(each)[:, 0], np.array(each)[:, 1]
 
 
-def _errors(arm: CalibratedArm) -> tuple[Array, Array]:
-    """Covariance of the estimates and its degrees of freedom: by configurations alone, else by the
-    noise model; where an older result states none, normal."""
-    if arm.scatter is not None:
-        return arm.scatter.covariance, arm.scatter.dof
-    stated = {str(entry["name"]): entry.get("dof") for entry in arm.entries}
-    dof = np.array([float(stated.get(name) or np.inf) for name in arm.determined])
-    return arm.covariance, dof
+def _covariance(arm: CalibratedArm) -> Array:
+    return arm.covariance if arm.scatter is None else arm.scatter.covariance

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 
@@ -151,20 +151,15 @@ def _explained(result: Calibration, noise: list[Finding]) -> bool:
 
     Of n equations for p parameters the held-out error is that of the fit times n / (n - p) or more.
     """
-    expected = result.residual_rms * _overfitted(result)
-    return is_noise(noise) and result.heldout_rms <= FLATTERS * expected
-
-
-def is_noise(found: Iterable[Finding]) -> bool:
-    """Whether what is known of the noise, stated or from repeats, accounts for all of the residual,
-    by these findings."""
-    told = {f.kind for f in found if (f.kind, f.severity) != ("lack_of_fit", "note")}
+    told = {f.kind for f in noise}
+    lacking = any(f.kind == "lack_of_fit" and f.severity == "care" for f in noise)
     stated = told & {
         "residual_agrees_with_stated_noise", "residual_below_stated_noise",
         "residual_agrees_with_readings",
     }  # fmt: skip
     agrees = bool(stated) or ("noise_not_compared" in told and "repeats_agree" in told)
-    return agrees and "lack_of_fit" not in told
+    expected = result.residual_rms * _overfitted(result)
+    return agrees and not lacking and result.heldout_rms <= FLATTERS * expected
 
 
 def _overfitted(result: Calibration) -> float:

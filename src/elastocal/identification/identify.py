@@ -16,7 +16,7 @@ from scipy import sparse
 
 from elastocal.errors import ElastocalError, option, said_of
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import is_noise, judged
+from elastocal.identification.findings import judged
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
@@ -285,8 +285,7 @@ def summarise(
     errors = None if test is None else _test_errors(model, result, test)
     result = replace(result, predicted=predicted, test=errors)
     result = judged(result, solution, every.problem.observations.table)
-    if not is_noise(result.findings) and not every.exact:
-        result = replace(result, scatter=_scatter(result, solution, course.options))
+    result = replace(result, scatter=_scatter(result, solution, course.options))
     told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
@@ -322,13 +321,18 @@ def uncertainty_of(
     return np.asarray(np.sqrt(np.bincount(code, each) / np.bincount(code)))
 
 
-def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatter | None:
-    """What a model lacks is larger at some poses than at others, and no noise of the readings.
+EXPLAINED = {
+    "residual_agrees_with_stated_noise", "residual_agrees_with_readings", "repeats_agree",
+}  # fmt: skip
 
-    None where something else than the readings holds estimates, where configurations err alike in
-    time, and where one of them alone holds a parameter."""
-    alike = result.weights.together is not None
-    if alike or result.prior_share or result.smooth or result.active or options.intervals != "auto":
+
+def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatter | None:
+    """None where known noise explains the residual, where more than readings holds estimates, and
+    where configurations err alike in time, or one of them alone holds a parameter."""
+    explained = solution.exact or not EXPLAINED.isdisjoint(f.kind for f in result.findings)
+    held = result.prior_share or result.smooth or result.active or options.intervals != "auto"
+    alike = result.weights.together is not None or result.observations.n_configurations < 2
+    if explained or held or alike:
         return None
     found = spread_of(solution, "cr2", None)
     return Scatter(found.matrix, found.dof) if found.dof.all() else None

@@ -56,7 +56,7 @@ LENGTHS = ("residual_rms", "heldout_rms", "heldout_all_rms", "nominal_rms")
 AS_THEY_ARE = (
     "residual_summary", "prior_share", "converged", "outliers", "excluded", "copies",
     "autocorrelation", "warnings", "findings", "method", "combinations", "covariance",
-    "correlations", "dof", "noise", "faulty_report", "test", "scatter",
+    "correlations", "dof", "noise", "faulty_report", "test",
 )  # fmt: skip
 LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
 
@@ -290,8 +290,8 @@ class Calibration(scrutiny.FoundFit, Result):
         noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
             "visits" have in common.
         shown: How sure the fit is where it was measured; None of a large table.
-        scatter: The covariance that configurations alone tell, where no noise that is known
-            explains the residual.
+        scatter: The covariance that configurations tell, where no known noise explains the
+            residual.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -685,6 +685,7 @@ class Calibration(scrutiny.FoundFit, Result):
             "parameter_sets": self.parameter_sets(),
             "uncertainty": self.uncertainty(),
             **{name: getattr(self, name) for name in AS_THEY_ARE},
+            **({} if self.scatter is None else {"scatter": self.scatter}),
         })  # fmt: skip
 
 

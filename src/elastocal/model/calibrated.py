@@ -114,8 +114,8 @@ class MeasuredVisits:
 
 @record
 class Scatter:
-    """Covariance (K, K) of the determined parameters that rests on nothing but that configurations
-    err independently (CR2), and its degrees of freedom (K,)."""
+    """Covariance (K, K) of the determined parameters where configurations alone err independently
+    (CR2), and its degrees of freedom (K,)."""
 
     more: ClassVar[str] = "ignore"
     covariance: Matrix = keyed("a row for each parameter of covariance_of", required=True)
@@ -174,8 +174,7 @@ class CalibratedArm(Valued, Saved):
         shown: How sure the fit is where it was measured; None in results that do not say.
         visits: The joints and forces measured; None in results that do not say.
         by_prior: Those of `determined` that owe more to a prior than to the readings.
-        scatter: What configurations alone say of their errors, where no noise is known that
-            explains the residual.
+        scatter: What configurations say of them, where no known noise explains the residual.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -312,8 +311,8 @@ def read_calibrated(
     )
     scatter = stated.scatter
     require(
-        scatter is None or scatter.covariance.shape == (n, n) == (len(scatter.dof), n),
-        f"{result_path}: scatter is not of the {n} names in covariance_of; {ANEW}",
+        scatter is None or (*scatter.covariance.shape, *scatter.dof.shape) == (n, n, n),
+        f"{result_path}: scatter is not of the names in covariance_of; {ANEW}",
     )
     entries, visits = {e["name"]: e for e in result["parameters"]}, stated.measured_visits
     shape = None if visits is None else (len(visits.force), model.chain.n_joints)
@@ -368,7 +367,7 @@ class _Result(Table, extra="ignore"):
     measured_poses: ShownPoses | None = key("a table")
     measured_visits: MeasuredVisits | None = key("a table")
     prior_share: dict[str, float | None] | None = key("a table of shares")
-    scatter: Scatter | None = key("a table of what configurations say of the covariance")
+    scatter: Scatter | None = key("a table")
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:
