@@ -5,11 +5,16 @@ up anew each time and count for neither) and V₁, V₂ their covariances,
 
     z = x₂ − x₁,    Cov z = V₁ + V₂,
 
-since two campaigns err independently.  All of z together: zᵀ (V₁ + V₂)⁻¹ z / p against F(p, ν), ν
-the smaller of the campaigns' degrees of freedom.  Each alone: |z_k| / s_k against Student's t with
-Welch and Satterthwaite's degrees of freedom, and by Holm's rule, so that with probability 1 − level
-no parameter is called changed that is not.  The coefficients of a smooth function are one thing,
-tested together as all of z are.
+since two campaigns err independently.  V is that of the noise model, N, where what is known of the
+noise explains the residual.  Else part of it is what the model lacks, larger at some poses than at
+others, and V is the `scatter` of configurations (CR2), which are drawn anew in each campaign.
+
+Each alone: |z_k| / s_k against Student's t with Welch and Satterthwaite's degrees of freedom ν_k,
+and by Holm's rule, so that with probability 1 − level no parameter is called changed that is not.
+All together, without inverting a V that few configurations tell, zᵀ N⁻¹ z / tr C against
+F(tr² C / tr C², ν), C = N^-½ V N^-½, of p where V is N (Box 1954; Brunner, Dette and Munk 1997, J.
+Am. Stat. Assoc. 92, 1494); ν^-½ is the mean of ν_k^-½, as of variances that err together.  The
+coefficients of a smooth function are one thing, tested together as all of z are.
 
 A campaign determines sums: a parameter with shares M of those that its poses do not tell from it,
 
@@ -301,7 +306,7 @@ def _compared(
         )
     columns = [before.model.names.index(name) for name in names]
     B = tool.sensitivity([row[settled] for row in rows], table.q[settled])[..., columns]
-    chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
+    chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V[1], B))
     changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
@@ -313,15 +318,16 @@ def _estimates(
     arm: CalibratedArm, own: list[str], free: list[str]
 ) -> tuple[IntArray, Array, Array, Array]:
     """Which of the parameters `own` are `free` (k,), y (k,) and A (k, own) with y = A X + ε, and
-    the covariance (k, k) of ε: noise, and what was left open of the set-up.
+    N and V (2, k, k) of ε: noise, and what was left open of the set-up.
 
     Raises InputError where the covariance has no numbers.
     """
     kept = np.array([k for k, name in enumerate(own) if name in free], dtype=np.int64)
     at = [arm.determined.index(own[k]) for k in kept]
-    A, V, values = np.eye(len(own))[kept], arm.covariance[np.ix_(at, at)], arm.values
+    V = np.stack([arm.covariance, _covariance(arm)])[:, at][..., at]
+    A, values = np.eye(len(own))[kept], arm.values
     require(
-        bool(np.isfinite(V).all() and (np.diag(V) > 0).all()),
+        bool(np.isfinite(V).all() and (np.diagonal(V, axis1=1, axis2=2) > 0).all()),
         f"{arm.source}: its covariance has no numbers, or negative variances, for "
         f"{', '.join(own[:3])} …; identify anew",
     )
@@ -344,7 +350,7 @@ def _left_open(arm: CalibratedArm) -> Iterator[tuple[str, Array, float]]:
 def _difference(
     old: CalibratedArm, new: CalibratedArm, own: list[str]
 ) -> tuple[list[str], Array, Array, list[str]]:
-    """Names, ẑ (p,), Cov ẑ (p, p), and which of `own` one campaign alone shows.
+    """Names, ẑ (p,), N and V of it (2, p, p), and which of `own` one campaign alone shows.
 
     Raises InputError where users held a parameter at two values, or at one that the other campaign
     contradicts, or a covariance has no numbers.
@@ -363,18 +369,22 @@ def _difference(
     # What both determined drops out of the differences, whatever it is: T of all estimates.
     of, side = np.append(first, second), np.repeat([-1.0, 1.0], [len(first), len(second)])
     T = np.vstack([(both[:, None] == of) * side, alone[:, None] == of])
-    size, unknown, nominal = np.zeros(len(own)), np.zeros(len(own)), old.model.nominal
-    unknown[of] = UNKNOWN * np.sqrt(np.append(np.diag(V1), np.diag(V2)))
+    size, unknown = np.zeros((2, len(own)))
+    nominal = old.model.nominal[[old.model.names.index(name) for name in own]]
+    unknown[of] = UNKNOWN * np.sqrt(np.append(np.diag(V1[0]), np.diag(V2[0])))
     for name, _, typical in (*_left_open(old), *_left_open(new)):
         if name in own:
             k = own.index(name)
-            size[k] = max(size[k], typical or unknown[k])
+            # A session that determined it may have found it larger than typical.
+            found = max(abs(arm.values[own[k]] - nominal[k]) for arm in (old, new))
+            size[k] = max(size[k], float(np.hypot(typical, found)) if typical else unknown[k])
     G, H = T @ np.vstack([A1, A2]), T[:, len(first) :] @ A2
     G[:, both] = 0.0
-    t = T @ np.append(y1, y2) - G @ nominal[[old.model.names.index(name) for name in own]]
-    V = T @ linalg.block_diag(V1, V2) @ T.T + (G * size**2) @ G.T
+    t = T @ np.append(y1, y2) - G @ nominal
+    V = np.stack([T @ linalg.block_diag(*both) @ T.T for both in zip(V1, V2, strict=True)])
+    V += (G * size**2) @ G.T
     # What the other held at a value that is no matter of chance, of as many as are held.
-    spread, held = np.sqrt(np.diag(V)), max(int((size[alone] == 0).sum()), 1)
+    spread, held = np.sqrt(np.diag(V[1])), max(int((size[alone] == 0).sum()), 1)
     most = -float(special.ndtri(LEVEL / held / 2))
     for k, off in zip(alone.tolist(), (t / spread)[len(both) :].tolist(), strict=True):
         one, other = (new, old) if k in first else (old, new)
@@ -383,16 +393,17 @@ def _difference(
             f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
             f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
         )
-    rho, unit = correlations(V)
+    rho, unit = correlations(V[0])
     value, axes = np.linalg.eigh(rho)
     # Sums that constraints fix in both do not vary.
-    white = axes.T @ (np.column_stack([H, t]) / unit[:, None])
+    white = axes.T / unit
     require(
-        bool((np.abs(white[value < TIED, -1]) < SAME).all()),
+        bool((np.abs(white[value < TIED] @ t) < SAME).all()),
         f"constraints fix a sum of parameters at one value in {old.source} and at another in "
         f"{new.source}; identify both with the same knowledge",
     )
-    W, target = np.split(white / np.sqrt(np.maximum(value, TIED))[:, None], [-1], 1)
+    white /= np.sqrt(np.maximum(value, TIED))[:, None]
+    W = white @ H
     told = both.tolist()
     for k in alone.tolist():
         beside = W[:, told]
@@ -405,27 +416,33 @@ def _difference(
     shares = np.abs(np.vstack([A1, A2])[np.isin(of, np.intersect1d(alone, told))]) * size
     covered = (shares > STANDS_FOR * shares.max(axis=1, initial=0.0)[:, None]).any(axis=0)
     hidden = [own[k] for k in alone if k not in told and not covered[k]]
-    return [own[k] for k in told], (half @ target)[:, 0], half @ half.T, hidden
+    K = half @ white
+    return [own[k] for k in told], K @ t, K @ V @ K.T, hidden
 
 
 def _tested(
     old: CalibratedArm, new: CalibratedArm, names: list[str], functions: dict[str, str], z: Array,
-    V: Array, level: float, B: Array,
+    spread: Array, level: float, B: Array,
 ) -> tuple[tuple[ParameterChange, ...], float]:  # fmt: skip
     """Each parameter and each smooth function by Holm's rule, and p of all together.  `functions`:
-    parameter → that which it is part of; `B` (poses, 3, p) in m per unit at the tool."""
+    parameter → that which it is part of; `spread`: N and V (2, p, p) of z; `B` (poses, 3, p) in m
+    per unit at the tool."""
+    N, V = spread
     std = np.sqrt(np.diag(V))
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
     nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
-    alone = 2 * special.stdtr(np.maximum(nu, 1.0), -np.abs(z) / std)
-    smallest = min(float(np.min(dofs)), 1e9)
+    nu = np.clip(nu, 1.0, 1e9)
+    alone = 2 * special.stdtr(nu, -np.abs(z) / std)
 
     def together(at: list[int]) -> float:
-        value, axes = np.linalg.eigh(correlations(V[np.ix_(at, at)])[0])
+        rho, unit = correlations(N[np.ix_(at, at)])
+        value, axes = np.linalg.eigh(rho)
         apart = value > 10 * TIED  # the rest is as constraints have it
-        t = (z[at] / std[at]) @ axes[:, apart]
-        return float(special.fdtrc(len(t), smallest, np.mean(t**2 / value[apart])))
+        white = axes[:, apart] / np.sqrt(value[apart]) / unit[:, None]
+        C, square = white.T @ V[np.ix_(at, at)] @ white, float(((z[at] @ white) ** 2).sum())
+        mean, dof = np.trace(C), float((nu[at] ** -0.5).mean() ** -2)
+        return float(special.fdtrc(mean**2 / (C**2).sum(), dof, square / mean))
 
     def rms(far: Array) -> float:
         return float(np.sqrt((far**2).sum(axis=1).mean()))
@@ -454,8 +471,15 @@ def _tested(
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
-    """Of each parameter; an older result states no degrees of freedom: normal."""
-    variance = dict(zip(arm.determined, np.maximum(np.diag(arm.covariance), 0.0), strict=True))
-    stated = {str(entry["name"]): entry.get("dof") for entry in arm.entries}
-    each = [(variance.get(name, 0.0), float(stated.get(name) or np.inf)) for name in names]
+    variances = np.maximum(np.diag(_covariance(arm)), 0.0)
+    if (scatter := arm.scatter) is not None:
+        dofs = dict(zip(arm.determined, scatter.dof.tolist(), strict=True))
+    else:  # an older result states none: normal
+        dofs = {str(entry["name"]): float(entry.get("dof") or np.inf) for entry in arm.entries}
+    variance = dict(zip(arm.determined, variances, strict=True))
+    each = [(variance.get(name, 0.0), dofs.get(name, np.inf)) for name in names]
     return np.array(each)[:, 0], np.array(each)[:, 1]
+
+
+def _covariance(arm: CalibratedArm) -> Array:
+    return arm.covariance if arm.scatter is None else arm.scatter.covariance

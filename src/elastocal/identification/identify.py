@@ -76,7 +76,7 @@ from elastocal.identification.start import (
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.model.arm import Parameter
-from elastocal.model.calibrated import ShownPoses
+from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.manipulator import Model
@@ -285,6 +285,7 @@ def summarise(
     errors = None if test is None else _test_errors(model, result, test)
     result = replace(result, predicted=predicted, test=errors)
     result = judged(result, solution, every.problem.observations.table)
+    result = replace(result, scatter=_scatter(result, solution, course.options))
     told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
@@ -318,6 +319,23 @@ def uncertainty_of(
     each = variance_of(B[:, :3], covariance)
     code = numbered(observed.configuration)
     return np.asarray(np.sqrt(np.bincount(code, each) / np.bincount(code)))
+
+
+EXPLAINED = {
+    "residual_agrees_with_stated_noise", "residual_agrees_with_readings", "repeats_agree",
+}  # fmt: skip
+
+
+def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatter | None:
+    """None where known noise explains the residual, where more than readings holds estimates, and
+    where configurations err alike in time, or one of them alone holds a parameter."""
+    explained = solution.exact or not EXPLAINED.isdisjoint(f.kind for f in result.findings)
+    held = result.prior_share or result.smooth or result.active or options.intervals != "auto"
+    alike = result.weights.together is not None or result.observations.n_configurations < 2
+    if explained or held or alike:
+        return None
+    found = spread_of(solution, "cr2", None)
+    return Scatter(found.matrix, found.dof) if found.dof.all() else None
 
 
 SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it

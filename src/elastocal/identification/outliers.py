@@ -288,10 +288,22 @@ def find_faulty(solution: Solution) -> BoolArray:
     # What all parameters say against so many is noise that readings share, or a missing effect.
     last = ends[-1] if (~ends[-1][1]).mean() <= FEW else ends[0]
     fit, good, _ = last if explains_more(last, ends[0]) else ends[0]
+    if (~good).mean() > FEW:
+        # Part of a block that errs alike bends all parameters, and is then contradicted no more.
+        sets, variance = (good, starts[0][0]), fit.variance
+        good = min(sets, key=lambda one: _beside_a_shift(B, y, one, variance))
+        fit = FitToGood(B, y, good, variance)
     faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
+
+
+def _beside_a_shift(B: Array, y: Array, good: BoolArray, variance: float) -> float:
+    """The sum of squares of a fit to all readings where those that are not `good` share a shift."""
+    shift = np.abs(y).max() * np.eye(y.shape[1]) * ~good[:, None, None]
+    every = np.ones(len(y), dtype=bool)
+    return FitToGood(np.concatenate([B, shift], axis=2), y, every, variance).rss
 
 
 def prior_widths(problem: Problem) -> Array:

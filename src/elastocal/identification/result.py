@@ -39,6 +39,7 @@ from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
     OpenParameters,
+    Scatter,
     ShownPoses,
     mostly_prior,
     nominal_flange_rows,
@@ -289,6 +290,8 @@ class Calibration(scrutiny.FoundFit, Result):
         noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
             "visits" have in common.
         shown: How sure the fit is where it was measured; None of a large table.
+        scatter: The covariance that configurations tell, where no known noise explains the
+            residual.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -326,6 +329,7 @@ class Calibration(scrutiny.FoundFit, Result):
     predicted: PredictedError | None = None
     copies: tuple[int, ...] = ()
     shown: ShownPoses | None = None
+    scatter: Scatter | None = None
 
     @property
     def covariance(self) -> Array:
@@ -522,7 +526,7 @@ class Calibration(scrutiny.FoundFit, Result):
             self.model, self.x, self.determined, self.covariance, self.observations.table.source,
             tuple(map(_estimate_json, self.estimates)), self.left, lacking,
             measured_loads(self.observations), self.shown, measured_visits(self.observations),
-            mostly_prior(self.prior_share),
+            mostly_prior(self.prior_share), self.scatter,
         )  # fmt: skip
 
     @cached_property
@@ -681,6 +685,7 @@ class Calibration(scrutiny.FoundFit, Result):
             "parameter_sets": self.parameter_sets(),
             "uncertainty": self.uncertainty(),
             **{name: getattr(self, name) for name in AS_THEY_ARE},
+            **({} if self.scatter is None else {"scatter": self.scatter}),
         })  # fmt: skip
 
 

@@ -112,6 +112,16 @@ class MeasuredVisits:
         }
 
 
+@record
+class Scatter:
+    """Covariance (K, K) of the determined parameters where configurations alone err independently
+    (CR2), and its degrees of freedom (K,)."""
+
+    more: ClassVar[str] = "ignore"
+    covariance: Matrix = keyed("a row for each parameter of covariance_of", required=True)
+    dof: Matrix = keyed("a number for each parameter of covariance_of", required=True)
+
+
 @dataclass(frozen=True, eq=False)
 class Valued:
     """A model and the values x (parameters,) to evaluate it at."""
@@ -164,6 +174,7 @@ class CalibratedArm(Valued, Saved):
         shown: How sure the fit is where it was measured; None in results that do not say.
         visits: The joints and forces measured; None in results that do not say.
         by_prior: Those of `determined` that owe more to a prior than to the readings.
+        scatter: What configurations say of them, where no known noise explains the residual.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -183,6 +194,7 @@ class CalibratedArm(Valued, Saved):
     shown: ShownPoses | None = None
     visits: MeasuredVisits | None = field(default=None, compare=False)  # rounded in files
     by_prior: tuple[str, ...] = ()
+    scatter: Scatter | None = None
 
     def __repr__(self) -> str:
         return (
@@ -277,7 +289,7 @@ def read_calibrated(
     told = f"{result_path}: schema is {quoted(schema)}, and {SCHEMA!r} is needed; {remedy}"
     require(schema == SCHEMA, told)
     try:
-        stated = checked(_Result, result, result_path)
+        stated = checked(_Result, {k: v for k, v in result.items() if v is not None}, result_path)
     except InputError as error:
         raise InputError(f"{error}; {ANEW}") from None
     given = [entry.name for entry in stated.parameters]
@@ -297,6 +309,11 @@ def read_calibrated(
         f"{result_path}: covariance of {stated.covariance.size} numbers for {n} names in "
         f"covariance_of; {ANEW}",
     )
+    scatter = stated.scatter
+    require(
+        scatter is None or (*scatter.covariance.shape, *scatter.dof.shape) == (n, n, n),
+        f"{result_path}: scatter is not of the names in covariance_of; {ANEW}",
+    )
     entries, visits = {e["name"]: e for e in result["parameters"]}, stated.measured_visits
     shape = None if visits is None else (len(visits.force), model.chain.n_joints)
     return CalibratedArm(
@@ -312,6 +329,7 @@ def read_calibrated(
         stated.measured_poses,
         visits if visits is not None and len(visits.q) and visits.q.shape == shape else None,
         mostly_prior(stated.prior_share or {}),
+        scatter,
     )
 
 
@@ -349,6 +367,7 @@ class _Result(Table, extra="ignore"):
     measured_poses: ShownPoses | None = key("a table")
     measured_visits: MeasuredVisits | None = key("a table")
     prior_share: dict[str, float | None] | None = key("a table of shares")
+    scatter: Scatter | None = key("a table")
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:
