@@ -250,7 +250,7 @@ class Functions:
         told = fit.posterior.effective[len(fit.reduction.kept) :][sized]
         away = ((fit.found.x[self.columns] - self.nominal) / self.std)[sized]
         own, unsure = own_size(away**2, told)
-        self.std, self.unsure = self.std * np.where(sized, own, 1.0), unsure * sized
+        self.std, self.unsure = self.std * np.where(sized, own, 1.0), np.where(sized, unsure, 0.0)
         return own > 1
 
 
@@ -508,6 +508,7 @@ class _Search:
         # of the prior as the size of this arm's errors is.
         unsure = np.append(np.full(k, f.unsure.max()), f.unsure[posterior.own])
         dof = 1 / np.maximum((1 - share) ** 2 / spare + 2 * unsure * share**2, 1e-6 / spare)
+        dof[:k] = np.minimum(dof[:k], spare)
         text = (
             "of readings and smooth functions together, the functions as random as their sizes "
             "say; assumes the noise model and normal noise"
