@@ -122,16 +122,21 @@ def test_nothing_is_claimed_where_there_are_no_curves():
         assert "do not show" in note
 
 
-def test_what_readings_do_not_show_is_known_by_its_size() -> None:
+@pytest.mark.parametrize("errors", [1, 5])
+def test_what_readings_do_not_show_is_known_by_the_size_of_errors(errors: float) -> None:
     """Not by how a nearly free exchange of two parameters bends the readings."""
     effects = (*PLACED, "joint_offset", "link_geometry", "joint_curve:joint2", "joint_curve:joint3")
     nominal, chain = Nominal(settings=dict.fromkeys(JOINTS[1:], CURVE)), kr270_chain()
     cell, rng = kr270_cell(effects, nominal=nominal), np.random.default_rng(2)
     m = Model.assembled(chain, replace(cell, tool=Tool(np.zeros(3), {"M1": np.array([0, 0, 0.1])})))
-    x = m.nominal + [(p.typical or 1e-3) * rng.normal() for p in m.parameters]
+    sizes = np.array([p.typical or 1e-3 for p in m.parameters]) * np.where(m.shrunk, 1, errors)
+    x = m.nominal + sizes * rng.normal(size=len(sizes))
     table = table_at(random_poses(chain, 60, 1), ((0, 0, 0),), ("M1",))
     fit = identify(m, measured(m, table, x, 5e-5, rng))
-    assert all(fit[n].std < 3e-3 for n in m.names if not m.shrunk[m.names.index(n)])
+    own = [k for k, name in enumerate(m.names) if not m.shrunk[k]]
+    std = np.array([fit[m.names[k]].std for k in own])
+    assert (std < 3 * sizes[own]).all()
+    assert ((fit.x - x)[own] / std).std() < 1.4
 
 
 # Weights that nobody knows and the compliances that they bend: a product, fitted as one.

@@ -28,7 +28,7 @@ from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Course, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates, own_size
 from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import Part, Problem, RFactor, same_size
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
@@ -217,15 +217,19 @@ class Functions:
     """What of the parameters `free` has a prior: columns (shrunk,), in groups (shrunk,) of one
     scale each.
 
-    First the smooth functions `groups`, then parameters of known size, `sized`, those of an effect
-    at a place that have one unit together.
+    First the smooth functions `groups`, then parameters that deviate from nominal by a size that is
+    known, to either side, those of an effect at a place that have one unit together.  A minimal
+    complete set of these, the rest held at nominal, fits the poses measured as well, but far from
+    them it goes anywhere: each that is kept stands for all that are not, where these poses cannot
+    tell them apart.  None are where nothing would be left without a prior.
     """
 
-    def __init__(self, model: Model, free: IntArray, sized: IntArray) -> None:
+    def __init__(self, model: Model, free: IntArray) -> None:
         self.groups = [g for g in smooth_groups(model) if np.isin(g.columns, free).any()]
         columns = [c[np.isin(c, free)] for c in (g.columns.ravel() for g in self.groups)]
-        alike: dict[tuple[str, str, str], list[int]] = {}
-        for c in sized.tolist():
+        own, alike = ordinary(model, free), dict[tuple[str, str, str], list[int]]()
+        sized = own[deviates(model)[own]]
+        for c in sized.tolist() if len(sized) < len(own) else ():
             p = model.parameters[c]
             alike.setdefault((p.effect, p.where, p.unit), []).append(c)
         columns += [np.array(same) for same in alike.values()]
@@ -233,20 +237,21 @@ class Functions:
         self.columns = np.concatenate(columns)
         self.std = np.array([model.parameters[c].typical for c in self.columns], dtype=float)
         self.nominal = model.nominal[self.columns]
+        self.unsure: Array = np.zeros(len(self.columns))
 
+    def as_large_as(self, fit: JointFit) -> bool:
+        """Whether this arm's errors beside the functions are larger than typical (`own_size`): then
+        parameters of known size are so from here on, `unsure` (shrunk,) the variance of log size.
 
-def sized_of(model: Model, free: IntArray) -> IntArray:
-    """Those of the parameters `free` that deviate from nominal by a size that is known, to either
-    side.
-
-    Beside smooth functions these are random as well.  A minimal complete set, the rest held at
-    nominal, fits the poses measured as well, but far from them it goes anywhere: each that is kept
-    stands for all that are not, where these poses cannot tell them apart.  None are where nothing
-    would be left without a prior.
-    """
-    own = ordinary(model, free)
-    found = own[deviates(model)[own]]
-    return found if len(found) < len(own) else found[:0]
+        An estimate varies by its prior variance less what is left of that: by the share that the
+        readings determine.
+        """
+        sized = self.group >= len(self.groups)
+        told = fit.posterior.effective[len(fit.reduction.kept) :][sized]
+        away = ((fit.found.x[self.columns] - self.nominal) / self.std)[sized]
+        own, unsure = own_size(away**2, told)
+        self.std, self.unsure = self.std * np.where(sized, own, 1.0), np.where(sized, unsure, 0.0)
+        return own > 1
 
 
 @dataclass(frozen=True)
@@ -301,20 +306,11 @@ class JointFit:
 
 def fit_smooth(course: Course) -> MethodResult:
     """All free parameters fitted together, from fits of the ordinary ones alone."""
-    sound, free, problem, tried = course.sound, course.free, course.every.problem, []
-    model, size = problem.model, problem.observations.size
-    for sized in (sized_of(model, free), free[:0]):
-        course.progress("fitting smooth functions")
-        search = _Search(course, Functions(model, free, sized))
-        fit, noise, good = search.settled(~course.faulty)
-        fit, cross = search.without_those_that_harm(fit)
-        held = rms_3d(cross[0], size)
-        tried.append((not fit.found.converged, held, search, (fit, cross, noise, good)))
-        # A prior that leads astray predicts worse than the ordinary parameters alone.
-        if not len(sized) or (fit.found.converged and held <= rms_3d(sound.crossed[0], size)):
-            break
-    _, _, search, parts = min(tried, key=lambda one: one[:2])
-    return search.result(*parts)
+    course.progress("fitting smooth functions")
+    search = _Search(course)
+    fit, noise, good = search.settled(~course.faulty)
+    fit, cross = search.without_those_that_harm(fit)
+    return search.result(fit, cross, noise, good)
 
 
 def _followed(observed: Observations, group: SmoothGroup) -> Array:
@@ -329,12 +325,12 @@ def _followed(observed: Observations, group: SmoothGroup) -> Array:
 
 
 class _Search:
-    def __init__(self, course: Course, functions: Functions) -> None:
+    def __init__(self, course: Course) -> None:
         self.every, self.options, self.progress = course.every, course.options, course.progress
         every, sound = course.every, course.sound
         self.model, self.observed = every.problem.model, every.problem.observations
-        self.functions, self.harmful = functions, list[str]()
-        own = np.setdiff1d(sound.problem.free, functions.columns)
+        self.functions, self.harmful = Functions(self.model, course.free), list[str]()
+        own = np.setdiff1d(sound.problem.free, self.functions.columns)
         problem = replace(sound.problem, free=own, sizes=every.problem.sizes)
         self.sound = replace(
             sound, fit=replace(sound.fit, problem=problem), reduction=sound.reduction.among(own)
@@ -428,6 +424,8 @@ class _Search:
             same = noise is None or noise.kind == kind
             if still and same and np.array_equal(before, good):
                 break
+            if k == 0 and self.functions.as_large_as(fit):  # and begin anew with these sizes
+                scales = replace(scales, scale=np.ones_like(scales.scale))
             if noise is not None:  # in units of which rows are whitened next
                 scales = replace(scales, variance=1.0)
                 self.progress(f"fitting with the noise found ({noise.kind})")
@@ -506,9 +504,11 @@ class _Search:
         )  # fmt: skip
         effective, share = float(posterior.effective.sum()), posterior.prior_share
         spare = max(len(found.whitened) - effective, 1.0)
-        # The noise's variance is known as well as the readings that the fit has left over say.
-        dof = spare / np.maximum(1 - share, 1e-3) ** 2
-        dof[:k] = spare
+        # The noise's variance is known as well as the readings that the fit has left over say, that
+        # of the prior as the size of this arm's errors is.
+        unsure = np.append(np.full(k, f.unsure.max()), f.unsure[posterior.own])
+        dof = 1 / np.maximum((1 - share) ** 2 / spare + 2 * unsure * share**2, 1e-6 / spare)
+        dof[:k] = np.minimum(dof[:k], spare)
         text = (
             "of readings and smooth functions together, the functions as random as their sizes "
             "say; assumes the noise model and normal noise"

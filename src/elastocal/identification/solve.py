@@ -419,13 +419,30 @@ SIZE_VARIANCE = CLIPPED_VARIANCE / (2 * _WITHIN) ** 2
 SIZE_STEPS = 100
 
 
+def own_size(square: Array, told: Array) -> tuple[float, float]:
+    """Size of an arm's errors in typical ones, 1 where they are not certainly larger, and the
+    variance of its logarithm: of the `square` (n,) of each, in that of its typical size, whose mean
+    is `told` (n,) where errors are typical.
+
+    It resists a joint that lost its zero: squares count up to CLIP² of it (Huber 1964, Ann. Math.
+    Statist. 35, proposal 2).
+    """
+    count = float(told.sum())
+    most = CLIPPED_MEAN + special.ndtri(CERTAIN) * np.sqrt(CLIPPED_VARIANCE / max(count, 1))
+    if np.minimum(square, CLIP**2 * told).sum() <= most * count:
+        return 1.0, 0.0
+    own = square.sum() / (CLIPPED_MEAN * count)
+    for _ in range(SIZE_STEPS):
+        own = np.minimum(square, CLIP**2 * own * told).sum() / (CLIPPED_MEAN * count)
+    return float(np.sqrt(own)), SIZE_VARIANCE / count
+
+
 def of_this_arm(solution: Solution, std: Array) -> tuple[Solution, float]:
     """The same with the sizes of what is held as large as the errors of this arm, where those are
     larger than typical; `std` (kept,) of the estimates.  And the variance of that size's logarithm.
 
     Of every kept parameter that `deviates`, |X − nominal| over the deviation that typical errors,
-    its own and of those it stands for, and the noise give it.  Their size resists a joint that lost
-    its zero: squares count up to CLIP² of it (Huber 1964, Ann. Math. Statist. 35, proposal 2).
+    its own and of those it stands for, and the noise give it.
     """
     fit, problem, chosen = solution.fit, solution.problem, solution.reduction
     kept, sizes, known = chosen.kept, problem.sizes, deviates(problem.model)
@@ -433,16 +450,11 @@ def of_this_arm(solution: Solution, std: Array) -> tuple[Solution, float]:
     variance = sizes[kept] ** 2 + (shares**2).sum(axis=1) + std**2
     square = (fit.x - problem.model.nominal)[kept] ** 2 / variance
     square = square[known[kept] & ~np.isin(kept, chosen.with_prior)]
-    chance = np.sqrt(CLIPPED_VARIANCE / max(len(square), 1))
-    most = CLIPPED_MEAN + special.ndtri(CERTAIN) * chance
-    if np.minimum(square, CLIP**2).sum() <= most * len(square):
-        return solution, 0.0
-    own = square.max()
-    for _ in range(SIZE_STEPS):
-        own = np.minimum(square, CLIP**2 * own).mean() / CLIPPED_MEAN
-    sizes = np.where(known, np.sqrt(own), 1.0) * sizes
-    sized = replace(fit, problem=replace(problem, sizes=sizes))
-    return replace(solution, fit=sized), SIZE_VARIANCE / len(square)
+    own, unsure = own_size(square, np.ones(len(square)))
+    if own > 1:
+        problem = replace(problem, sizes=np.where(known, own, 1.0) * sizes)
+        solution = replace(solution, fit=replace(fit, problem=problem))
+    return solution, unsure
 
 
 def posed(
