@@ -30,29 +30,14 @@ from elastocal.identification.scrutiny import BudgetStep
 HOSTILE = "<script>alert(1)</script>\x1b[31m"
 
 ECCENTRICITY = FoundEffect(
-    effect="gear_eccentricity",
-    where="joint2",
-    probability=0.981,
-    gap_reduction=0.752,
-    gap_reduction_ci90=(0.65, 0.82),
-    gap_reduction_ci95=(0.63, 0.84),
-    parameters=(
-        FittedParameter("joint2.eccentricity_sin", 1.12e-4, "rad", 6e-6),
-        FittedParameter("joint2.eccentricity_cos", -4.1e-5, "rad", 7e-6),
-    ),
-    settings={},
-)
-
+    "gear_eccentricity", "joint2", 0.981, 0.752, (0.65, 0.82), (0.63, 0.84),
+    (FittedParameter("joint2.eccentricity_sin", 1.12e-4, "rad", 6e-6),
+     FittedParameter("joint2.eccentricity_cos", -4.1e-5, "rad", 7e-6)), {},
+)  # fmt: skip
 JUMP = FoundEffect(
-    effect="encoder_jump",
-    where="joint1",
-    probability=0.91,
-    gap_reduction=0.12,
-    gap_reduction_ci90=(0.06, 0.18),
-    gap_reduction_ci95=(0.05, 0.19),
-    parameters=(FittedParameter("joint1.jump", 1.4e-4, "rad", 1.1e-5),),
-    settings={"jump_time_s": 4325.5},
-)
+    "encoder_jump", "joint1", 0.91, 0.12, (0.06, 0.18), (0.05, 0.19),
+    (FittedParameter("joint1.jump", 1.4e-4, "rad", 1.1e-5),), {"jump_time_s": 4325.5},
+)  # fmt: skip
 
 CANDIDATES = (
     Candidate("gear_eccentricity", "joint2", "transmission", 0.981, 161.4, 21.0, {}),
@@ -74,27 +59,16 @@ STRUCTURE = (
 )
 
 LOCATION = Location(
-    stage="transmission",
-    where="joint2",
-    probability=0.984,
-    stages={"transmission": 0.984, "load": 0.015, "compliance": 0.001},
-    places={"joint2": 0.985, "link2": 0.012, f"marker:{HOSTILE}": 0.003},
-    drivers={"joint2 angle": 0.0005},
-)
+    "transmission", "joint2", 0.984, {"transmission": 0.984, "load": 0.015, "compliance": 0.001},
+    {"joint2": 0.985, "link2": 0.012, f"marker:{HOSTILE}": 0.003}, {"joint2 angle": 0.0005},
+)  # fmt: skip
 
+FAULTY = FaultyReading(41, HOSTILE, "M1", 0.4e-3, 22.0), FaultyReading(88, "29", "M3", 1.3e-3, 71.0)
 NOISE = NoiseFloor(
-    stated=True,
-    stated_factor=1.12,
-    ratio_to_stated=1.2,
-    reading_sigma=18.4e-6,
-    repeatability=(6.1e-6, 5.2e-6, 7.0e-6, 0.0, 9.4e-6, 4.4e-6),
-    shared=0.5,
-    pure_error=17.6e-6,
-    faulty=(
-        FaultyReading(41, HOSTILE, "M1", 0.4e-3, 22.0),
-        FaultyReading(88, "29", "M3", 1.3e-3, 71.0),
-    ),
-)
+    stated=True, stated_factor=1.12, ratio_to_stated=1.2, reading_sigma=18.4e-6,
+    repeatability=(6.1e-6, 5.2e-6, 7.0e-6, 0.0, 9.4e-6, 4.4e-6), shared=0.5,
+    pure_error=17.6e-6, faulty=FAULTY,
+)  # fmt: skip
 
 EXPLAINED = Diagnosis(
     verdict="explained",
@@ -116,17 +90,11 @@ EXPLAINED = Diagnosis(
     probability_nothing=1e-12,
     probability_unknown=0.001,
     p_value=0.0004,
-    untested=(
-        Untested(
-            "hysteresis", "joint1", "the table has no approach direction",
-            "record the direction of the last motion (approach_1 …) and repeat poses from both "
-            "sides",
-        ),
-        Untested(
-            "hysteresis", "joint2", "the table has no approach direction",
-            "record the direction of the last motion (approach_1 …) and repeat poses from both "
-            "sides",
-        ),
+    untested=tuple(
+        Untested("hysteresis", joint, "the table has no approach direction",
+                 "record the direction of the last motion (approach_1 …) and repeat poses from "
+                 "both sides")
+        for joint in ("joint1", "joint2")
     ),
     warnings=(f"marker {HOSTILE} was seen in 3 poses only",),
     n_readings=360,
