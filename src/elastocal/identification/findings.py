@@ -146,6 +146,13 @@ def _trust(found: tuple[Finding, ...]) -> Finding:
     return _good("trust", use, because=())
 
 
+# Of the residual: known noise explains it.
+KNOWN_NOISE = {
+    "residual_agrees_with_stated_noise", "residual_below_stated_noise",
+    "residual_agrees_with_readings",
+}  # fmt: skip
+
+
 def _explained(result: Calibration, noise: list[Finding]) -> bool:
     """Whether the noise explains what is left, by the findings on it, and held-out poses agree.
 
@@ -153,11 +160,7 @@ def _explained(result: Calibration, noise: list[Finding]) -> bool:
     """
     told = {f.kind for f in noise}
     lacking = any(f.kind == "lack_of_fit" and f.severity == "care" for f in noise)
-    stated = told & {
-        "residual_agrees_with_stated_noise", "residual_below_stated_noise",
-        "residual_agrees_with_readings",
-    }  # fmt: skip
-    agrees = bool(stated) or ("noise_not_compared" in told and "repeats_agree" in told)
+    agrees = bool(told & KNOWN_NOISE) or {"noise_not_compared", "repeats_agree"} <= told
     expected = result.residual_rms * _overfitted(result)
     return agrees and not lacking and result.heldout_rms <= FLATTERS * expected
 

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from elastocal.errors import ElastocalError, option, said_of
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import judged
+from elastocal.identification.findings import KNOWN_NOISE, judged
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
@@ -321,15 +321,11 @@ def uncertainty_of(
     return np.asarray(np.sqrt(np.bincount(code, each) / np.bincount(code)))
 
 
-EXPLAINED = {
-    "residual_agrees_with_stated_noise", "residual_agrees_with_readings", "repeats_agree",
-}  # fmt: skip
-
-
 def _scatter(result: Calibration, solution: Solution, options: Options) -> Scatter | None:
     """None where known noise explains the residual, where more than readings holds estimates, and
     where configurations err alike in time, or one of them alone holds a parameter."""
-    explained = solution.exact or not EXPLAINED.isdisjoint(f.kind for f in result.findings)
+    told = {f.kind for f in result.findings}
+    explained = solution.exact or told & {*KNOWN_NOISE, "repeats_agree"}
     held = result.prior_share or result.smooth or result.active or options.intervals != "auto"
     alike = result.weights.together is not None or result.observations.n_configurations < 2
     if explained or held or alike:
