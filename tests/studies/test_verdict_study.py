@@ -31,4 +31,5 @@ def test_where_screening_leaves_too_little_all_readings_are_judged():
 def test_what_has_too_few_readings_is_refused_or_not_trusted():
     assert study.run({"number": 3}, np.random.default_rng(0))["refused"]
     row = study.run({"number": 4}, np.random.default_rng(0))
-    assert row["tone"] == "poor" and "few_configurations" in row["missing"]
+    assert row["tone"] == "care" and "few_configurations" in row["missing"]
+    assert row["true_um"] < row["heldout_um"] < 2 * row["true_um"]
