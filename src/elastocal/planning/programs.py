@@ -109,7 +109,7 @@ def driven(steps: Sequence[Step], lower: Array, upper: Array) -> list[Step]:
                 f"step {k + 1} moves joint {j + 1} to {value:.6g}°, outside its limits "
                 f"[{low:.6g}, {high:.6g}]°; give poses inside them",
             )
-    inner = lower + DIGIT, upper - DIGIT
+    inner = np.minimum(lower + DIGIT, upper), np.maximum(upper - DIGIT, lower)  # some stand still
     return [(kind, np.clip(v, *inner) if kind == "move" else v, note) for kind, v, note in steps]
 
 
