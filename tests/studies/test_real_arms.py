@@ -126,4 +126,4 @@ def test_iiwa_without_springs_is_found_to_bend_at_joint_2(folder, cell, calibrat
     assert found["verdict"] == "explained"
     assert "base" in {e["where"] for e in (*found["effects"], *found["fields"])}
     assert "joint1" not in {e["where"] for e in found["effects"]}
-    assert first["gap_reduction_ci95"][0] > 0  # beside a curve of the same joint, which has most
+    assert first["gap_reduction_ci95"][0] > 0  # beside a curve of the same joint
