@@ -28,8 +28,8 @@ counts as noise of each.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -39,7 +39,7 @@ from scipy import linalg, special
 
 from elastocal.above import Result, checked_arguments
 from elastocal.errors import InsufficientDataError, option, require
-from elastocal.identification.least_squares import correlations
+from elastocal.identification.least_squares import correlations, moved, variance_of
 from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN
@@ -57,12 +57,13 @@ from elastocal.model.calibrated import (
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import smooth_groups
 from elastocal.text import listed, size_of
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 SCHEMA = "elastocal/comparison/1"
 LEVEL = 0.05  # chance that anything is called changed where nothing is
 UNKNOWN = 1e3  # standard deviations of an estimate: its parameter has no typical size
-TIED, SAME = 1e-13, 1e-3  # least eigenvalue of correlations; standard deviations
+TIED = 1e-13  # least eigenvalue of correlations: below, constraints fix a sum
+SAME = 1e-3 / TIED**0.5  # in its deviations, of the difference of two such sums
 STANDS_FOR = 0.1  # of the largest deviation in a sum: a part of it
 CENTRAL = 0.95
 NAMED = 4  # parameters in a message
@@ -290,11 +291,10 @@ def _compared(
     load = cell.tool.load_point
     at = load if load.any() else next(iter(cell.tool.markers.values()), load)
     # The set-up of the old campaign for both.
-    values = before.values | {n: before.values[n] + d for n, d in zip(names, z, strict=True)}
-    moved = np.array([values[name] for name in before.model.names])
+    columns = np.array([before.model.names.index(name) for name in names])
     tool, tool_moved = (
         CalibratedTool(replace(old, model=before.model, x=x), ToolPoint(at, None, "tool"))
-        for x in (before.x, moved)
+        for x in (before.x, moved(before.x, columns, z))
     )
     rows = tool.rows(table)
     here, there = (each.poses(rows, table.q)[0] for each in (tool, tool_moved))
@@ -304,47 +304,42 @@ def _compared(
             f"none of {poses} random poses has a static equilibrium under the load; check "
             f"{option('load')}"
         )
-    columns = [before.model.names.index(name) for name in names]
     B = tool.sensitivity([row[settled] for row in rows], table.q[settled])[..., columns]
-    chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V[1], B))
     changes, p = _tested(old, new, names, functions, z, V, level, B)
     return Comparison(
-        old, new, changes, p, level, (there - here)[settled], chance, here[settled],
-        forces, whose, {*old.determined} & own != {*new.determined} & own, dict(left),
+        old, new, changes, p, level, (there - here)[settled], np.sqrt(variance_of(B, V[1])),
+        here[settled], forces, whose, {*old.determined} & own != {*new.determined} & own,
+        dict(left),
     )  # fmt: skip
 
 
-def _estimates(
-    arm: CalibratedArm, own: list[str], free: list[str]
-) -> tuple[IntArray, Array, Array, Array]:
-    """Which of the parameters `own` are `free` (k,), y (k,) and A (k, own) with y = A X + ε, and
-    N and V (2, k, k) of ε: noise, and what was left open of the set-up.
+def _estimates(arm: CalibratedArm, own: list[str]) -> tuple[IntArray, Array, Array, Array, Array]:
+    """Which of the parameters `own` it determined (k,), y (k,) and A (k, own) with y = A X + ε, N
+    and V (2, k, k) of ε: noise, and what was left open of the set-up; and the typical sizes (own,)
+    of those left open, 0 where none is known, −∞ for the others.
 
     Raises InputError where the covariance has no numbers.
     """
-    kept = np.array([k for k, name in enumerate(own) if name in free], dtype=np.int64)
-    at = [arm.determined.index(own[k]) for k in kept]
-    V = np.stack([arm.covariance, _covariance(arm)])[:, at][..., at]
+    # What constraints fix is held.
+    place = {name: i for i, name in enumerate(arm.determined) if arm.covariance[i, i] != 0}
+    kept = np.array([k for k, name in enumerate(own) if name in place], dtype=np.int64)
+    at = [place[own[k]] for k in kept]
+    V = np.stack([arm.covariance, arm.of_campaigns[0]])[:, at][..., at]
     A, values = np.eye(len(own))[kept], arm.values
     require(
         bool(np.isfinite(V).all() and (np.diagonal(V, axis1=1, axis2=2) > 0).all()),
         f"{arm.source}: its covariance has no numbers, or negative variances, for "
         f"{', '.join(own[:3])} …; identify anew",
     )
-    y = np.array([values[own[k]] for k in kept])
-    for name, shares, typical in _left_open(arm):
-        share = shares[at]
+    y, left = np.array([values[own[k]] for k in kept]), np.full(len(own), -np.inf)
+    open_ = arm.left and zip(arm.left.names, arm.left.mixing[at].T, arm.left.typical, strict=True)
+    for name, share, typical in open_ or ():
         if name in own:
-            A[:, own.index(name)] = share
+            A[:, own.index(name)], left[own.index(name)] = share, typical
             y += share * values[name]
         else:
             V = V + typical**2 * np.outer(share, share)
-    return kept, y, A, V
-
-
-def _left_open(arm: CalibratedArm) -> Iterator[tuple[str, Array, float]]:
-    if arm.left is not None:
-        yield from zip(arm.left.names, arm.left.mixing.T, arm.left.typical.tolist(), strict=True)
+    return kept, y, A, V, left
 
 
 def _difference(
@@ -355,33 +350,28 @@ def _difference(
     Raises InputError where users held a parameter at two values, or at one that the other campaign
     contradicts, or a covariance has no numbers.
     """
-    # What constraints fix is held as well.
-    free = [np.array(arm.determined)[np.diag(arm.covariance) != 0].tolist() for arm in (old, new)]
-    said = [{*free[i], *(n for n, _, _ in _left_open(arm))} for i, arm in enumerate((old, new))]
-    for name in (n for n in own if n not in said[0] | said[1]):
-        require(
-            bool(np.isclose(old.values[name], new.values[name], rtol=1e-9, atol=0.0)),
-            f"{name} is held at {old.values[name]:.6g} in {old.source} and at "
-            f"{new.values[name]:.6g} in {new.source}; identify both with the same value",
-        )
-    (first, y1, A1, V1), (second, y2, A2, V2) = map(_estimates, (old, new), (own, own), free)
+    found = (_estimates(arm, own) for arm in (old, new))
+    (first, y1, A1, V1, left1), (second, y2, A2, V2, left2) = found
     both, alone = np.intersect1d(first, second), np.setxor1d(first, second)
     # What both determined drops out of the differences, whatever it is: T of all estimates.
     of, side = np.append(first, second), np.repeat([-1.0, 1.0], [len(first), len(second)])
-    T = np.vstack([(both[:, None] == of) * side, alone[:, None] == of])
-    size, unknown = np.zeros((2, len(own)))
-    nominal = old.model.nominal[[old.model.names.index(name) for name in own]]
-    unknown[of] = UNKNOWN * np.sqrt(np.append(np.diag(V1[0]), np.diag(V2[0])))
-    for name, _, typical in (*_left_open(old), *_left_open(new)):
-        if name in own:
-            k = own.index(name)
-            # A session that determined it may have found it larger than typical.
-            found = max(abs(arm.values[own[k]] - nominal[k]) for arm in (old, new))
-            size[k] = max(size[k], float(np.hypot(typical, found)) if typical else unknown[k])
-    G, H = T @ np.vstack([A1, A2]), T[:, len(first) :] @ A2
+    T, A = np.vstack([(both[:, None] == of) * side, alone[:, None] == of]), np.vstack([A1, A2])
+    std, nominal = np.zeros(len(own)), old.model.nominal[[*map(old.model.names.index, own)]]
+    std[of] = np.sqrt(np.append(np.diag(V1[0]), np.diag(V2[0])))
+    values = np.array([[arm.values[name] for name in own] for arm in (old, new)])
+    left, off = np.maximum(left1, left2), np.abs(values - nominal).max(axis=0)
+    # A session that determined it may have found it larger than typical.
+    size = np.where(left > 0, np.hypot(left, off), UNKNOWN * std) * (left >= 0)
+    for k in np.flatnonzero((left < 0) & (std == 0)).tolist():
+        require(
+            math.isclose(*values[:, k]),
+            f"{own[k]} is held at {values[0, k]:.6g} in {old.source} and at {values[1, k]:.6g} in "
+            f"{new.source}; identify both with the same value",
+        )
+    G, H = T @ A, T[:, len(first) :] @ A2
     G[:, both] = 0.0
     t = T @ np.append(y1, y2) - G @ nominal
-    V = np.stack([T @ linalg.block_diag(*both) @ T.T for both in zip(V1, V2, strict=True)])
+    V = np.stack([T @ linalg.block_diag(*each) @ T.T for each in zip(V1, V2, strict=True)])
     V += (G * size**2) @ G.T
     # What the other held at a value that is no matter of chance, of as many as are held.
     spread, held = np.sqrt(np.diag(V[1])), max(int((size[alone] == 0).sum()), 1)
@@ -393,31 +383,34 @@ def _difference(
             f"{own[k]} is held in {one.source} at a value from which that of {other.source} is "
             f"{abs(off):.1f} standard deviations away; identify both with it free, or both held",
         )
-    rho, unit = correlations(V[0])
-    value, axes = np.linalg.eigh(rho)
-    # Sums that constraints fix in both do not vary.
-    white = axes.T / unit
+    white, fixed = _whitener(V[0], TIED)
     require(
-        bool((np.abs(white[value < TIED] @ t) < SAME).all()),
+        bool((np.abs(white[fixed] @ t) < SAME).all()),
         f"constraints fix a sum of parameters at one value in {old.source} and at another in "
         f"{new.source}; identify both with the same knowledge",
     )
-    white /= np.sqrt(np.maximum(value, TIED))[:, None]
-    W = white @ H
-    told = both.tolist()
+    W, told = white @ H, both.tolist()
     for k in alone.tolist():
         beside = W[:, told]
         off = W[:, k] - beside @ np.linalg.lstsq(beside, W[:, k], rcond=None)[0]
         if np.linalg.norm(off) * size[k] > WORTH_A_COLUMN:
             told.append(k)
-    length = np.linalg.norm(W[:, told], axis=0)
-    half = np.linalg.pinv(W[:, told] / length) / length[:, None]
     # What one that is told stands for is no less told.
-    shares = np.abs(np.vstack([A1, A2])[np.isin(of, np.intersect1d(alone, told))]) * size
+    shares = np.abs(A[np.isin(of, np.intersect1d(alone, told))]) * size
     covered = (shares > STANDS_FOR * shares.max(axis=1, initial=0.0)[:, None]).any(axis=0)
     hidden = [own[k] for k in alone if k not in told and not covered[k]]
-    K = half @ white
+    length = np.linalg.norm(W[:, told], axis=0)
+    K = np.linalg.pinv(W[:, told] / length) / length[:, None] @ white
     return [own[k] for k in told], K @ t, K @ V @ K.T, hidden
+
+
+def _whitener(V: Array, least: float) -> tuple[Array, BoolArray]:
+    """W (p, p) with W V Wᵀ = I, and which of its rows are sums that constraints fix: an eigenvalue
+    of the correlations below `least`, which stands in its place."""
+    rho, unit = correlations(V)
+    value, axes = np.linalg.eigh(rho)
+    white = axes.T / unit / np.sqrt(np.maximum(value, least))[:, None]
+    return white, np.asarray(value < least)
 
 
 def _tested(
@@ -429,18 +422,14 @@ def _tested(
     per unit at the tool."""
     N, V = spread
     std = np.sqrt(np.diag(V))
-    shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
-    both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
-    nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
-    nu = np.clip(nu, 1.0, 1e9)
+    (v1, dof1), (v2, dof2) = (_variances(arm, names) for arm in (old, new))
+    nu = np.clip((v1 + v2) ** 2 / np.maximum(v1**2 / dof1 + v2**2 / dof2, 1e-300), 1.0, 1e9)
     alone = 2 * special.stdtr(nu, -np.abs(z) / std)
 
     def together(at: list[int]) -> float:
-        rho, unit = correlations(N[np.ix_(at, at)])
-        value, axes = np.linalg.eigh(rho)
-        apart = value > 10 * TIED  # the rest is as constraints have it
-        white = axes[:, apart] / np.sqrt(value[apart]) / unit[:, None]
-        C, square = white.T @ V[np.ix_(at, at)] @ white, float(((z[at] @ white) ** 2).sum())
+        white, fixed = _whitener(N[np.ix_(at, at)], 10 * TIED)
+        white = white[~fixed]
+        C, square = white @ V[np.ix_(at, at)] @ white.T, float(((white @ z[at]) ** 2).sum())
         mean, dof = np.trace(C), float((nu[at] ** -0.5).mean() ** -2)
         return float(special.fdtrc(mean**2 / (C**2).sum(), dof, square / mean))
 
@@ -462,24 +451,17 @@ def _tested(
             (a, change, sd), unit = (float(v[at[0]]) for v in (x, z, std)), units[name]
             values = a, a + change, change, sd
         else:
-            noise = np.einsum("nik,kl,nil->ni", own, V[np.ix_(at, at)], own)
-            values, unit = (rms(own @ x[at]), rms(own @ (x + z)[at]), moves, rms(noise**0.5)), "m"
+            sd, unit = float(np.sqrt(variance_of(own, V[np.ix_(at, at)]).mean())), "m"
+            values = rms(own @ x[at]), rms(own @ (x + z)[at]), moves, sd
         changes.append(ParameterChange(
             name, unit, *values, single, in_family, in_family < level, moves, others.get(name, ()),
         ))  # fmt: skip
     return tuple(changes), together(list(range(len(z))))
 
 
-def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
-    variances = np.maximum(np.diag(_covariance(arm)), 0.0)
-    if (scatter := arm.scatter) is not None:
-        dofs = dict(zip(arm.determined, scatter.dof.tolist(), strict=True))
-    else:  # an older result states none: normal
-        dofs = {str(entry["name"]): float(entry.get("dof") or np.inf) for entry in arm.entries}
-    variance = dict(zip(arm.determined, variances, strict=True))
-    each = [(variance.get(name, 0.0), dofs.get(name, np.inf)) for name in names]
-    return np.array(each)[:, 0], np.array(each)[:, 1]
-
-
-def _covariance(arm: CalibratedArm) -> Array:
-    return arm.covariance if arm.scatter is None else arm.scatter.covariance
+def _variances(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
+    """Variances (p,) and their degrees of freedom; 0 of what it did not determine."""
+    V, dof = arm.of_campaigns
+    each = dict(zip(arm.determined, zip(np.diag(V), dof, strict=True), strict=True))
+    v, nu = np.array([each.get(name, (0.0, np.inf)) for name in names]).T
+    return v, nu

@@ -202,6 +202,15 @@ class CalibratedArm(Valued, Saved):
             f"parameters determined, from {self.source}>"
         )
 
+    @property
+    def of_campaigns(self) -> tuple[Array, Array]:
+        """Covariance and degrees of freedom of what campaigns find: those of `scatter`, else of the
+        noise model, normal where an older result states none."""
+        if self.scatter is not None:
+            return self.scatter.covariance, self.scatter.dof
+        dof = {entry["name"]: float(entry.get("dof") or np.inf) for entry in self.entries}
+        return self.covariance, np.array([dof.get(name, np.inf) for name in self.determined])
+
     @checked_arguments
     def pose(self, q: ArrayLike, load: ArrayLike | None = None) -> NDArray:
         """The flange's pose in the data's frame, deflections included.
