@@ -36,7 +36,7 @@ from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
 from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
-from elastocal.identification.solve import FAR
+from elastocal.identification.solve import FAR, far_off
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.manipulator import Model
@@ -422,13 +422,12 @@ def unheard_of(found: Sequence[FoundEffect], model: Model) -> Iterator[str]:
     nominal."""
     far = list[str]()
     for f in found:
-        for p in effect_of(f.effect).parameters(f.where, model.chain, model.cell):
-            value = next((v for v in f.parameters if v.name == f"{f.where}.{p.key}"), None)
-            if value is None or not p.typical or p.shrunk:
-                continue
-            off = abs(value.value - p.nominal)
-            if off - special.ndtri(0.975) * value.std > FAR * p.typical:
-                far.append(f"{value.name} ({rounded(off / p.typical, 2)} times)")
+        specs = effect_of(f.effect).parameters(f.where, model.chain, model.cell)
+        known = {f"{f.where}.{p.key}": p for p in specs if not p.shrunk}
+        for v in (v for v in f.parameters if v.name in known):
+            p, half = known[v.name], special.ndtri(0.975) * v.std
+            if times := far_off(v.value - p.nominal, half, p.typical):
+                far.append(f"{v.name} ({rounded(times, 2)} times)")
     if far:
         yield (
             f"more than {FAR:g} times as large as usual: {listed(far)}; confirm such a cause at "

@@ -19,7 +19,7 @@ from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding
 from elastocal.identification.sentences import AT_BOUND, made, more_poses
-from elastocal.identification.solve import FAR, Solution
+from elastocal.identification.solve import Solution, far_off
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import Parameter
@@ -281,12 +281,12 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
         typical[name] = math.hypot(*(share * typical[n] for n, share in c.terms.items()))
     half = {name: (high - low) / 2 for name, (low, high) in ends.items()}
     far = [
-        (p, float(x) - p.nominal)
-        for p, x in zip(result.model.parameters, result.x, strict=True)
+        (p, x - p.nominal, times)
+        for p, x in zip(result.model.parameters, result.x.tolist(), strict=True)
         if p.effect in STATED_BY_FILE and p.typical and p.name in half
-        and abs(float(x) - p.nominal) - half[p.name] > FAR * typical[p.name]
+        and (times := far_off(x - p.nominal, half[p.name], typical[p.name]))
     ]  # fmt: skip
-    zeros = [(p, off) for p, off in far if p.effect == JointOffset.name]
+    zeros = [(p, off) for p, off, _ in far if p.effect == JointOffset.name]
     if zeros:
         told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
                 f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
@@ -313,12 +313,10 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
         )
         yield _care("scale", remedy, readings_over_file=scale, likely=likely)
         return
-    sizes = {p.name: abs(off) / typical[p.name] for p, off in far}
-    others = [(p, off) for p, off in far if p.effect != JointOffset.name]
-    others.sort(key=lambda found: -sizes[found[0].name])
+    others = sorted((f for f in far if f[0].effect != JointOffset.name), key=lambda f: -f[2])
     if others:
         told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
-                for p, off in others]  # fmt: skip
+                for p, off, _ in others]  # fmt: skip
         compare = (
             "The arm is not the one of the robot's file: compare its lengths and angles with the "
             f"data sheet (off, and known to: {listed(told, 3)})."
@@ -326,10 +324,10 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
         yield (_note if explained else _care)(
             "far_from_nominal" if explained else "unheard_of",
             compare if explained else _lacking(result),
-            parameters=tuple(p.name for p, _ in others),
-            typical_sizes=tuple(sizes[p.name] for p, _ in others),
-            values=tuple(float(v) + p.nominal for p, v in others),
-            units=tuple(p.unit for p, _ in others), readings_set_apart=len(result.excluded),
+            parameters=tuple(p.name for p, *_ in others),
+            typical_sizes=tuple(times for *_, times in others),
+            values=tuple(off + p.nominal for p, off, _ in others),
+            units=tuple(p.unit for p, *_ in others), readings_set_apart=len(result.excluded),
         )  # fmt: skip
 
 

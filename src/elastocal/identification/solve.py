@@ -40,6 +40,12 @@ ROUNDING = 1e-9
 FAR = 10.0  # typical deviations from nominal, beyond which an arm that works has no parameter
 
 
+def far_off(off: float, half: float, typical: float | None) -> float:
+    """How many `typical` deviations a value is `off` nominal where its whole interval, ± half, is
+    off by more than FAR of them; else 0."""
+    return abs(off) / typical if typical and abs(off) - half > FAR * typical else 0.0
+
+
 @dataclass(frozen=True)
 class Reduction:
     """`kept` and `dropped` parameter indices; `mixing` (kept, dropped) with B_D ≈ B_K · mixing.
