@@ -22,13 +22,14 @@ from elastocal.identification.residuals import (
     predicts_better,
     rms_3d,
 )
+from elastocal.identification.start import nothing_shown
 from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
 from elastocal.measurements import numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.text import EXACT, length
+from elastocal.text import EXACT
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, and what the rest combine with.
@@ -171,27 +172,16 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
     return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
 
 
-FAR_OFF = 10.0  # times the median, which is more than any noise is
-
-
 def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) -> Reduction:
     """A minimal complete set of the free columns, as indices into all parameters.
 
     Raises InsufficientDataError where no column is worth keeping.
     """
-    observed, free = problem.observations, problem.free
+    free = problem.free
     parameters = tuple(problem.model.parameters[c] for c in free)
     local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
     if not len(local.kept):
-        off = problem.residual(problem.x0).reshape(-1, observed.size)[:, :3]
-        far = np.linalg.norm(off, axis=1)
-        told = "the readings do not depend on any parameter of the model; measure other poses or "
-        told += "loads, or choose other effects"
-        if far.max() > FAR_OFF * np.median(far):
-            line = observed.table.row[observed.lead[far.argmax()]]
-            told = f"no parameter shows beside the reading of line {line}, which is "
-            told += f"{length(far.max())} off: correct it, or drop it"
-        raise InsufficientDataError(f"{observed.table.source}: {told}")
+        raise nothing_shown(problem.observations, problem.residual(problem.x0))
     return replace(
         local, kept=free[local.kept], dropped=free[local.dropped], invisible=free[local.invisible]
     )

@@ -18,7 +18,7 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.placements import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.text import did_you_mean, listed, rounded
+from elastocal.text import did_you_mean, length, listed, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 # The linear map of readings onto the nominal arm.  With G_i m + t_i the nominal place of a marker
@@ -399,6 +399,22 @@ def _check_units(model: Model, table: Measurements) -> None:
         f"{table.source}: the readings extend over {rounded(extent * 1e3, 4)} mm, but the nominal "
         f"arm's flange moves over {rounded(reach * 1e3, 4)} mm at these joint values; {cause}"
     )
+
+
+FAR_OFF = 10.0  # times the median, which is more than any noise is
+
+
+def nothing_shown(observed: Observations, residual: Array) -> InsufficientDataError:
+    """Why no parameter moves the readings by more than what is left of them, `residual` (rows,):
+    one that is far off hides them all, or the poses show none."""
+    far = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
+    told = "the readings do not depend on any parameter of the model; measure other poses or loads,"
+    told += " or choose other effects"
+    if far.max() > FAR_OFF * np.median(far):
+        line = observed.table.row[observed.lead[far.argmax()]]
+        told = f"no parameter shows beside the reading of line {line}, which is "
+        told += f"{length(far.max())} off: correct it, or drop it"
+    return InsufficientDataError(f"{observed.table.source}: {told}")
 
 
 def _reach(model: Model, table: Measurements) -> float:
