@@ -365,10 +365,8 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
             yield Covariate("load × angle", f"load × joint{i + 1} angle", by_angle)
         if slow is not None:
             yield Covariate("load × time", "load × time", slow * load[:, :, None])
-    for i in joints:
-        if approach is None:
-            break
-        a, size = approach[:, :, i], np.abs(torque[:, :, i])
+    for i, a in enumerate(() if approach is None else np.moveaxis(approach, 2, 0)):
+        size = np.abs(torque[:, :, i])
         by = [a] if load is None else [a, a * load]
         if size.max() > 0:
             by.append(a * size / size.max())
@@ -381,10 +379,8 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
         yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
         if slow is not None:
             yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
-    for i in joints:
-        if slow is None:
-            break
-        product = few[i][:, :, :, None] * slow[:, :, None, :]
+    products = () if slow is None else [own[..., None] * slow[:, :, None] for own in few]
+    for i, product in enumerate(products):
         both = product.reshape(*product.shape[:2], -1)
         yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
 
