@@ -540,15 +540,11 @@ def tied_fit(problem: Problem, tolerance: float) -> Fit:
 
     Many readings start where such a fit to a sample of them ends.
     """
-    x = problem.x0
-    rough = _sampled(problem)
-    if rough is not problem:
-        found = _tied_from(rough, x, tolerance)
-        try:
+    if (rough := _sampled(problem)) is not problem:
+        found = _tied_from(rough, problem.x0, tolerance)
+        with suppress(ElastocalError):  # it may lead where other readings have no equilibrium
             return _tied_from(problem, found.x, tolerance, residual_sigma(found, 0))
-        except ElastocalError:
-            pass  # the sample has led where other readings have no equilibrium
-    return _tied_from(problem, x, tolerance)
+    return _tied_from(problem, problem.x0, tolerance)
 
 
 def _sampled(problem: Problem) -> Problem:
