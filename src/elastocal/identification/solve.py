@@ -234,11 +234,7 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     """
     problem, every = found.problem, found.of_free
     observed, sigma = problem.observations, residual_sigma(found, len(reduction.kept))
-
-    def predicts(before: Array, after: Array) -> bool:
-        own = observed.configuration, observed.size
-        return predicts_better(before, after, problem.weights, *own)
-
+    judges = problem.weights, observed.configuration, observed.size
     least = max(every.rest / np.sqrt(max(every.rows - every.columns, 1)), 1e-12)
     lost = least < MOSTLY * sigma
     wider = choose(problem, every, least if lost else sigma, WIDER)
@@ -251,7 +247,7 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     step = size * least_norm(own.R * size, own.projected, cond=own.rows * EPS)
     start = moved(found.x, wider.kept, step)
     linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
-    if not predicts(held, linear):
+    if not predicts_better(held, linear, *judges):
         return found, reduction
     try:
         wide = fit_kept(problem, start, wider, max_steps=30)
@@ -261,7 +257,7 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
         # come to rest where it is singular.
         return found, reduction
     better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-    if not better or not predicts(held, after):
+    if not better or not predicts_better(held, after, *judges):
         return found, reduction
     # What its zero hid may be worth a column now; each set is wider than the last.
     return prefer_wider(wide, wider) if lost else (wide, wider)
