@@ -707,11 +707,9 @@ def _held_out_rms(solution: Solution, judge: Solution) -> float:
     held = solution.crossed[0]
     if together is not None:
         block = dict(zip(judged.configuration.tolist(), together.tolist(), strict=True))
-        observed, weights = solution.problem.observations, solution.problem.weights
+        observed, fit = solution.problem.observations, solution.fit
         left_out = np.array([block.get(c, -1) for c in observed.configuration.tolist()])
-        if weights.together is not None:
-            weights = replace(weights, together=left_out)
-        fit = solution.fit
+        weights = replace(solution.problem.weights, together=left_out)
         held = held_out_residual(fit.B, fit.residual, weights, left_out, observed.size)
     known = held[np.isfinite(held)]
     return float(np.sqrt(np.mean(known**2)))
