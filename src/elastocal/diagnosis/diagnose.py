@@ -214,8 +214,7 @@ def _diagnosed(
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
     refuse_nonsense(model, base.observed, base.x, base.residual, table)
-    disordered = order_contradicted(table)
-    if disordered:
+    if disordered := order_contradicted(table):
         told = (*told, disordered + OUT_OF_ORDER)
         options = replace(options, without=(*options.without, *BY_LAST_MOVE))
     hypotheses, untested = possible(model, table, options.without)

@@ -103,8 +103,7 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     The statistic is the largest evidence among the covariate's blocks; its distribution without
     structure comes from flipping the signs of whole configurations.
     """
-    each = observed.covariates
-    if not each:
+    if not (each := observed.covariates):
         return ()
     odds = {covariate: float(own[0]) for covariate, own in each.items()}
     largest = np.max([own[1:] for own in each.values()], axis=0)
@@ -284,8 +283,7 @@ class FewAnswer(SumAnswer):
     def location(self, tests: Sequence[StructureTest]) -> Location | None:
         """Probabilities of stage and place, from all that could stand in the place of the unknown
         effect, or of the first one found."""
-        items = self.selected.chosen.items
-        if not items:
+        if not (items := self.selected.chosen.items):
             return None
         own = next((k for k, item in enumerate(items) if not item.known), 0)
         slot = self.selected.slots[own]

@@ -234,8 +234,7 @@ def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
 def _impossible(result: Calibration) -> Iterator[Finding]:
     """Values that no arm has.  Where most compliances are among them, no missing effect explains
     it, but loads in the opposite direction do, and no load is compensated rightly."""
-    found = impossible(result)
-    if not found:
+    if not (found := impossible(result)):
         return
     springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
     turned = [p for p, _ in found if p.effect == JointCompliance.name]
@@ -286,8 +285,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
         if p.effect in STATED_BY_FILE and p.typical and p.name in half
         and (times := far_off(x - p.nominal, half[p.name], typical[p.name]))
     ]  # fmt: skip
-    zeros = [(p, off) for p, off, _ in far if p.effect == JointOffset.name]
-    if zeros:
+    if zeros := [(p, off) for p, off, _ in far if p.effect == JointOffset.name]:
         told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
                 f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
         turned = zeros[-1][0].where == f"joint{result.model.chain.n_joints}"
@@ -300,8 +298,7 @@ def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
             joints=tuple(p.where for p, _ in zeros), values=tuple(v for _, v in zeros),
             units=tuple(p.unit for p, _ in zeros), ci95_half=tuple(half[p.name] for p, _ in zeros),
         )  # fmt: skip
-    scale = scale_of(result)
-    if scale is not None:
+    if (scale := scale_of(result)) is not None:
         other = abs(scale - 1) > OF_A_TARGET
         likely = "another robot" if other else "a scale error"
         remedy = (
@@ -399,8 +396,7 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
 
 
 def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
-    ratio = result.noise.ratio_to_stated
-    if ratio is None:
+    if (ratio := result.noise.ratio_to_stated) is None:
         yield _note("noise_not_compared", "" if _lacks_fit(result) else _state_noise(result))
         return
     tails, size, kurtosis = result.model.cell.noise.tails, result.observations.size, 0.0
@@ -553,8 +549,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
 
 def _beside_stated(key: str, found: list[tuple[noise_summary.NoiseSize, float]], fits: bool) -> str:
     """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
-    said = listed([rounded(1e6 * size) for _, size in found if size])
-    if not said:
+    if not (said := listed([rounded(1e6 * size) for _, size in found if size])):
         return f"State it as [noise] {key} in the cell for design and simulate."
     if all(size.agrees_with(stated) for size, stated in found):
         return f"It agrees with [noise] {key} of the cell ({said})."
@@ -741,8 +736,7 @@ def _test(result: Calibration) -> Iterator[Finding]:
 
 
 def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
-    found = exchanged(result.model, whole)
-    if found is not None:
+    if (found := exchanged(result.model, whole)) is not None:
         lines = whole.row[found.rows]
         fitted = np.isin(lines, result.observations.table.row).any()
         yield (_care if fitted else _note)(

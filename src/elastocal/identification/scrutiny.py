@@ -440,8 +440,7 @@ def _floor(result: FoundFit) -> tuple[float | None, str]:
     dof //= parts.shape[1]
     if dof >= FEWEST_REPEATS:
         return float(np.sqrt(square / dof)), "repeats alone"
-    ratio = result.noise.ratio_to_stated
-    if ratio:
+    if ratio := result.noise.ratio_to_stated:
         scatter = result.residual_rms * float(np.sqrt(len(result.residual) / result.dof))
         return scatter / float(ratio), "stated noise"
     return None, ""

@@ -369,8 +369,7 @@ def solve(
         kept = reduction.kept
         found = fit_kept(problem, found.x, reduction)
         sigma, r_factor = residual_sigma(found, len(kept)), found.of_free
-    left = reduction.seen(problem.free, r_factor.R, problem.sizes)
-    if left is not reduction:
+    if (left := reduction.seen(problem.free, r_factor.R, problem.sizes)) is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)
     if try_wider:
         progress("comparing with wider sets")

@@ -357,8 +357,7 @@ def check_limits(model: Model, table: Measurements) -> None:
             f"{rounded(np.abs(table.q[i]).max(), 4)} rad, more than two turns ({1 + len(more)} of "
             f"{len(table)} lines); {remedy}"
         )
-    beyond = beyond_limits(model.cell, model.chain, table.q, OVERSHOOT, 4)
-    if beyond is not None:
+    if (beyond := beyond_limits(model.cell, model.chain, table.q, OVERSHOOT, 4)) is not None:
         rows, _, told = beyond
         hint = "correct the line or the limits"
         if 2 * len(rows) > len(table):
@@ -429,8 +428,7 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
     """
     held = set()
     for name in fixed:
-        match = model.meant_by(name)
-        if not match:
+        if not (match := model.meant_by(name)):
             raise InputError(
                 f"{option('fixed', name)}: the model has no such parameter, place or effect"
                 f"{did_you_mean(name, model.all_names)}"
@@ -645,8 +643,7 @@ class Fallen:
 def fallen(model: Model, x: Array) -> Fallen | None:
     """The arm at x (parameters,), where its base lies far from upright; None where it does not, or
     no base was fitted."""
-    placed = as_placed(model, x)
-    if placed is model.cell:
+    if (placed := as_placed(model, x)) is model.cell:
         return None
     stated, found = (c.model.nominal.base_rotation for c in (model.cell, placed))
     mounted = np.eye(3) if stated is None else np.asarray(stated)

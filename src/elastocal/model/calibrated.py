@@ -248,8 +248,7 @@ def given_arm(name: str, given: Any) -> CalibratedArm:
 def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
     """The arm without smooth functions of the time, which are of one campaign, and their names."""
     model = arm.model
-    gone = [group.name for group in smooth_groups(model) if not group.lasting]
-    if not gone:
+    if not (gone := [group.name for group in smooth_groups(model) if not group.lasting]):
         return arm, ()
     cell = model.cell
     for name in dict.fromkeys(choice.name for choice in cell.model.effects):
