@@ -359,9 +359,9 @@ def _difference(
     std, nominal = np.zeros(len(own)), old.model.nominal[[*map(old.model.names.index, own)]]
     std[of] = np.sqrt(np.append(np.diag(V1[0]), np.diag(V2[0])))
     values = np.array([[arm.values[name] for name in own] for arm in (old, new)])
-    left, off = np.maximum(left1, left2), np.abs(values - nominal).max(axis=0)
+    left, away = np.maximum(left1, left2), np.abs(values - nominal).max(axis=0)
     # A session that determined it may have found it larger than typical.
-    size = np.where(left > 0, np.hypot(left, off), UNKNOWN * std) * (left >= 0)
+    size = np.where(left > 0, np.hypot(left, away), UNKNOWN * std) * (left >= 0)
     for k in np.flatnonzero((left < 0) & (std == 0)).tolist():
         require(
             math.isclose(*values[:, k]),
