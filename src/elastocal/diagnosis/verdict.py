@@ -137,7 +137,7 @@ class FewAnswer(SumAnswer):
         cls, before: DiagnosisData, selected: SelectedEffects, rng: np.random.Generator
     ) -> FewAnswer:
         found = sum_of(selected.dataset, selected.chosen)
-        return cls(before, selected.dataset, found, (), rng, selected)
+        return cls(before, selected.dataset, found, (), rng, {}, selected)
 
     @cached_property
     def rivals(self) -> tuple[Rivals, ...]:
