@@ -437,7 +437,7 @@ class SumAnswer:
 
     @cached_property
     def _replaced(self) -> dict[str, float]:
-        """Of kinds without which there is another sum the probability that this is the right one."""
+        """Of kinds without which there is another sum the probability that it is the right one."""
         return {
             kind: doubt(
                 self.found.score - other.score, gains(self.found.data, other.data, self.found.noise)

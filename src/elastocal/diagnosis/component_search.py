@@ -108,14 +108,13 @@ class Growth:
 
     def instead_of(self, kind: str, found: FittedSum) -> FittedSum:
         """What grows from the sum where this kind of cause does not exist."""
+        self.progress(f"what else may be at work than {kind}")
         gone = [c for c in found.components if c.effect.name == kind]
         every, others, tried = (
             [c for c in some if c.effect.name != kind]
             for some in (self.every, self.others, self.tried)
         )
-        bare = Growth(
-            self.dataset, every, others, tried, self.without | {kind}, self.progress
-        )
+        bare = Growth(self.dataset, every, others, tried, self.without | {kind}, self.progress)
         return bare.grown(_with_lines(self.dataset, exchanged(found, gone)))
 
 

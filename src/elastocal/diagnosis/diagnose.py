@@ -46,6 +46,7 @@ from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,
     candidates,
+    confirm,
     structure_tests,
     too_small,
     unheard_of,
@@ -259,7 +260,7 @@ def _diagnosed(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
             *warnings(dataset, found, suspects, answer.found.noise),
-            *unheard_of(answers["effects"], base.model),
+            *confirm(unheard_of(answers["effects"], base.model)),
         ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
@@ -294,8 +295,8 @@ def _sum_of_all(
     n_causes = len({(c.family, c.where) for c in answer.found.components})
     if over > CLEARLY + max(chosen.score - nothing, 0.0) and n_causes >= MANY:
         # What would have to be larger than on any arm has to be missed where it does not exist.
-        far = dict.fromkeys(p.effect for p, _ in unheard_of(answer.effects, few.before.base.model))
-        instead = {kind: growth.instead_of(kind, answer.found) for kind in far}
+        far = unheard_of(answer.effects, few.before.base.model)
+        instead = {kind: growth.instead_of(kind, answer.found) for kind, _ in far.values()}
         return replace(answer, instead=instead), over, ()
     causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
