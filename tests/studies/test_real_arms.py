@@ -123,7 +123,8 @@ def test_iiwa_without_springs_is_found_to_bend_at_joint_2(folder, cell, calibrat
     assert found["gap"]["explained_um"] < 500
     # Its base gives way as well, by name or without one beside encoder scales: not joint 1 across
     # its axis, which looks much the same.
-    assert found["verdict"] == "explained"
     assert "base" in {e["where"] for e in (*found["effects"], *found["fields"])}
     assert "joint1" not in {e["where"] for e in found["effects"]}
     assert first["gap_reduction_ci95"][0] > 0  # beside a curve of the same joint
+    # A backlash forty times as large as any is no certain name: lines of two joints do as well.
+    assert all(e["probability"] < 0.9 for e in found["effects"] if e["effect"] == "backlash")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +30,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import spans_of
+from elastocal.diagnosis.effect_search import doubt, gains, spans_of
 from elastocal.diagnosis.noise_floor import (
     NEW_POSES,
     SupportedFloor,
@@ -68,7 +68,7 @@ class SumAnswer:
 
     `before` has the columns of the cell's own parameters, `dataset` those beside the weights of
     links where the sum has them.  `hidden` may be there as well: shares and intervals, not names,
-    count with them.
+    count with them.  `instead` is what the sum would be if some kinds of it did not exist.
     """
 
     before: DiagnosisData
@@ -76,6 +76,7 @@ class SumAnswer:
     found: FittedSum
     hidden: tuple[Component, ...]
     rng: np.random.Generator
+    instead: Mapping[str, FittedSum]
 
     @cached_property
     def at(self) -> Projection:
@@ -426,7 +427,23 @@ class SumAnswer:
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]
                 sets.append(tuple(EffectAt(*key) for key in keys))
+        for kind, doubted in self._replaced.items():
+            if 1 - doubted < NAMED:
+                here = next((f.effect, f.where) for f in self.effects if f.effect == kind)
+                there = ((c.effect.name, c.where) for c in self.instead[kind].components if c.named)
+                new = dict.fromkeys(key for key in there if key not in self._at_place)
+                sets.append(tuple(EffectAt(*key) for key in (here, *new))[:3])
         return tuple(s for s in sets if len(s) > 1)
+
+    @cached_property
+    def _replaced(self) -> dict[str, float]:
+        """Of kinds without which there is another sum the probability that it is the right one."""
+        return {
+            kind: doubt(
+                self.found.score - other.score, gains(self.found.data, other.data, self.found.noise)
+            )
+            for kind, other in self.instead.items()
+        }
 
     @property
     def _unnamed(self) -> list[int]:
@@ -525,8 +542,9 @@ class SumAnswer:
         return np.asarray(expit(self.found.earned - self.found.sums.pool.costs))
 
     def _probability(self, k: int) -> float:
-        there = float(self._present[k])
-        hypothesis = self.found.components[k].hypothesis
+        c = self.found.components[k]
+        there, hypothesis = float(self._present[k]), c.hypothesis
+        there *= 1 - self._replaced.get(c.effect.name, 0.0)
         if k in self._rivals and hypothesis is not None:
             return there * self._rivals[k].get(hypothesis.key, CHANCE)
         return there

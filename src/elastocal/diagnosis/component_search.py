@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
@@ -67,12 +67,62 @@ LINE_SEARCHES, FIELD_SEARCHES, TWICE = 16, 3, 2
 MOST_FIELDS = 4  # that one search adds
 
 
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """What a sum beside the fitted parameters grows by: `every` component that may return, those
+    that may be there beside `others`, and curves with these, all that is `tried` from the start;
+    the effects `without` which to do, and whom `progress` is told."""
+
+    dataset: DiagnosisData
+    every: Sequence[Component]
+    others: Sequence[Component]
+    tried: Sequence[Component]
+    without: frozenset[str]
+    progress: Progress
+
+    def grown(self, found: FittedSum) -> FittedSum:
+        """The sum with what shows beside it, and without what this makes needless."""
+        dataset, few = self.dataset, len(self.dataset.blocks.member) <= FEW_POSES
+        self.progress("what shows now that the noise is smaller")
+        found = with_shorter_drifts(dataset, found)
+        again = with_returned(found, self.every)
+        if again is not found and few:
+            again = with_returned(_with_lines(dataset, again), self.every)
+        found = again
+        for _ in range(FIELD_SEARCHES):
+            self.progress("what has no name beside the components")
+            wider = _with_corrections(dataset, found, few, self.without)
+            if wider is found:
+                break
+            found = wider
+        self.progress("what can be left out")
+        found = completed(with_shorter_drifts(dataset, with_own_axes(found)), self.tried)
+        for _ in range(TWICE if few else 0):
+            before = with_likelier_orders(dataset, with_expected_families(dataset, found))
+            # Which of two laws the last move follows shows where the lines are right.
+            found = completed(before, self.tried)
+            if found.score <= before.score + GAINED:
+                break
+            found = _with_lines(dataset, found)
+        return with_likelier_names(dataset, found, self.others)
+
+    def instead_of(self, kind: str, found: FittedSum) -> FittedSum:
+        """What grows from the sum where this kind of cause does not exist."""
+        self.progress(f"what else may be at work than {kind}")
+        gone = [c for c in found.components if c.effect.name == kind]
+        every, others, tried = (
+            [c for c in some if c.effect.name != kind]
+            for some in (self.every, self.others, self.tried)
+        )
+        bare = Growth(self.dataset, every, others, tried, self.without | {kind}, self.progress)
+        return bare.grown(_with_lines(self.dataset, exchanged(found, gone)))
+
+
 def search_components(
-    dataset: DiagnosisData, chosen: ModelSet, open_: bool, without: Container[str] = (),
+    dataset: DiagnosisData, chosen: ModelSet, open_: bool, without: Collection[str] = (),
     progress: Progress = lambda message: None,
-) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]] | None:  # fmt: skip
-    """The most probable sum beside the fitted parameters, the data with all its columns, and what
-    may be there as well though these data do not show it.
+) -> tuple[Growth, FittedSum] | None:  # fmt: skip
+    """The most probable sum beside the fitted parameters, and what it has grown by.
 
     `chosen` is what the forward search found: its searched constants are tried as they are, the
     effects `without` not.  None where it leaves nothing `open_` and no sum beside it promises to be
@@ -107,29 +157,8 @@ def search_components(
         found = _with_lines_first(full, found, curves, others, tried, instrument)
     else:
         found = _with_lines(full, found)
-    progress("what shows now that the noise is smaller")
-    found = with_shorter_drifts(full, found)
-    again = with_returned(found, every)
-    if again is not found and few:
-        again = with_returned(_with_lines(full, again), every)
-    found = again
-    for _ in range(FIELD_SEARCHES):
-        progress("what has no name beside the components")
-        wider = _with_corrections(full, found, few, without)
-        if wider is found:
-            break
-        found = wider
-    progress("what can be left out")
-    found = completed(with_shorter_drifts(full, with_own_axes(found)), tried)
-    for _ in range(TWICE if few else 0):
-        before = with_likelier_orders(full, with_expected_families(full, found))
-        # Which of two laws the last move follows shows where the lines are right.
-        found = completed(before, tried)
-        if found.score <= before.score + GAINED:
-            break
-        found = _with_lines(full, found)
-    found = with_likelier_names(full, found, others)
-    return full, found, hidden_fellows(found, others)
+    growth = Growth(full, every, others, tried, frozenset(without), progress)
+    return growth, growth.grown(found)
 
 
 def _with_lines_first(

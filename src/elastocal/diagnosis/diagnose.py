@@ -17,7 +17,13 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
 from elastocal.diagnosis.baseline import NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
-from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
+from elastocal.diagnosis.component_search import (
+    CLEARLY,
+    Growth,
+    compared_score,
+    hidden_fellows,
+    search_components,
+)
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
 from elastocal.diagnosis.effect_search import (
@@ -40,6 +46,7 @@ from elastocal.diagnosis.verdict import (
     FewAnswer,
     beside_unknown,
     candidates,
+    confirm,
     structure_tests,
     too_small,
     unheard_of,
@@ -253,7 +260,7 @@ def _diagnosed(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
             *warnings(dataset, found, suspects, answer.found.noise),
-            *unheard_of(answers["effects"], base.model),
+            *confirm(unheard_of(answers["effects"], base.model)),
         ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
@@ -274,19 +281,23 @@ def _sum_of_all(
     chosen, nothing = found.chosen, found.nothing.score
     open_ = few.verdict == "unknown_effect" or few.supported.open
 
-    def summed(dataset: DiagnosisData, without: set[str]) -> tuple[SumAnswer, float] | None:
+    def summed(dataset: DiagnosisData, without: set[str]) -> tuple[SumAnswer, float, Growth] | None:
         if (searched := search_components(dataset, chosen, open_, without, progress)) is None:
             return None
-        full, total, hidden = searched
-        answer = SumAnswer(dataset, full, total, hidden, few.rng).decided
-        return answer, compared_score(full, total) - nothing
+        growth, total = searched
+        hidden = hidden_fellows(total, growth.others)
+        answer = SumAnswer(few.before, growth.dataset, total, hidden, few.rng, {}).decided
+        return answer, compared_score(growth.dataset, total) - nothing, growth
 
     if (searched := summed(few.before, {*options.without})) is None:
         return None, 0.0, ()
-    answer, over = searched
+    answer, over, growth = searched
     n_causes = len({(c.family, c.where) for c in answer.found.components})
     if over > CLEARLY + max(chosen.score - nothing, 0.0) and n_causes >= MANY:
-        return answer, over, ()
+        # What would have to be larger than on any arm has to be missed where it does not exist.
+        far = unheard_of(answer.effects, few.before.base.model)
+        instead = {kind: growth.instead_of(kind, answer.found) for kind, _ in far.values()}
+        return replace(answer, instead=instead), over, ()
     causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
     named = {(c.effect.name, c.where) for c in answer.found.components if c.effect.name in causes}
@@ -294,7 +305,7 @@ def _sum_of_all(
         # Names that the verdict does not know stand for what is unknown: searched without them.
         bare = replace(few.before, hypotheses=tuple(known))
         if (searched := summed(bare, {*options.without, *causes})) is not None:
-            answer, _ = searched
+            answer = searched[0]
     # Curves, lines and what has no name correct the arm though the verdict knows no cause of them.
     correcting = (f for f in answer.effects if corrects(effect_of(f.effect)))
     return None, 0.0, (*correcting, *answer.fields)

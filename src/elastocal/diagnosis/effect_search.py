@@ -310,9 +310,10 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     # Of the fitted parameters none is of play: their columns are those they were.
     under_other = replace(dataset, base=other, columns=columns)
     here, there = (_likeliest(d, noise) for d in (dataset, under_other))
-    if there.score <= here.score + ALIKE:
-        return replace(dataset, other_backlash=doubt(here, there))
-    return replace(under_other, other_backlash=doubt(there, here))
+    if there.score > here.score + ALIKE:
+        dataset, here, there = under_other, there, here
+    d = gains(here.data, there.data, here.noise)
+    return replace(dataset, other_backlash=doubt(float(d.sum()), d))
 
 
 def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
@@ -323,24 +324,26 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     return ModelSet(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 
 
-def doubt(better: ModelSet, other: ModelSet) -> float:
-    """Probability of the less likely model: the larger of 1/(1 + exp Σ d) and Φ(−Σ d / √Σ d²).
+def doubt(odds: float, d: Array) -> float:
+    """Probability of the less likely of two models: the larger of 1/(1 + exp L) and Φ(−L / √Σ d²).
 
-    d (configurations,) is what each adds to the log likelihood ratio under the noise of `better`.
-    Both models idealise what happens in the dead zone, so that one or two configurations there may
-    speak loudly for the wrong one; by the test of Vuong (1989, Econometrica 57) for models of which
-    none is quite true, their ratio counts against its own scatter.
+    L are the log odds, d (configurations,) what each adds to the log likelihood ratio.  Both models
+    idealise, so that a few configurations may speak loudly for the wrong one; by the test of Vuong
+    (1989, Econometrica 57) for models of which none is quite true, their ratio counts against its
+    own scatter.
     """
-    others = _squares(other.data, project(other.data, better.noise))
-    d = (others - _squares(better.data, better.at)) / 2
-    odds, scatter = max(float(d.sum()), 0.0), max(float(np.linalg.norm(d)), 1e-300)
+    odds, scatter = max(odds, 0.0), max(float(np.linalg.norm(d)), 1e-300)
     return float(max(expit(-odds), ndtr(-odds / scatter)))
 
 
-def _squares(data: NoisyData, at: Projection) -> Array:
-    """eᵀV⁻¹e of each configuration (C,) with what the fit leaves, e = r − Xβ."""
-    left = data.masked(data.r - data.X @ at.beta)
-    return np.asarray((left * at.u).sum(axis=1))
+def gains(better: NoisyData, other: NoisyData, noise: NoiseValues) -> Array:
+    """What each configuration (C,) adds to the log likelihood ratio under one noise, by eᵀV⁻¹e of
+    what each fit leaves, e = r − Xβ."""
+    squares = []
+    for data in (other, better):
+        at = project(data, noise)
+        squares.append((data.masked(data.r - data.X @ at.beta) * at.u).sum(axis=1))
+    return np.asarray((squares[0] - squares[1]) / 2)
 
 
 # What a search found: the set, what else could stand in each of its places, and the odds.

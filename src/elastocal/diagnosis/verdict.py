@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -137,7 +137,7 @@ class FewAnswer(SumAnswer):
         cls, before: DiagnosisData, selected: SelectedEffects, rng: np.random.Generator
     ) -> FewAnswer:
         found = sum_of(selected.dataset, selected.chosen)
-        return cls(before, selected.dataset, found, (), rng, selected)
+        return cls(before, selected.dataset, found, (), rng, {}, selected)
 
     @cached_property
     def rivals(self) -> tuple[Rivals, ...]:
@@ -415,20 +415,26 @@ def warnings(
     return tuple(out)
 
 
-def unheard_of(found: Sequence[FoundEffect], model: Model) -> Iterator[str]:
-    """Parameters of causes whose whole interval lies more than FAR typical deviations from
-    nominal."""
-    far = list[str]()
+def unheard_of(found: Sequence[FoundEffect], model: Model) -> dict[str, tuple[str, float]]:
+    """Parameters of causes whose whole interval lies more than FAR typical deviations from nominal,
+    by name: the effect, and by how many times it is larger than usual."""
+    far = dict[str, tuple[str, float]]()
     for f in found:
         specs = effect_of(f.effect).parameters(f.where, model.chain, model.cell)
         known = {f"{f.where}.{p.key}": p for p in specs if not p.shrunk}
         for v in (v for v in f.parameters if v.name in known):
             p, half = known[v.name], special.ndtri(0.975) * v.std
             if times := far_off(v.value - p.nominal, half, p.typical):
-                far.append(f"{v.name} ({rounded(times, 2)} times)")
+                far[v.name] = f.effect, times
+    return far
+
+
+def confirm(far: Mapping[str, tuple[str, float]]) -> Iterator[str]:
+    """What to do about causes that are unheard of."""
     if far:
+        each = [f"{name} ({rounded(times, 2)} times)" for name, (_, times) in far.items()]
         yield (
-            f"more than {FAR:g} times as large as usual: {listed(far)}; confirm such a cause at "
+            f"more than {FAR:g} times as large as usual: {listed(each)}; confirm such a cause at "
             "the arm before you rely on its name, as what the catalogue lacks may look like it"
         )
 
