@@ -427,12 +427,12 @@ class SumAnswer:
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]
                 sets.append(tuple(EffectAt(*key) for key in keys))
+        largest = {f.effect: (f.effect, f.where) for f in reversed(self.effects)}
         for kind, doubted in self._replaced.items():
-            if 1 - doubted < NAMED:
-                here = next((f.effect, f.where) for f in self.effects if f.effect == kind)
+            if kind in largest and 1 - doubted < NAMED:
                 there = ((c.effect.name, c.where) for c in self.instead[kind].components if c.named)
                 new = dict.fromkeys(key for key in there if key not in self._at_place)
-                sets.append(tuple(EffectAt(*key) for key in (here, *new))[:3])
+                sets.append(tuple(EffectAt(*key) for key in (largest[kind], *new))[:3])
         return tuple(s for s in sets if len(s) > 1)
 
     @cached_property
