@@ -69,9 +69,9 @@ MOST_FIELDS = 4  # that one search adds
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """What a sum beside the fitted parameters grows by: `every` component that may return, those
-    that may be there beside `others`, and curves with these, all that is `tried` from the start;
-    the effects `without` which to do, and whom `progress` is told."""
+    """What a sum beside the fitted parameters grows by: `every` component may return, `others` may
+    stand in the place of one, and what was `tried` from the start, curves too, completes a kind; it
+    does without the effects `without`."""
 
     dataset: DiagnosisData
     every: Sequence[Component]
