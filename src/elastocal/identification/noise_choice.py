@@ -46,7 +46,7 @@ from elastocal.model.observations import Observations, polar_axes
 from elastocal.units import Array, IntArray
 
 TINY = 1e-100  # stands for the variance of perfect data: its square is still a number
-LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
+LEAST_START = 1e-6  # a variance of a former fit that is smaller beside a new start is no start
 FEWEST_TELLING = 10  # degrees of freedom of repeats, from which on they tell the noise
 
 # Readings as rows.  Of R repeats the mean, times √R, holds all of Δx and of what they share; R − 1
@@ -124,19 +124,8 @@ class NoisyReadings:
 
     @property
     def may_vanish(self) -> list[int]:
-        """Variances that may be none: own ones together, the others still giving every reading
-        noise in every direction, and what is shared; without what drifts its waves have no prior.
-        """
-        theta = np.ones(self.own)
-        found: list[int] = []
-        if self.structure.index.shape[1] > 1 and not self.kind.shrunk:
-            for k in reversed(range(self.own)):  # the last that can be spared first
-                theta[k] = 0.0
-                if np.linalg.eigvalsh(self.structure.covariance(theta)).min() > 0:
-                    found.append(k)
-                else:
-                    theta[k] = 1.0
-        return found + [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
+        """Variances that may be none: what is shared; without what drifts its waves have no prior."""
+        return [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
 
     def model(self, prior: LogPrior | None = None) -> Mixed:
         """Packs of clusters of the sets: readings of a configuration that share anything are one.
@@ -187,12 +176,11 @@ class NoisyReadings:
         theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)
         if like is None:
             return theta
-        known = dict(zip(like.noisy.names, like.theta, strict=True))
+        known = dict(zip(like.noisy.names, like.theta.tolist(), strict=True))
         same = like.noisy.structure.names == self.structure.names
-        least = LEAST_START * float(like.own.max())
         for k, name in enumerate(self.names):
-            if (v := known.get(name, 0.0)) > (least if k < self.own else 0.0):
-                theta[k] = v if same or k >= self.own else theta[k]
+            if (same or k >= self.own) and known.get(name, 0.0) > LEAST_START * theta[k]:
+                theta[k] = known[name]
         return theta
 
 
@@ -267,24 +255,21 @@ def fitted(
         if lasting is None:
             tried = [fitted(readings, kind, like, each, enough) for each in record.lasting]
             return max(tried, key=lambda one: one.log_likelihood)
-    noisy, prior = NoisyReadings(readings, kind, lasting), None
-    start = noisy.start(like)
-    if kind.shrunk:
-        if TIME in kind.parts:
-            raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
-        prior = prior_of_groups(noisy)
-        if like is None or like.noisy.structure.names != noisy.structure.names:
-            start[: noisy.own] = np.exp(prior.mean)
+    noisy = NoisyReadings(readings, kind, lasting)
+    if not kind.shrunk:
+        return Fitted(noisy, None, noisy.start(like), enough)
+    if TIME in kind.parts:
+        raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
+    prior, start = prior_of_groups(noisy), noisy.start(like)
+    start[: noisy.own] = np.exp(prior.mean)
     return Fitted(noisy, prior, start, enough)
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
 #
 # Empirical Bayes in the spirit of Smyth 2004 (Stat. Appl. Genet. Mol. Biol. 3, 3), with a lognormal
-# prior that knows direction and configuration: log θ_ca = μ_a + u_c + v_ca, where u ~ N(0, ω_u) and
-# v ~ N(0, ω_v).  A sample variance s² on f degrees of freedom has log s² = log θ + ψ(f/2) −
-# log(f/2) plus scatter of variance ψ'(f/2), from which an analysis of variance finds μ, ω_u and
-# ω_v.
+# prior that knows the direction: log θ_ca ~ N(μ_a, ω).  A sample variance s² on f degrees of freedom
+# has log s² = log θ + ψ(f/2) − log(f/2) plus scatter of variance ψ'(f/2).
 
 FEWEST = 2.0  # degrees of freedom of a group, at the median, below which there is nothing to shrink
 NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
@@ -316,25 +301,17 @@ def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
     # A lucky group of (near) equal readings says little about its variance, not minus infinity.
     s2 = np.maximum(s2, max(1e-6 * float(np.median(s2)), TINY))
     z = (np.log(s2) - special.digamma(f / 2) + np.log(f / 2)).reshape(-1, size)
-    noise = special.polygamma(1, f / 2)
-    scatter, configurations = float(noise.mean()), len(z)
-    mean = np.average(z, axis=0, weights=1 / noise.reshape(-1, size))
-    u = (z - mean).mean(axis=1)
-    omega_u, omega_v = float((u**2).sum() / (configurations - 1)), 0.0
-    if size > 1:
-        within = float(((z - mean - u[:, None]) ** 2).sum())
-        omega_v = within / ((configurations - 1) * (size - 1)) - scatter
-    omega_u -= (max(omega_v, 0.0) + scatter) / size
-    block = max(omega_u, 0.0) * np.ones((size, size)) + max(omega_v, NARROWEST) * np.eye(size)
-    precision = np.kron(np.eye(configurations), np.linalg.inv(block)).astype(np.float64)
-    return LogPrior(np.tile(mean, configurations), precision)
+    noise = special.polygamma(1, f / 2).reshape(z.shape)
+    mean = np.average(z, axis=0, weights=1 / noise)
+    omega = ((z - mean) ** 2).sum() / (z.size - size) - noise.mean()
+    return LogPrior(np.tile(mean, len(z)), np.full(K, 1 / max(float(omega), NARROWEST)))
 
 
 def own_noise(found: Fitted, readings: Readings) -> tuple[Array, Array]:
     """Covariance (N, size, size) of single readings, be they those fitted or others, and degrees of
     freedom (N, size) behind it.  A variance that no reading of the fit has is the mean of all."""
     names = found.noisy.structure.names
-    structure = found.noisy.structure.model.structure(readings, names)
+    structure = STRUCTURES[found.noisy.kind.own].structure(readings, names)
     place = {name: k for k, name in enumerate(names)}
     known = np.array([place.get(name, -1) for name in structure.names])
     W = np.diag(found.covariance)[: found.noisy.own]
@@ -422,7 +399,7 @@ class NoiseFit:
         names: dict[str, list[str]] = {}
         for d, _ in self.fit.found:
             names.setdefault(d.part, []).append(d.name)
-        text = self.fit.noisy.structure.model.description
+        text = STRUCTURES[self.fit.kind.own].description
         for part, own in names.items():
             named = " / ".join([own[0], *(name.removeprefix(EACH_HAS) for name in own[1:])])
             text += PARTS[part][0].format(named)
