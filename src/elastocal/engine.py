@@ -149,7 +149,7 @@ class State:
 
 @dataclass(frozen=True)
 class LogPrior:
-    """Gaussian prior of the logarithms of the first k variances: `mean` and `precision` (k,)."""
+    """Gaussian prior of the logarithms of the first k variances: `mean` (k,), its `precision`."""
 
     mean: Array
     precision: Array
@@ -157,12 +157,14 @@ class LogPrior:
     def penalty(self, t: Array) -> tuple[float, Array]:
         """−2 log density at logarithms (K,) but for its constant, and the slope of that (k,)."""
         off = t[: len(self.mean)] - self.mean
-        slope = self.precision * off
+        slope = self.precision @ off
         return float(off @ slope), 2 * slope
 
     def curved(self, information: Array) -> Array:
         """Information (K, K) with that of the prior."""
-        return information + np.diag(np.pad(self.precision, (0, len(information) - len(self.mean))))
+        out, k = information.copy(), len(self.mean)
+        out[:k, :k] += self.precision
+        return out
 
 
 @dataclass(frozen=True)
@@ -394,8 +396,10 @@ class MixedFit:
         if prior is None:
             return found
         k = len(prior.mean)
-        wider = np.log(prior.precision).sum() - np.linalg.slogdet(self._curvature[:k, :k])[1]
-        return found - 0.5 * prior.penalty(np.log(self.theta[:k]))[0] + 0.5 * float(wider)
+        H = self._curvature[:k, :k]
+        log_dets = [float(np.linalg.slogdet(part)[1]) for part in (prior.precision, H)]
+        off = prior.penalty(np.log(self.theta[:k]))[0]
+        return found - 0.5 * off + 0.5 * (log_dets[0] - log_dets[1])
 
 
 # The least of a function of a few logarithms between limits, by steps of its information.

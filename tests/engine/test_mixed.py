@@ -168,8 +168,8 @@ def test_shrunk_variances_are_nearer_the_truth_and_their_likelihood_is_an_integr
     assert shrunk < 0.5 * plain
     # One log variance unknown, the others fixed by a narrow prior: quadrature against Laplace.
     noisy = NoisyReadings(groups(4, 12, 0.0, 0.0, 1)[0], Kind("groups"))
-    mean, precision = np.tile(MEAN, 4), np.full(12, 1e8)
-    precision[0] = 1 / 0.5
+    mean, precision = np.tile(MEAN, 4), np.diag(np.full(12, 1e8))
+    precision[0, 0] = 1 / 0.5
     found = MixedFit(noisy.model(LogPrior(mean, precision)), np.exp(mean))
     nodes, weights = np.polynomial.hermite_e.hermegauss(60)
     at = [np.exp(mean + np.sqrt(0.5) * z * (np.arange(12) == 0)) for z in nodes]

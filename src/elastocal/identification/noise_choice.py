@@ -124,7 +124,7 @@ class NoisyReadings:
 
     @property
     def may_vanish(self) -> list[int]:
-        """Variances that may be none: what is shared; without what drifts its waves have no prior."""
+        """Variances that may be none: what is shared, but the prior of what drifts."""
         return [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
 
     def model(self, prior: LogPrior | None = None) -> Mixed:
@@ -268,8 +268,8 @@ def fitted(
 # Many variances from few readings each: shrink their logarithms towards one another.
 #
 # Empirical Bayes in the spirit of Smyth 2004 (Stat. Appl. Genet. Mol. Biol. 3, 3), with a lognormal
-# prior that knows the direction: log θ_ca ~ N(μ_a, ω).  A sample variance s² on f degrees of freedom
-# has log s² = log θ + ψ(f/2) − log(f/2) plus scatter of variance ψ'(f/2).
+# prior that knows the direction: log θ_ca ~ N(μ_a, ω).  A sample variance s² on f degrees of
+# freedom has log s² = log θ + ψ(f/2) − log(f/2) plus scatter of variance ψ'(f/2).
 
 FEWEST = 2.0  # degrees of freedom of a group, at the median, below which there is nothing to shrink
 NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
@@ -304,7 +304,7 @@ def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
     noise = special.polygamma(1, f / 2).reshape(z.shape)
     mean = np.average(z, axis=0, weights=1 / noise)
     omega = ((z - mean) ** 2).sum() / (z.size - size) - noise.mean()
-    return LogPrior(np.tile(mean, len(z)), np.full(K, 1 / max(float(omega), NARROWEST)))
+    return LogPrior(np.tile(mean, len(z)), np.eye(K) / max(float(omega), NARROWEST))
 
 
 def own_noise(found: Fitted, readings: Readings) -> tuple[Array, Array]:
@@ -404,11 +404,6 @@ class NoiseFit:
             named = " / ".join([own[0], *(name.removeprefix(EACH_HAS) for name in own[1:])])
             text += PARTS[part][0].format(named)
         return text
-
-    def of_readings(self) -> NoiseFit:
-        tried = [t for t in self.trials if not Kind.parsed(t.kind).by_visit]
-        kind = min(tried, key=lambda t: t.criterion).kind
-        return replace(self, kind=kind, trials=tuple(tried), reason=_reason(kind, tried))
 
 
 def estimate_noise(

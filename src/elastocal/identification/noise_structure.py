@@ -250,6 +250,9 @@ class Readings:
 # What single readings scatter by: one variance, or several.
 
 
+Terms = Iterable[tuple[IntArray | int, Array]]
+
+
 class Structure:
     """Covariance of reading i alone: Σ_l θ[index[i, l]] · matrix[i, l].
 
@@ -257,9 +260,7 @@ class Structure:
     Each of the L `terms` is which variance a reading has, and S, for each reading or all.
     """
 
-    def __init__(
-        self, readings: Readings, names: Iterable[str], terms: Iterable[tuple[IntArray | int, Array]]
-    ) -> None:
+    def __init__(self, readings: Readings, names: Iterable[str], terms: Terms) -> None:
         n, size = readings.e.shape
         index, matrix = zip(*terms, strict=True)
         self.names = tuple(names)

@@ -56,12 +56,16 @@ class Weights:
 
     def apply(self, rows: Array) -> Array:
         """Whiten a vector (rows,) or matrix (rows, k)."""
-        own = rows if self.whiten is None else self.whiten @ rows
+        return self.beside(rows if self.whiten is None else self.whiten @ rows)
+
+    def beside(self, own: Array) -> Array:
+        """(I − low lowᵀ) of rows that are whitened by W₀."""
         return own if self.common is None else own - self._low @ (self._low.T @ own)
 
     @cached_property
     def _low(self) -> Array:
         """(I + F₀F₀ᵀ)^(−1/2) = I − U (1 − (1 + s²)^(−1/2)) Uᵀ of the whitened F₀ = W₀F."""
+        assert self.common is not None and self.whiten is not None
         U, size, _ = linalg.svd(self.whiten @ self.common, full_matrices=False)
         return np.asarray((U * np.sqrt(1 - 1 / np.sqrt(1 + size**2)))[:, size > 0])
 
