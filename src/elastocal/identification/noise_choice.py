@@ -498,14 +498,10 @@ class _Choice:
             found = found or fitted(self.readings, kind, self.best, lasting, ROUGHLY)
         except InsufficientDataError:
             return
-        own = found.noisy.own
-        if kind.shrunk:
-            own = self.readings.size + 2  # means of log θ and its two variances
-        spent = len(found.found) + (found.lasting is not None)
-        if EACH in found.kind.parts:  # what tells their sizes apart, none of them included
-            there = sum(d.part == EACH for d, _ in found.found)
-            spent += 1 - there
-            own += sum(d.part == EACH for d in found.noisy.deviations) - 1
+        own = self.readings.size + 1 if kind.shrunk else found.noisy.own  # of many their prior
+        own += max(sum(d.part == EACH for d in found.noisy.deviations) - 1, 0)
+        shared = {d.part if d.part == EACH else d.name for d, _ in found.found}
+        spent = len(shared) + (found.lasting is not None)
         criterion = float(own * self.price + 2 * spent - 2 * found.log_likelihood)
         self.trials[kind, lasting] = Trial(found.kind.name, own + spent, criterion)
         if criterion < self.least:
@@ -538,7 +534,7 @@ class _Choice:
 
     def _look_for(self, part: str, kind: Kind, lasting: Sequence[float | None]) -> None:
         """Try a part, with each of these times of what drifts, where the likelihood shows a trace
-        of it beside what there is; many variances imitate it, and none knows a drift beside them.
+        of it beside what there is; many variances of single readings imitate it, and give way.
 
         Twice what it gains, against a mixture of χ² with as many degrees of freedom as of the k
         variances of the part are not at zero, a half of them on average (Self and Liang 1987, J.
@@ -546,7 +542,7 @@ class _Choice:
         """
         less = self.best
         assert less is not None
-        if kind.shrunk and part == TIME:
+        if kind.shrunk:
             kind = kind._replace(own=self.names[0])
             less = fitted(self.readings, kind, less, None, ROUGHLY)
         wanted = kind.with_part(part)
@@ -563,8 +559,6 @@ class _Choice:
             self.attempt(wanted, lasting[0], more)
             for each in lasting[1:]:
                 self.attempt(wanted, each)
-            if kind.shrunk:
-                self.attempt(wanted._replace(own=self.names[0]), lasting[0])
 
 
 def _reason(label: str, trials: Sequence[Trial]) -> str:

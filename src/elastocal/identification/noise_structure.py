@@ -320,14 +320,12 @@ class NoiseModel:
             f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
             f"({n}, {size}, {size}), is needed",
         )
-        require(bool(np.isfinite(S).all()), f"{where} is not finite")
         full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
-        require(np.allclose(full, full.transpose(0, 2, 1)), f"{where} is not symmetric")
+        same = np.isfinite(S).all() and np.allclose(full, full.transpose(0, 2, 1))
+        require(bool(same), f"{where} is not finite and symmetric")
         smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
-        require(
-            bool((smallest >= -1e-9 * largest).all()),
-            f"{where} has a negative variance in some direction",
-        )
+        lower = (smallest < -1e-9 * largest).any()
+        require(not lower, f"{where} has a negative variance in some direction")
         return full
 
 
