@@ -467,8 +467,7 @@ class _Choice:
         self.readings, self.names = readings, names or supported(readings)
         self.price = float(np.log(max(readings.e.size - readings.n_parameters, 3)))
         self.trials: dict[tuple[Kind, float | None], Trial] = {}
-        self.tests: dict[str, NoiseTest] = {}
-        self.looked_for: set[Kind] = set()
+        self.tests: dict[Kind, NoiseTest] = {}
         self.best: Fitted | None = None
         self.least = math.inf
 
@@ -485,7 +484,8 @@ class _Choice:
         best = self.best
         trials, kind = tuple(self.trials.values()), best.kind.name
         again = fitted(self.readings, best.kind, best, best.lasting)
-        return NoiseFit(kind, again, T, trials, _reason(kind, trials), tuple(self.tests.values()))
+        tests = {test.part: test for test in self.tests.values()}  # the last one of each
+        return NoiseFit(kind, again, T, trials, _reason(kind, trials), tuple(tests.values()))
 
     def attempt(
         self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
@@ -509,8 +509,7 @@ class _Choice:
 
     def _changed(self) -> bool:
         before, record = self.least, self.readings.visits
-        together = np.unique(self.readings.configuration, return_counts=True)[1]
-        rows = int(together.max()) * self.readings.size
+        rows = np.bincount(self.readings.configuration).max() * self.readings.size
         visited = np.zeros(0, dtype=np.int64) if record is None else record.visit
         visits = np.unique(visited[visited >= 0], return_counts=True)[1]
         known = len(visits) >= FEWEST_VISITS and rows <= MOST_TOGETHER
@@ -546,15 +545,14 @@ class _Choice:
             kind = kind._replace(own=self.names[0])
             less = fitted(self.readings, kind, less, None, ROUGHLY)
         wanted = kind.with_part(part)
-        if wanted in self.looked_for:
+        if wanted in self.tests:
             return
-        self.looked_for.add(wanted)
         more = fitted(self.readings, wanted, less, lasting[0], ROUGHLY)
         k = np.arange(1, 1 + sum(d.part == part for d in more.noisy.deviations))
         gain = 2 * (more.log_likelihood - less.log_likelihood)
         share = special.binom(len(k), k) / 2 ** len(k)
         p = float(share @ special.chdtrc(k, gain)) if gain > ROUGHLY else 1.0
-        self.tests[part] = NoiseTest(part, p)
+        self.tests[wanted] = NoiseTest(part, p)
         if p < TRACE:
             self.attempt(wanted, lasting[0], more)
             for each in lasting[1:]:
