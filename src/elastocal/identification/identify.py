@@ -81,7 +81,7 @@ from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, subset
-from elastocal.units import Array, BoolArray, IntArray, Progress
+from elastocal.units import Array, BoolArray, Progress
 
 __all__ = ["Options", "identify"]
 
@@ -409,80 +409,65 @@ def _correlations(
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
 
 ROUNDS, RESTARTS = 14, 2
-# Of a standard deviation: what relinearising may still move an estimate by at the end, and where
-# the kind of noise is chosen.
-SETTLED, LINEAR = 0.01, 1.0
+SETTLED = 0.01  # of a standard deviation: what relinearising may still move an estimate by
 
 # A fit to the good observations (N,), the noise found from them, and which they are.
 Adapted = tuple[Solution, NoiseFit, BoolArray]
 
 FIRST = ("independent", "stated")  # noise whose weights are those of the first fit
-OF_READINGS = "auto, of readings"  # the best noise model but those that know the arm's visits
 
 
 def _adapted(
-    course: Course, start: Solution, good: BoolArray, kind: str, noise: NoiseFit | None = None,
-    judging: bool = True,
+    course: Course, start: Solution, good: BoolArray, kind: str, *,
+    visits: bool = True, judging: bool = True,
 ) -> Adapted:  # fmt: skip
     """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
 
     `start` is the fit to the `good` (N,) observations.  Noise and good readings are settled at its
-    values and the kept parameters fitted anew with these weights, until neither changes.  Then what
-    was chosen on the way is chosen again by what is there now: the parameters, if other readings
-    are good or the weights show more, and the kind of noise, unless one is given.  More parameters
-    that do not settle are none: the fit without them stays.  Readings are judged if `judging`.
+    values and the kept parameters fitted anew with these weights, until neither changes.  Then the
+    parameters are chosen again by what is there now, if other readings are good or the weights show
+    more, and with them, as whenever the good readings have changed, the kind of noise.  Noise that
+    knows the arm's `visits` counts, and readings are judged, unless told otherwise.
     """
-    asked, every = "auto" if kind == OF_READINGS else kind, course.every
-    problem, solution, now, fitted = every.problem, start, good, good
-    readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
-    sure, restarts, fewer = False, 0, None
+    every, same = course.every, True
+    noise: NoiseFit | None = None
+    problem, solution, now, fitted, restarts = every.problem, start, good, good, 0
+
+    def linear() -> Readings:
+        kept = linearised(problem.model, problem.observations, solution.fit.x, start.reduction.kept)
+        return kept if visits else replace(kept, visits=None)
+
+    readings = linear()
     for left in reversed(range(ROUNDS)):
-        before, kept, first = now, start.reduction.kept, noise is None
+        before, kept, known = now, start.reduction.kept, noise if same else None
         if judging:
-            noise, now = settle(readings, asked, now, noise)
+            noise, now = settle(readings, kind, now, known)
         else:
-            noise = estimate_noise(readings, asked, noise)
+            noise = estimate_noise(readings, kind, known)
         course.progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
         solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
-        readings = _linearised(problem, solution.fit.x, kept, kind)
+        readings = linear()
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         same = np.array_equal(now, before)
-        # What relinearising moves by more may have looked like some noise.
-        sure = sure or (first and same and moved.max(initial=0.0) < LINEAR)
         if moved.max(initial=0.0) >= SETTLED or not same:
             continue
-        others = judging and restarts < RESTARTS and not np.array_equal(now, fitted)
-        if others:
+        if judging and restarts < RESTARTS and not np.array_equal(now, fitted):
             start, fitted, restarts = every if now.all() else course.refit(now), now, restarts + 1
-            solution, more = start, start.reduction
+            solution = start
         else:
             # Weights that make light of what is noisy may show more than those of the first fit.
             more = start.reduction
             if noise.kind not in FIRST and left > 0:
                 fit, sigma = solution.fit, residual_sigma(solution.fit, len(kept))
                 more = choose(fit.problem, fit.of_free, sigma, more.threshold)
-        if others or len(more.kept) > len(kept):
-            fewer = None if others else (solution, noise, now, readings)
-            start, sure = replace(start, reduction=more), False
-            readings = _linearised(problem, solution.fit.x, more.kept, kind)
-            continue
-        settled, chosen = noise.kind, sure
-        if not sure:
-            noise, sure = estimate_noise(readings.take(now), asked), True
-        if chosen or noise.kind == settled:
-            break
-    else:
-        if fewer is not None:
-            solution, noise, now, readings = fewer
+            if len(more.kept) <= len(kept):
+                break
+            start = replace(start, reduction=more)
+        readings, same = linear(), False
     assert noise is not None
     final = readings.take(now)
     return solution, not_knowing_times(estimate_noise(final, like=noise)), now
-
-
-def _linearised(problem: Problem, x: Array, kept: IntArray, kind: str) -> Readings:
-    readings = linearised(problem.model, problem.observations, x, kept)
-    return replace(readings, visits=None) if kind == OF_READINGS else readings
 
 
 def refined(
@@ -660,18 +645,18 @@ def _holding(
 def _reml(course: Course) -> MethodResult:
     every, sound, options = course.every, course.sound, course.options
 
-    def found(
-        start: Solution, good: BoolArray, kind: str, known: NoiseFit | None = None
-    ) -> Adapted:
-        solution, noise, good = _adapted(course, start, good, kind, known)
+    def found(start: Solution, good: BoolArray, visits: bool = True) -> Adapted:
+        solution, noise, good = _adapted(course, start, good, options.noise, visits=visits)
         explained = partial(_explained, every, solution, noise, good)
         if not good.all() and not options.sets_aside(~good, explained):
             # So many faulty readings look like anything that scatters or drifts.
-            plainly, everything = OF_READINGS if kind == "auto" else kind, np.ones_like(good)
-            solution, noise, _ = _adapted(course, every, everything, plainly, judging=False)
+            everything, visits = np.ones_like(good), visits and options.noise != "auto"
+            solution, noise, _ = _adapted(
+                course, every, everything, options.noise, visits=visits, judging=False
+            )
         return solution, noise, good
 
-    solution, noise, good = found(sound, ~course.faulty, options.noise)
+    solution, noise, good = found(sound, ~course.faulty)
     if options.noise == "auto" and Kind.of(noise.kind).by_visit:
         # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
         # which make light of it let the fit go where poses left out are predicted worse.
@@ -679,11 +664,10 @@ def _reml(course: Course) -> MethodResult:
         agreed = every if good.all() else sound
         if not good.all() and not np.array_equal(good, ~course.faulty):
             agreed = course.refit(good)
-        plain = found(agreed, good, OF_READINGS, noise.of_readings())
+        plain = found(agreed, good, visits=False)
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
-            tests = noise.tests
-            solution, noise, good = plain
-            noise = replace(noise, tests=tests)  # which say what is not counted
+            solution, good = plain[::2]
+            noise = replace(plain[1], tests=noise.tests)  # which say what is not counted
     spread = spread_of(solution, options.intervals, noise)
     return MethodResult("reml", solution, spread, noise, good)
 

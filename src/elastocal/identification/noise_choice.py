@@ -46,7 +46,7 @@ from elastocal.model.observations import Observations, polar_axes
 from elastocal.units import Array, IntArray
 
 TINY = 1e-100  # stands for the variance of perfect data: its square is still a number
-LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
+LEAST_START = 1e-6  # a variance of a former fit that is smaller beside a new start is no start
 FEWEST_TELLING = 10  # degrees of freedom of repeats, from which on they tell the noise
 
 # Readings as rows.  Of R repeats the mean, times √R, holds all of Δx and of what they share; R − 1
@@ -124,19 +124,8 @@ class NoisyReadings:
 
     @property
     def may_vanish(self) -> list[int]:
-        """Variances that may be none: own ones together, the others still giving every reading
-        noise in every direction, and what is shared; without what drifts its waves have no prior.
-        """
-        theta = np.ones(self.own)
-        found: list[int] = []
-        if self.structure.index.shape[1] > 1 and not self.kind.shrunk:
-            for k in reversed(range(self.own)):  # the last that can be spared first
-                theta[k] = 0.0
-                if np.linalg.eigvalsh(self.structure.covariance(theta)).min() > 0:
-                    found.append(k)
-                else:
-                    theta[k] = 1.0
-        return found + [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
+        """Variances that may be none: what is shared, but the prior of what drifts."""
+        return [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
 
     def model(self, prior: LogPrior | None = None) -> Mixed:
         """Packs of clusters of the sets: readings of a configuration that share anything are one.
@@ -187,12 +176,11 @@ class NoisyReadings:
         theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)
         if like is None:
             return theta
-        known = dict(zip(like.noisy.names, like.theta, strict=True))
+        known = dict(zip(like.noisy.names, like.theta.tolist(), strict=True))
         same = like.noisy.structure.names == self.structure.names
-        least = LEAST_START * float(like.own.max())
         for k, name in enumerate(self.names):
-            if (v := known.get(name, 0.0)) > (least if k < self.own else 0.0):
-                theta[k] = v if same or k >= self.own else theta[k]
+            if (same or k >= self.own) and known.get(name, 0.0) > LEAST_START * theta[k]:
+                theta[k] = known[name]
         return theta
 
 
@@ -267,24 +255,21 @@ def fitted(
         if lasting is None:
             tried = [fitted(readings, kind, like, each, enough) for each in record.lasting]
             return max(tried, key=lambda one: one.log_likelihood)
-    noisy, prior = NoisyReadings(readings, kind, lasting), None
-    start = noisy.start(like)
-    if kind.shrunk:
-        if TIME in kind.parts:
-            raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
-        prior = prior_of_groups(noisy)
-        if like is None or like.noisy.structure.names != noisy.structure.names:
-            start[: noisy.own] = np.exp(prior.mean)
+    noisy = NoisyReadings(readings, kind, lasting)
+    if not kind.shrunk:
+        return Fitted(noisy, None, noisy.start(like), enough)
+    if TIME in kind.parts:
+        raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
+    prior, start = prior_of_groups(noisy), noisy.start(like)
+    start[: noisy.own] = np.exp(prior.mean)
     return Fitted(noisy, prior, start, enough)
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
 #
 # Empirical Bayes in the spirit of Smyth 2004 (Stat. Appl. Genet. Mol. Biol. 3, 3), with a lognormal
-# prior that knows direction and configuration: log θ_ca = μ_a + u_c + v_ca, where u ~ N(0, ω_u) and
-# v ~ N(0, ω_v).  A sample variance s² on f degrees of freedom has log s² = log θ + ψ(f/2) −
-# log(f/2) plus scatter of variance ψ'(f/2), from which an analysis of variance finds μ, ω_u and
-# ω_v.
+# prior that knows the direction: log θ_ca ~ N(μ_a, ω).  A sample variance s² on f degrees of
+# freedom has log s² = log θ + ψ(f/2) − log(f/2) plus scatter of variance ψ'(f/2).
 
 FEWEST = 2.0  # degrees of freedom of a group, at the median, below which there is nothing to shrink
 NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
@@ -316,25 +301,17 @@ def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
     # A lucky group of (near) equal readings says little about its variance, not minus infinity.
     s2 = np.maximum(s2, max(1e-6 * float(np.median(s2)), TINY))
     z = (np.log(s2) - special.digamma(f / 2) + np.log(f / 2)).reshape(-1, size)
-    noise = special.polygamma(1, f / 2)
-    scatter, configurations = float(noise.mean()), len(z)
-    mean = np.average(z, axis=0, weights=1 / noise.reshape(-1, size))
-    u = (z - mean).mean(axis=1)
-    omega_u, omega_v = float((u**2).sum() / (configurations - 1)), 0.0
-    if size > 1:
-        within = float(((z - mean - u[:, None]) ** 2).sum())
-        omega_v = within / ((configurations - 1) * (size - 1)) - scatter
-    omega_u -= (max(omega_v, 0.0) + scatter) / size
-    block = max(omega_u, 0.0) * np.ones((size, size)) + max(omega_v, NARROWEST) * np.eye(size)
-    precision = np.kron(np.eye(configurations), np.linalg.inv(block)).astype(np.float64)
-    return LogPrior(np.tile(mean, configurations), precision)
+    noise = special.polygamma(1, f / 2).reshape(z.shape)
+    mean = np.average(z, axis=0, weights=1 / noise)
+    omega = ((z - mean) ** 2).sum() / (z.size - size) - noise.mean()
+    return LogPrior(np.tile(mean, len(z)), np.eye(K) / max(float(omega), NARROWEST))
 
 
 def own_noise(found: Fitted, readings: Readings) -> tuple[Array, Array]:
     """Covariance (N, size, size) of single readings, be they those fitted or others, and degrees of
     freedom (N, size) behind it.  A variance that no reading of the fit has is the mean of all."""
     names = found.noisy.structure.names
-    structure = found.noisy.structure.model.structure(readings, names)
+    structure = STRUCTURES[found.noisy.kind.own].structure(readings, names)
     place = {name: k for k, name in enumerate(names)}
     known = np.array([place.get(name, -1) for name in structure.names])
     W = np.diag(found.covariance)[: found.noisy.own]
@@ -422,16 +399,11 @@ class NoiseFit:
         names: dict[str, list[str]] = {}
         for d, _ in self.fit.found:
             names.setdefault(d.part, []).append(d.name)
-        text = self.fit.noisy.structure.model.description
+        text = STRUCTURES[self.fit.kind.own].description
         for part, own in names.items():
             named = " / ".join([own[0], *(name.removeprefix(EACH_HAS) for name in own[1:])])
             text += PARTS[part][0].format(named)
         return text
-
-    def of_readings(self) -> NoiseFit:
-        tried = [t for t in self.trials if not Kind.parsed(t.kind).by_visit]
-        kind = min(tried, key=lambda t: t.criterion).kind
-        return replace(self, kind=kind, trials=tuple(tried), reason=_reason(kind, tried))
 
 
 def estimate_noise(
@@ -495,8 +467,7 @@ class _Choice:
         self.readings, self.names = readings, names or supported(readings)
         self.price = float(np.log(max(readings.e.size - readings.n_parameters, 3)))
         self.trials: dict[tuple[Kind, float | None], Trial] = {}
-        self.tests: dict[str, NoiseTest] = {}
-        self.looked_for: set[Kind] = set()
+        self.tests: dict[Kind, NoiseTest] = {}
         self.best: Fitted | None = None
         self.least = math.inf
 
@@ -513,7 +484,8 @@ class _Choice:
         best = self.best
         trials, kind = tuple(self.trials.values()), best.kind.name
         again = fitted(self.readings, best.kind, best, best.lasting)
-        return NoiseFit(kind, again, T, trials, _reason(kind, trials), tuple(self.tests.values()))
+        tests = {test.part: test for test in self.tests.values()}  # the last one of each
+        return NoiseFit(kind, again, T, trials, _reason(kind, trials), tuple(tests.values()))
 
     def attempt(
         self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
@@ -526,14 +498,10 @@ class _Choice:
             found = found or fitted(self.readings, kind, self.best, lasting, ROUGHLY)
         except InsufficientDataError:
             return
-        own = found.noisy.own
-        if kind.shrunk:
-            own = self.readings.size + 2  # means of log θ and its two variances
-        spent = len(found.found) + (found.lasting is not None)
-        if EACH in found.kind.parts:  # what tells their sizes apart, none of them included
-            there = sum(d.part == EACH for d, _ in found.found)
-            spent += 1 - there
-            own += sum(d.part == EACH for d in found.noisy.deviations) - 1
+        own = self.readings.size + 1 if kind.shrunk else found.noisy.own  # of many their prior
+        own += max(sum(d.part == EACH for d in found.noisy.deviations) - 1, 0)
+        shared = {d.part if d.part == EACH else d.name for d, _ in found.found}
+        spent = len(shared) + (found.lasting is not None)
         criterion = float(own * self.price + 2 * spent - 2 * found.log_likelihood)
         self.trials[kind, lasting] = Trial(found.kind.name, own + spent, criterion)
         if criterion < self.least:
@@ -541,8 +509,7 @@ class _Choice:
 
     def _changed(self) -> bool:
         before, record = self.least, self.readings.visits
-        together = np.unique(self.readings.configuration, return_counts=True)[1]
-        rows = int(together.max()) * self.readings.size
+        rows = np.bincount(self.readings.configuration).max() * self.readings.size
         visited = np.zeros(0, dtype=np.int64) if record is None else record.visit
         visits = np.unique(visited[visited >= 0], return_counts=True)[1]
         known = len(visits) >= FEWEST_VISITS and rows <= MOST_TOGETHER
@@ -566,7 +533,7 @@ class _Choice:
 
     def _look_for(self, part: str, kind: Kind, lasting: Sequence[float | None]) -> None:
         """Try a part, with each of these times of what drifts, where the likelihood shows a trace
-        of it beside what there is; many variances imitate it, and none knows a drift beside them.
+        of it beside what there is; many variances of single readings imitate it, and give way.
 
         Twice what it gains, against a mixture of χ² with as many degrees of freedom as of the k
         variances of the part are not at zero, a half of them on average (Self and Liang 1987, J.
@@ -574,25 +541,22 @@ class _Choice:
         """
         less = self.best
         assert less is not None
-        if kind.shrunk and part == TIME:
+        if kind.shrunk:
             kind = kind._replace(own=self.names[0])
             less = fitted(self.readings, kind, less, None, ROUGHLY)
         wanted = kind.with_part(part)
-        if wanted in self.looked_for:
+        if wanted in self.tests:
             return
-        self.looked_for.add(wanted)
         more = fitted(self.readings, wanted, less, lasting[0], ROUGHLY)
         k = np.arange(1, 1 + sum(d.part == part for d in more.noisy.deviations))
         gain = 2 * (more.log_likelihood - less.log_likelihood)
         share = special.binom(len(k), k) / 2 ** len(k)
         p = float(share @ special.chdtrc(k, gain)) if gain > ROUGHLY else 1.0
-        self.tests[part] = NoiseTest(part, p)
+        self.tests[wanted] = NoiseTest(part, p)
         if p < TRACE:
             self.attempt(wanted, lasting[0], more)
             for each in lasting[1:]:
                 self.attempt(wanted, each)
-            if kind.shrunk:
-                self.attempt(wanted._replace(own=self.names[0]), lasting[0])
 
 
 def _reason(label: str, trials: Sequence[Trial]) -> str:

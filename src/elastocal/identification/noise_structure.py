@@ -8,7 +8,7 @@ common besides; a `Kind` is one of the former with some of the latter.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property, lru_cache
 from typing import ClassVar, NamedTuple
@@ -250,25 +250,25 @@ class Readings:
 # What single readings scatter by: one variance, or several.
 
 
-@dataclass(frozen=True)
+Terms = Iterable[tuple[IntArray | int, Array]]
+
+
 class Structure:
     """Covariance of reading i alone: Σ_l θ[index[i, l]] · matrix[i, l].
 
     `index` (N, L) into the `names` of the variances θ, in m² (rad²); `matrix` (N, L, size, size).
+    Each of the L `terms` is which variance a reading has, and S, for each reading or all.
     """
 
-    model: NoiseModel
-    names: tuple[str, ...]
-    index: IntArray
-    matrix: Array
+    def __init__(self, readings: Readings, names: Iterable[str], terms: Terms) -> None:
+        n, size = readings.e.shape
+        index, matrix = zip(*terms, strict=True)
+        self.names = tuple(names)
+        self.index = np.stack([np.broadcast_to(own, n) for own in index], axis=1)
+        self.matrix = np.stack([np.broadcast_to(S, (n, size, size)) for S in matrix], axis=1)
 
     def covariance(self, theta: Array) -> Array:
         return np.einsum("nl,nlij->nij", theta[self.index], self.matrix)
-
-
-# The variances' names; and of each term which of them a reading has, (N,) or one for all, and S,
-# (N, size, size) or (size, size).
-Terms = tuple[Sequence[str], Sequence[tuple[IntArray | int, Array]]]
 
 
 class NoiseModel:
@@ -301,23 +301,15 @@ class NoiseModel:
     def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         """The model for the likelihood, of the variances `names` where it may have several sets;
         InputError where `components` are not as they should be, or readings lack what it needs."""
-        n, size = readings.e.shape
-        own, terms = self._terms(readings, names)
-        index = np.stack([np.broadcast_to(number, n) for number, _ in terms], axis=1)
-        matrix = np.stack([np.broadcast_to(S, (n, size, size)) for _, S in terms], axis=1)
-        return Structure(self, tuple(own), index, matrix)
-
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
         found = self.components(readings)
         require(bool(found), f"the noise model '{self.name}' has no components")
-        each = {name: self._matrices(name, S, readings) for name, S in found.items()}
-        smallest = np.linalg.eigvalsh(np.sum(list(each.values()), axis=0))[:, 0]
+        each = [self._matrices(name, S, readings) for name, S in found.items()]
         require(
-            bool((smallest > 0).all()),
+            bool((np.linalg.eigvalsh(np.sum(each, axis=0))[:, 0] > 0).all()),
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
-        return tuple(each), list(enumerate(each.values()))
+        return Structure(readings, found, enumerate(each))
 
     def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
         n, size = len(readings), readings.size
@@ -328,14 +320,12 @@ class NoiseModel:
             f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
             f"({n}, {size}, {size}), is needed",
         )
-        require(bool(np.isfinite(S).all()), f"{where} is not finite")
         full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
-        require(np.allclose(full, full.transpose(0, 2, 1)), f"{where} is not symmetric")
+        same = np.isfinite(S).all() and np.allclose(full, full.transpose(0, 2, 1))
+        require(bool(same), f"{where} is not finite and symmetric")
         smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
-        require(
-            bool((smallest >= -1e-9 * largest).all()),
-            f"{where} has a negative variance in some direction",
-        )
+        lower = (smallest < -1e-9 * largest).any()
+        require(not lower, f"{where} has a negative variance in some direction")
         return full
 
 
@@ -350,11 +340,11 @@ class Independent(NoiseModel):
     name, words = "independent", "equal noise"
     description = "one variance for all readings"
 
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
-        turns = np.arange(readings.size) >= 3
-        if not turns.any():
-            return ["distance" if readings.size == 1 else "position"], [(0, np.eye(len(turns)))]
-        return ["position", "rotation"], [(0, np.diag(1.0 - turns)), (1, np.diag(1.0 * turns))]
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
+        own = ("distance",) if readings.size == 1 else ("position", "rotation")
+        which = np.arange(readings.size) // 3
+        parts = [np.diag(1.0 * (which == k)) for k in range(which[-1] + 1)]
+        return Structure(readings, own[: len(parts)], enumerate(parts))
 
 
 class ByAxis(NoiseModel):
@@ -365,9 +355,9 @@ class ByAxis(NoiseModel):
     def supports(self, readings: Readings) -> bool:
         return 1 < readings.size <= readings.spare
 
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         own = ("x", "y", "z", "rx", "ry", "rz") if readings.size > 1 else ("distance",)
-        return own[: readings.size], list(enumerate(_axes(readings.size)))
+        return Structure(readings, own[: readings.size], enumerate(_axes(readings.size)))
 
 
 class ByMarker(NoiseModel):
@@ -376,10 +366,10 @@ class ByMarker(NoiseModel):
     def supports(self, readings: Readings) -> bool:
         return readings.size == 3 and 1 < len(np.unique(readings.marker)) <= readings.spare
 
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         require(readings.size == 3, "variances per marker are for positions and deflections")
         labels, number = np.unique(readings.marker, return_inverse=True)
-        return [f"marker {m}" for m in labels], [(number.ravel(), np.eye(3))]
+        return Structure(readings, [f"marker {m}" for m in labels], [(number.ravel(), np.eye(3))])
 
 
 class ByGroup(NoiseModel):
@@ -397,7 +387,7 @@ class ByGroup(NoiseModel):
         left = len(readings) - readings.n_parameters / readings.size
         return 3 <= groups <= MOST_GROUPS and 3 * groups <= left
 
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         size = readings.size
         key = np.column_stack([readings.configuration, readings.load])
         groups, number = np.unique(key, axis=0, return_inverse=True)
@@ -405,7 +395,8 @@ class ByGroup(NoiseModel):
             f"configuration {c}, load {load}, component {a}"
             for c, load in groups for a in range(size)
         ]  # fmt: skip
-        return own, [(size * number.ravel() + a, E) for a, E in enumerate(_axes(size))]
+        terms = [(size * number.ravel() + a, E) for a, E in enumerate(_axes(size))]
+        return Structure(readings, own, terms)
 
 
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
@@ -425,7 +416,7 @@ class Polar(NoiseModel):
     def supports(self, readings: Readings) -> bool:
         return readings.size == 3 and readings.sight is not None and readings.spare >= 3
 
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         require(
             readings.sight is not None and readings.size == 3,
             "polar noise needs positions and the tracker's position",
@@ -435,7 +426,7 @@ class Polar(NoiseModel):
         own = {"range": along, "transverse": np.eye(3) - along}
         if "angular" in names if names else np.ptp(d) > 0.2 * d.mean():
             own["angular"] = own["transverse"] * d[:, None, None] ** 2
-        return tuple(own), list(enumerate(own.values()))
+        return Structure(readings, own, enumerate(own.values()))
 
 
 class AsStated(NoiseModel):
@@ -451,9 +442,9 @@ class AsStated(NoiseModel):
             size <= 3 and np.allclose(S, S[0, 0, 0] * np.eye(size), rtol=1e-9, atol=0)
         )
 
-    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
         require(readings.stated is not None, "no noise is stated that could be used")
-        return ["factor"], [(0, np.asarray(readings.stated))]
+        return Structure(readings, ["factor"], [(0, np.asarray(readings.stated))])
 
 
 STRUCTURES: dict[str, NoiseModel] = {

@@ -339,7 +339,7 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
         return f"{numbered[1]} {labels[numbered[1]][int(numbered[2])]}"
 
     structure, sizes = fit.noisy.structure, list[NoiseSize]()
-    kind = structure.model.name
+    kind = fit.kind.own
     error = np.sqrt(np.diagonal(fit.covariance)) / np.maximum(fit.theta, 1e-300)
     for name, s, r in zip(structure.names, sigma[:own], error[:own].tolist(), strict=True):
         size, factor = (None, s) if kind == "stated" else (s, None)

@@ -53,8 +53,7 @@ SMALL = 0.05
 # Parameters of known size pay below 0 as well: where others stand for a few of them too, the
 # likelihood has them vanish, and how uncertain they are with them.
 PRICE = 0.75
-# Noise as shares of the variance that ordinary parameters leave, from which the search starts.
-SHARES = (1.0, 0.1, 0.01, 0.001)
+NOISE = 0.1  # as a share of the variance that ordinary parameters leave, at the start of the search
 CLIMBS, ENOUGH, CURVED = 30, 1e-3, 0.3  # of −2ℓ: what the last step may promise; its curvature
 
 
@@ -131,21 +130,11 @@ class LinearRows:
             gone = 1 + np.flatnonzero(start.scale == 0)
             lower[gone], upper[gone] = -np.inf, -np.inf
 
-        def found(theta: Array) -> Array:
-            return climb(objective, np.clip(theta, lower, upper), lower, upper, ENOUGH, CLIMBS)[0]
-
-        if start is None:
-            levels = 0.5 * np.log(variance * np.array(SHARES))
-            begun = [np.append(level, np.zeros(n)) for level in levels]
-            theta = found(min(begun, key=lambda one: objective(one)[0]))
-            small = np.append(False, theta[1:] < 0.5 * np.log(SMALL))
-            if small.any():
-                again = found(np.where(small, 0.0, theta))
-                theta = min(theta, again, key=lambda one: objective(one)[0])
-        else:
-            # From nothing the likelihood shows no way back: what is small begins anew.
-            known = np.where(start.scale < SMALL, 1.0, start.scale)
-            theta = found(0.5 * np.log(np.append(start.variance, known)))
+        # From nothing the likelihood shows no way back: what is small begins anew.
+        known = np.ones(n) if start is None else np.where(start.scale < SMALL, 1.0, start.scale)
+        level = NOISE * variance if start is None else start.variance
+        begun = np.clip(0.5 * np.log(np.append(level, known)), lower, upper)
+        theta = climb(objective, begun, lower, upper, ENOUGH, CLIMBS)[0]
         at = products.at(variances(theta), theta[0])
         gain = at.left_out([np.flatnonzero(mine) for mine in own.T])
         return Scales(np.exp(2 * theta[1:]), float(np.exp(2 * theta[0])), gain)

@@ -56,7 +56,7 @@ class Weights:
 
     def apply(self, rows: Array) -> Array:
         """Whiten a vector (rows,) or matrix (rows, k)."""
-        return self.beside(self.alone(rows))
+        return self.beside(rows if self.whiten is None else self.whiten @ rows)
 
     def beside(self, own: Array) -> Array:
         """(I − low lowᵀ) of rows that are whitened by W₀."""
@@ -65,22 +65,18 @@ class Weights:
     @cached_property
     def _low(self) -> Array:
         """(I + F₀F₀ᵀ)^(−1/2) = I − U (1 − (1 + s²)^(−1/2)) Uᵀ of the whitened F₀ = W₀F."""
-        assert self.common is not None
-        U, size, _ = linalg.svd(self.alone(self.common), full_matrices=False)
+        assert self.common is not None and self.whiten is not None
+        U, size, _ = linalg.svd(self.whiten @ self.common, full_matrices=False)
         return np.asarray((U * np.sqrt(1 - 1 / np.sqrt(1 + size**2)))[:, size > 0])
-
-    def alone(self, rows: Array) -> Array:
-        """The same by what is not common to all readings, W₀."""
-        return rows if self.whiten is None else self.whiten @ rows
 
     def beside_common(self, B: Array, e: Array) -> tuple[Array, Array]:
         """The whitened rows of B (rows, p) and e, with the coefficients of what all have in common
         as further columns, held by rows of their own that are the last."""
-        if self.common is None:
+        if self.common is None or self.whiten is None:
             return self.apply(B), self.apply(e)
         p, k = B.shape[1], self.common.shape[1]
-        rows = np.vstack([self.alone(np.hstack([B, self.common])), np.eye(k, p + k, p)])
-        return rows, np.concatenate([self.alone(e), np.zeros(k)])
+        rows = np.vstack([self.whiten @ np.hstack([B, self.common]), np.eye(k, p + k, p)])
+        return rows, np.concatenate([self.whiten @ e, np.zeros(k)])
 
 
 def weights_for(
