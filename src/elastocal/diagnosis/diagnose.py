@@ -297,7 +297,7 @@ def _sum_of_all(
         # What would have to be larger than on any arm has to be missed where it does not exist.
         far = unheard_of(answer.effects, few.before.base.model)
         instead = {kind: growth.instead_of(kind, answer.found) for kind, _ in far.values()}
-        return replace(answer, instead=instead), over, ()
+        return replace(answer, instead=instead) if instead else answer, over, ()
     causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
     named = {(c.effect.name, c.where) for c in answer.found.components if c.effect.name in causes}
