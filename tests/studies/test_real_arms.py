@@ -121,8 +121,7 @@ def test_iiwa_without_springs_is_found_to_bend_at_joint_2(folder, cell, calibrat
     assert 5e-5 < compliance["value"] < 1.5e-4
     assert found["gap"]["calibrated_um"] == pytest.approx(calibrated, rel=0.1)
     assert found["gap"]["explained_um"] < 500
-    # Its base gives way as well, by name or without one beside encoder scales: not joint 1 across
-    # its axis, which looks much the same.
+    # Its base gives way as well, by name or without: not joint 1, which looks much the same.
     assert "base" in {e["where"] for e in (*found["effects"], *found["fields"])}
     assert "joint1" not in {e["where"] for e in found["effects"]}
     assert first["gap_reduction_ci95"][0] > 0  # beside a curve of the same joint
