@@ -296,7 +296,8 @@ def _sum_of_all(
     if over > CLEARLY + max(chosen.score - nothing, 0.0) and n_causes >= MANY:
         # What would have to be larger than on any arm has to be missed where it does not exist.
         far = unheard_of(answer.effects, few.before.base.model)
-        instead = {kind: growth.instead_of(kind, answer.found) for kind, _ in far.values()}
+        kinds = dict.fromkeys(kind for kind, _ in far.values())
+        instead = {kind: growth.instead_of(kind, answer.found) for kind in kinds}
         return replace(answer, instead=instead) if instead else answer, over, ()
     causes = {name for name, effect in CATALOGUE.items() if not corrects(effect)}
     known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
