@@ -563,7 +563,7 @@ def diagnose(
     from elastocal.diagnosis.extra_poses import plan_extra
 
     tell("looking for poses that tell the rivals apart")
-    extra = plan_extra(made, table, found, most=extra_poses, seed=cast(int, seed), progress=tell)
+    extra = plan_extra(found, extra_poses, cast(int, seed), tell)
     return replace(found, extra=extra)
 
 

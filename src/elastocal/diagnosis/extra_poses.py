@@ -3,33 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import count, islice
 from typing import Any
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, thinned
+from elastocal.diagnosis.baseline import SMALLEST_NOISE, Baseline, NoiseValues
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.hypotheses import with_keys, with_recorded_drivers
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
+from elastocal.diagnosis.hypotheses import possible, with_keys
 from elastocal.diagnosis.rivals import (
     APART_AT_LAST,
     Discrimination,
     RivalSet,
-    Suspects,
-    as_diagnosed,
-    check_open,
-    inseparable,
-    pairs_of,
-    together,
-    with_neighbours,
+    covered,
+    named_sets,
+    rival_sets,
 )
-from elastocal.errors import InsufficientDataError, option, require
+from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements, visits, with_moves
-from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.manipulator import Model
+from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.observations import observe
 from elastocal.planning.candidates import draw
 from elastocal.planning.execution import nearest_first
@@ -39,9 +34,9 @@ from elastocal.simulation import simulate
 from elastocal.text import counted, rounded
 from elastocal.units import Array, BoolArray, Progress
 
-# What may be measured next: poses in all load states, from either side, at once or later.
+# What may be measured next: poses in all load states, from any side, at once or later.
 
-CANDIDATES, FEWEST_POSES = 256, 64
+CANDIDATES = 256
 NEWTON = 1.0  # forces are told apart to this
 RARE = 0.1  # share of the visits below which a load state is not asked for again
 
@@ -51,8 +46,9 @@ class VisitPool:
     """N candidates, each one pose with its side of approach and moment, in all load states.
 
     `q` (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces`
-    (L, 3) N.  `table` holds their rows: candidate by candidate, load by load, marker by marker,
-    with the readings that the fitted model expects; those `hidden` (rows,) the tracker cannot make.
+    (L, 3) N.  `table` holds the campaign's rows and then theirs: candidate by candidate, load by
+    load, marker by marker, with the readings that the fitted model expects; those `hidden` (rows,)
+    the tracker cannot make.
     """
 
     q: Array
@@ -65,73 +61,65 @@ class VisitPool:
     def __len__(self) -> int:
         return len(self.q)
 
+    @classmethod
+    def of(
+        cls, base: Baseline, q: Array, approach: Array | None, time: Array | None, forces: Array
+    ) -> VisitPool:
+        campaign, n, L = base.observed.table, len(q), len(forces)
+        begun, M, labels = len(campaign), len(campaign.marker_names), campaign.configuration_labels
+        of, warm = np.repeat(np.arange(n), L * M), campaign.temperature
+        table = replace(
+            campaign.take(np.append(np.arange(begun), np.zeros(len(of), dtype=np.int64))),
+            configuration_labels=labels + tuple(f"candidate {i}" for i in range(n)),
+        )
 
-def draw_pool(
-    model: Model, x: Array, table: Measurements, *, sides: bool, waits: bool, most: int, seed: int
-) -> VisitPool:
-    """Candidates that the cell's rules allow, after the campaign of `table`.
+        def plan(**columns: Any) -> None:
+            for name, values in columns.items():
+                if (column := getattr(table, name)) is not None:
+                    column[begun:] = values
 
-    Some CANDIDATES, or `most` where memory is short, of FEWEST_POSES poses at least.  With
-    `sides` every pose comes twice, each joint from either side; with `waits` twice too: at once
-    and after as long as the campaign took.  Both only where the table has such a column.
+        plan(
+            row=campaign.row.max() + 1, q=q[of], configuration=len(labels) + of, repeat=0,
+            marker=np.resize(np.arange(M), len(of)),
+            force=np.resize(np.repeat(forces, M, axis=0), (len(of), 3)),
+            approach=None if approach is None else approach[of],
+            time=None if time is None else time[of],
+            temperature=None if warm is None else np.median(warm),
+        )  # fmt: skip
+        if table.move is not None:  # which follows from the order of them all
+            table = with_moves(table)
+        read = simulate(base.model, table.take(slice(begun, None)), base.x, 0, noise=False)
+        plan(position=read.position, rotation=read.rotation, distance=read.distance)
+        hidden = np.append(np.zeros(begun, dtype=bool), _hidden(base, q, forces))
+        return cls(q, approach, time, forces, table, hidden)
+
+
+def draw_pool(base: Baseline, diagnosis: Diagnosis, seed: int) -> VisitPool:
+    """Candidates that the cell's rules allow, after the campaign, each joint from any side; where
+    a rival relaxes with time some at once and others after as long as the campaign took.  Sides and
+    moments only where the table has such a column.
 
     Raises InsufficientDataError where no pose is feasible.
     """
-    sides, waits = sides and table.approach is not None, waits and table.time is not None
-    rng = np.random.default_rng(seed)
-    forces = load_forces(table)
-    n = max(min(CANDIDATES, most) // (1 + sides) // (1 + waits), FEWEST_POSES)
-    cell, chain = model.cell, model.chain
-    if cell.model.compliance_levels and not cell.design.levels:
-        # A joint whose compliance is known at its levels only can be nowhere else.
-        spec = replace(cell.design, levels=cell.model.compliance_levels)
-        cell = replace(cell, design=spec)
-    q = draw(Feasibility(cell, chain), forces, n, seed).q
-    approach = time = None
-    if table.approach is not None:
-        approach = rng.choice([-1.0, 1.0], q.shape)
-        if sides:
-            q, approach = np.concatenate([q, q]), np.concatenate([approach, -approach])
+    table, cell, rng = base.observed.table, base.model.cell, np.random.default_rng(seed)
+    # A joint whose compliance is known at its levels only can be nowhere else.
+    spec = replace(cell.design, levels=cell.design.levels or cell.model.compliance_levels)
+    rules, forces = Feasibility(replace(cell, design=spec), base.model.chain), load_forces(table)
+    q = draw(rules, forces, CANDIDATES, seed).q
+    approach = None if table.approach is None else rng.choice([-1.0, 1.0], q.shape)
+    named = (CATALOGUE[name] for keys in named_sets(diagnosis) for name, _ in keys)
+    kinds = [setting.kind for effect in named for setting in effect.constants]
+    waits, time = diagnosis.verdict == "unknown_effect" or "time_constant" in kinds, None
     if table.time is not None:
-        begin, step = table.time.max() + time_step(table), np.ptp(table.time)
-        time = np.full(len(q), begin)
-        if waits:
-            q, time = np.concatenate([q, q]), np.concatenate([time, time + step])
-            approach = None if approach is None else np.tile(approach, (2, 1))
-    return visit_pool_of(model, x, table, q, approach, time, forces)
+        later = np.ptp(table.time) * rng.integers(1 + waits, size=len(q))
+        time = table.time.max() + time_step(table) + later
+    return VisitPool.of(base, q, approach, time, forces)
 
 
-def visit_pool_of(
-    model: Model, x: Array, table: Measurements, q: Array, approach: Array | None,
-    time: Array | None, forces: Array,
-) -> VisitPool:  # fmt: skip
-    """The pool of these candidates, read as the model at `x` would be."""
-    n, L, M = len(q), len(forces), len(table.marker_names)
-    candidate = np.repeat(np.arange(n), L * M)
-    known = len(table.configuration_labels)
-    rows = replace(
-        table.take(np.zeros(len(candidate), dtype=np.int64)),
-        row=np.zeros(len(candidate), dtype=np.int64),  # no line of any file
-        q=q[candidate],
-        configuration=known + candidate,
-        configuration_labels=table.configuration_labels + tuple(f"candidate {i}" for i in range(n)),
-        repeat=np.zeros(len(candidate), dtype=np.int64),
-        marker=np.tile(np.arange(M), n * L),
-        force=forces[np.tile(np.repeat(np.arange(L), M), n)],
-        approach=None if approach is None else approach[candidate],
-        time=None if time is None else time[candidate],
-    )
-    if table.temperature is not None:
-        rows = replace(rows, temperature=np.full(len(rows), np.median(table.temperature)))
-    if table.move is not None:
-        rows = with_moves(rows)  # from one candidate to the next, as good as any order
-    read = simulate(model, rows, x, 0, noise=False)
-    return VisitPool(q, approach, time, forces, read, _hidden(model, q, forces, table.marker_names))
-
-
-def _hidden(model: Model, q: Array, forces: Array, markers: tuple[str, ...]) -> BoolArray:
+def _hidden(base: Baseline, q: Array, forces: Array) -> BoolArray:
     """(N·L·M,): the tracker does not see the marker of pose q (N, n) under that of `forces` (L, 3),
     or for deflections under another of them."""
+    model, markers = base.model, base.observed.table.marker_names
     seen, stated = Feasibility(model.cell, model.chain).seen, list(model.cell.tool.markers)
     if seen is None:
         return np.zeros(len(q) * len(forces) * len(markers), dtype=bool)
@@ -163,68 +151,45 @@ def time_step(table: Measurements) -> float:
     return float(np.median(np.diff(moments))) if len(moments) > 1 else 0.0
 
 
-def joined(first: Measurements, second: Measurements) -> Measurements:
-    """Both tables' rows; the second's labels hold for both, its columns are the first's.
-
-    How the arm came to each visit follows from the order of them all.
-    """
-    first, known = replace(first, move=None, direction=None), first.move is not None
-    arrays: dict[str, Any] = {
-        f.name: np.concatenate([value, getattr(second, f.name)])
-        if isinstance(value, np.ndarray) else value
-        for f in fields(first)
-        if isinstance(value := getattr(first, f.name), np.ndarray) or value is None
-    }  # fmt: skip
-    table = replace(second, source=first.source, **arrays)
-    return with_moves(table) if known else table
-
-
-def with_pool(
-    base: Baseline, pool: VisitPool, suspects: Suspects
-) -> tuple[DiagnosisData, DiagnosisData, NoiseValues]:
-    """Columns of the data so far and of the pool at the fit, of the data alone, and the noise that
-    the diagnosis found; faulty readings and those of markers that are not seen left out.
+def discriminations(
+    base: Baseline, pool: VisitPool, diagnosis: Diagnosis, seed: int,
+    sets: Sequence[RivalSet] = (),
+) -> list[Discrimination]:  # fmt: skip
+    """Of all `sets` of rivals, by default those of the diagnosis, under the noise that it found;
+    its faulty readings and those of markers that are not seen are left out.
 
     Candidates are read as precisely as the same marker was on average.
     """
-    table = base.observed.table
-    observed = observe(joined(table, pool.table), base.model.observe)
-    n, stated, marker = len(base.observed.lead), base.covariance, table.marker[base.observed.lead]
-    usual = {k: stated[marker == k].mean(axis=0) for k in np.unique(marker).tolist()}
-    later = observed.table.marker[observed.lead[n:]].tolist()
-    planned = np.array([usual.get(k, stated.mean(axis=0)) for k in later])
+    observed = observe(pool.table, base.model.observe)
+    n, stated, marker = len(base.observed.lead), base.covariance, pool.table.marker[observed.lead]
+    usual = {k: stated[marker[:n] == k].mean(axis=0) for k in np.unique(marker[:n]).tolist()}
+    planned = [usual.get(k, stated.mean(axis=0)) for k in marker[n:].tolist()]
     both = replace(
-        base, observed=observed, stated=np.concatenate([stated, planned]), planned=len(later),
-        residual=np.concatenate([base.residual, np.zeros(observed.size * len(later))]),
+        base, observed=observed, stated=np.array([*stated, *planned]), planned=len(planned),
+        residual=np.append(base.residual, np.zeros(observed.size * len(planned))),
     )  # fmt: skip
-    dataset, noise = as_diagnosed(diagnosis_data_of(both, suspects.hypotheses), suspects.diagnosis)
-    hidden = np.concatenate([np.zeros(len(table), dtype=bool), pool.hidden])[observed.lead]
-    dataset = dataset.without(dataset.data.faulty | hidden)
-    return dataset, dataset.without((np.arange(len(hidden)) >= n) | dataset.data.faulty), noise
-
-
-def discriminations_of(
-    base: Baseline, pool: VisitPool, suspects: Suspects, seed: int
-) -> list[Discrimination]:
-    dataset, so_far, noise = with_pool(base, pool, suspects)
-    sets = [*suspects.sets, *([suspects.unknown_set(so_far, noise)] if suspects.unknown else [])]
+    tried = {(c.effect, c.where) for c in diagnosis.candidates}
+    every = (h for h in possible(base.model, base.observed.table)[0] if h.key in tried)
+    dataset, found = diagnosis_data_of(both, list(every)), diagnosis.noise
+    joint = np.maximum(found.repeatability, SMALLEST_NOISE)
+    shared = np.array(found.shared_by_joint or [found.shared] * len(joint))
+    noise = NoiseValues(found.stated_factor, joint, shared)
+    faulty = np.isin(pool.table.row[observed.lead], [f.line for f in found.faulty])
+    dataset = dataset.without(faulty | pool.hidden[observed.lead])
+    so_far = dataset.without(dataset.data.faulty | (np.arange(len(observed.lead)) >= n))
     return [
         Discrimination(dataset, so_far, noise, len(pool), s, np.random.default_rng(seed))
-        for s in sets
+        for s in sets or rival_sets(so_far, noise, diagnosis)
     ]
 
 
-# The fewest candidates that tell the rivals apart: greedy addition, then exchange.
+# The fewest candidates that tell the rivals apart, one more at a time until they are enough.
 #
 # The design module's criteria are functions of one information matrix, convex and homogeneous of
 # degree −1, which its bounds rest on.  Distances of rivals are neither: they start from data in
-# hand, and a pair's distance is a difference of two informations.  So this search is its own: one
-# candidate more at a time until they are enough, each then exchanged for the best other until none
-# helps, and what has become needless left out.
+# hand, and a pair's distance is a difference of two informations.  So this choice is its own.
 
 ENOUGH = 0.97  # probability of the right answer from which no further pose is asked for
-ROUNDS = 3  # of exchange, at most
-WORTH = 1e-3  # relative fall of the error that an exchange is made for
 RANDOM_DRAWS = 32  # of as many candidates, whose mean a plan is compared with
 
 
@@ -233,49 +198,17 @@ def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -
     `enough`; `most` where fewer do not reach it."""
     chosen: list[int] = []
     while len(chosen) < min(most, len(tasks[0].pool)):
-        chosen.append(_best(tasks, chosen)[0])
+        error = np.sum([c.error_bound(c.squared_with_each(chosen)) for c in tasks], axis=0)
+        error[chosen] = np.inf
+        chosen.append(int(np.argmin(error)))
         if expected(tasks, chosen) >= enough:
             break
-    _exchange(tasks, chosen)
-    while len(chosen) > 1 and expected(tasks, chosen) >= enough:
-        fewer = min(
-            (chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))),
-            key=lambda left: _error(tasks, left),
-        )
-        _exchange(tasks, fewer)
-        if expected(tasks, fewer) < enough:
-            break
-        chosen = fewer
     return chosen
 
 
 def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
     """Probability that the right one of every set is named after the chosen visits."""
-    each = [c.probability(c.squared(chosen)) for c in tasks]
-    return float(np.prod(each))
-
-
-def _best(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, float]:
-    """The candidate not chosen yet that lowers the error most, and the error with it."""
-    error = np.array(sum(c.error_bound(c.squared_with_each(chosen)) for c in tasks))
-    error[list(chosen)] = np.inf
-    best = int(np.argmin(error))
-    return best, float(error[best])
-
-
-def _error(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
-    return sum(float(c.error_bound(c.squared(chosen))) for c in tasks)
-
-
-def _exchange(tasks: Sequence[Discrimination], chosen: list[int]) -> None:
-    for _ in range(ROUNDS if len(chosen) > 1 else 0):
-        before = list(chosen)
-        for k, own in enumerate(before):
-            best, error = _best(tasks, chosen[:k] + chosen[k + 1 :])
-            if best != own and error < (1 - WORTH) * _error(tasks, chosen):
-                chosen[k] = best
-        if chosen == before:
-            break
+    return math.prod(c.probability(c.squared(chosen)) for c in tasks)
 
 
 # The extra visits as one would make them: a short way through the poses, all loads at each.
@@ -313,180 +246,140 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
     )  # fmt: skip
 
 
-# What to do besides measuring the extra poses, in words.
-
-
-def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str:
-    """`distance`: how far apart neighbours among the group are at most."""
-    names = " and ".join([", ".join(group[:-1]), group[-1]])
-    near = f"they would be {distance:.1f} standard deviations apart"
-    if len(group) > 2:
-        near = f"each would be within {distance:.1f} standard deviations of another of them"
-    return f"no pose separates {names}: measured in all {tried} poses that were tried {near}"
-
-
-def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
-    """What the extra visits must keep to, because rivals depend on it."""
-    out = []
-    if any(s.depends_on("approach") for s in sets):
-        out.append("come to each extra pose with every joint from the side that the plan states")
-    if any(s.depends_on("time") for s in sets):
-        out.append(
-            "leave arm and tracker as they are until the extra poses are measured, and record "
-            "their times on the same clock"
-        )
-    return out
-
+# The plan, and what to do besides measuring it, in words.
 
 # What a plan can aim at, and from which probability it goes without saying that one is at work.
 MOST_CERTAIN, MOSTLY = 0.99, 0.9
-NUMBERS = 20_000_000  # of the configurations' covariances that are held at once
 GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
 
 
 def plan_extra(
-    model: Model,
-    table: Measurements,
-    diagnosis: Diagnosis,
-    *,
-    most: int = 10,
-    seed: int = 0,
-    progress: Progress = lambda message: None,
+    diagnosis: Diagnosis, most: int, seed: int = 0, progress: Progress = lambda message: None
 ) -> ExtraPlan:
     """The fewest extra poses, at most `most`, that tell the rivals of an open verdict apart.
 
-    `diagnosis` of `table` under `model`, its verdict ambiguous or unknown_effect.  The rivals are
-    the sets that it calls indistinguishable, or what the unknown effect may be.  Candidates are
-    feasible poses of the cell in the table's load states, after the campaign; their distances come
-    from the columns of the fitted arm with all fitted parameters free (see `Discrimination`).
-
-    Raises InputError for a verdict that leaves no rivals, or fewer than one pose.
+    The rivals are the sets that the diagnosis calls indistinguishable, or what the unknown effect
+    may be.  Candidates are feasible poses of the cell in the table's load states, after the
+    campaign; their distances come from the columns of the fitted arm with all fitted parameters
+    free (see `Discrimination`).
     """
-    check_open(diagnosis)
-    require(most >= 1, f"extra poses: at least one has to be allowed; found {most}")
-    notes: list[str] = []
-    if model.cell.model.torque == "measured":
-        model = with_keys(model, torque="computed")
-        notes.append("torques of poses not measured yet are computed from load and weights")
-    table, _ = thinned(table)
-    model = with_recorded_drivers(model, table, diagnosis)
-    suspects = Suspects(model, table, diagnosis)
-    progress("extra poses: fitting the model as it is")
-    base = fit_baseline(model, table, seed)
-    progress("extra poses: what else the rivals may be")
-    suspects.sets = with_neighbours(base, suspects)
+    base, advice, none = diagnosis.calibrated, list[str](), ""
+    assert base is not None
+    if base.model.cell.model.torque == "measured":
+        base = replace(base, model=with_keys(base.model, torque="computed"))
+        advice.append("torques of poses not measured yet are computed from load and weights")
     progress("extra poses: drawing candidates")
-    C, M = base.blocks.member.shape
-    room = max(NUMBERS // (M * base.observed.size) ** 2 - C, 0)
     try:
-        pool = draw_pool(model, base.x, table, **suspects.matters, most=room, seed=seed)
+        pool = draw_pool(base, diagnosis, seed)
     except InsufficientDataError as error:
-        return _nothing(suspects.sets, suspects, (str(error),))
-    return _chosen(base, pool, suspects, most, seed, notes, progress)
-
-
-def _chosen(
-    base: Baseline, pool: VisitPool, suspects: Suspects, most: int, seed: int, notes: list[str],
-    progress: Progress,
-) -> ExtraPlan:  # fmt: skip
-    progress("extra poses: columns of the candidates")
-    tasks = discriminations_of(base, pool, suspects, seed)
+        nowhere = np.zeros((0, base.model.chain.n_joints))
+        pool, none = VisitPool.of(base, nowhere, None, None, np.zeros((1, 3))), str(error)
+    progress("extra poses: what the rivals may be, and columns of the candidates")
+    tasks = discriminations(base, pool, diagnosis, seed)
     sets = [c.rivals for c in tasks]
-    hopeless = inseparable(tasks)
-    groups = tuple(group for c in tasks for group in together(c))
-    for group in groups:
-        near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
-        notes.append(inseparable_advice(group, near, len(pool)))
-    effects = [name.partition(":")[0] for pair in hopeless for name in pair]
-    notes += dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy))
-    covered = suspects.covered
-    if covered < MOSTLY:
-        notes.append(
-            f"with probability {1 - covered:.2f} none of these rivals is at work (noise alone: "
-            f"{suspects.diagnosis.probability_nothing:.2f}), which the probabilities count with: "
-            "measure more poses of any kind first"
-        )
+    share = covered(sets, diagnosis)
     # More poses may make up for a small doubt whether the right one is among the rivals.
-    enough = ENOUGH / covered if covered * MOST_CERTAIN >= ENOUGH else ENOUGH
+    enough = ENOUGH / share if share * MOST_CERTAIN >= ENOUGH else ENOUGH
     # Where what can be told apart is told apart already, only what cannot be is left.
-    worthwhile = any(np.ptp(c.classes) > 0 for c in tasks) and expected(tasks, ()) < enough
+    useful = any(np.ptp(c.classes) > 0 for c in tasks) and expected(tasks, ()) < enough
     progress("extra poses: choosing")
-    chosen = fewest(tasks, most, enough) if worthwhile else []
-    after = expected(tasks, chosen)
-    if after < enough or hopeless:
+    chosen = fewest(tasks, most, enough) if useful and not none else []
+    if not none:
+        advice += _advice(tasks, chosen, enough, share, diagnosis)
         progress("extra poses: what a horizontal pull would add")
-        if after < enough:
-            reachable = covered * expected(tasks, range(len(pool)))
-            notes.append(
-                f"with {counted(len(chosen), 'pose')} the probability is {covered * after:.2f} "
-                f"only; many more would reach {reachable:.2f}: allow more poses "
-                f"({option('poses')}), or repeat each of them"
-            )
-        notes += _pull_notes(base, pool, suspects, seed, tasks, hopeless, len(chosen), after)
-    nothing = _nothing(sets, suspects, notes)
-    found = replace(nothing, pairs=pairs_of(tasks, chosen), inseparable=groups)
-    if not worthwhile:
-        return found
-    rng, n = np.random.default_rng(seed), len(chosen)
-    picks = [rng.choice(len(pool), size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
-    return replace(
-        found,
-        plan=measuring_order(pool, chosen, base.observed.table),
-        n_poses=n,
-        probability_before=covered * expected(tasks, ()),
-        probability_after=covered * after,
-        probability_random=covered * float(np.mean([expected(tasks, pick) for pick in picks])),
-        separable=True,
-        advice=(*recording_advice(sets), *notes),
+        advice += _of_pulls(base, pool, tasks, chosen, enough, share, diagnosis, seed)
+    likeliest = [float(s.probability.max()) for s in sets] or [diagnosis.probability_unknown]
+    before = after = by_chance = share * math.prod(likeliest)
+    if chosen:
+        rng, n, N = np.random.default_rng(seed), len(chosen), len(pool)
+        picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
+        before, after = (share * expected(tasks, some) for some in ((), chosen))
+        by_chance = share * float(np.mean([expected(tasks, pick) for pick in picks]))
+    return ExtraPlan(
+        separable=bool(chosen),
+        inseparable=tuple(names for c in tasks for names in c.inseparable),
+        n_poses=len(chosen),
+        rivals=tuple(dict.fromkeys(name for s in sets for name in s.names)),
+        pairs=tuple(pair for c in tasks for pair in c.pairs(chosen)),
+        plan=measuring_order(pool, chosen, base.observed.table) if chosen else None,
+        probability_before=before,
+        probability_after=after,
+        probability_random=by_chance,
+        advice=(none,) if none else tuple(advice),
     )
 
 
-def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: Sequence[str]) -> ExtraPlan:
-    likeliest = [float(s.probability.max()) for s in sets]
-    p = float(np.prod(likeliest)) if sets else suspects.diagnosis.probability_unknown
-    p *= suspects.covered
-    names = tuple(dict.fromkeys(name for s in sets for name in s.names))
-    return ExtraPlan(False, (), 0, names, (), None, p, p, p, tuple(notes))
+def _advice(
+    tasks: Sequence[Discrimination], chosen: Sequence[int], enough: float, share: float,
+    diagnosis: Diagnosis,
+) -> Iterator[str]:  # fmt: skip
+    sets, N = [c.rivals for c in tasks], len(tasks[0].pool) if tasks else 0
+    if chosen and any(s.depends_on("approach") for s in sets):
+        yield "come to each extra pose with every joint from the side that the plan states"
+    if chosen and any(s.depends_on("time") for s in sets):
+        yield (
+            "leave arm and tracker as they are until the extra poses are measured, and record "
+            "their times on the same clock"
+        )
+    groups = {names: d for c in tasks for names, d in c.inseparable.items()}
+    for names, d in groups.items():
+        near = f"they would be {d:.1f} standard deviations apart"
+        if len(names) > 2:
+            near = f"each would be within {d:.1f} standard deviations of another of them"
+        together = " and ".join([", ".join(names[:-1]), names[-1]])
+        yield f"no pose separates {together}: measured in all {N} poses that were tried {near}"
+    effects = dict.fromkeys(name.partition(":")[0] for names in groups for name in names)
+    yield from dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy))
+    if share < MOSTLY:
+        yield (
+            f"with probability {1 - share:.2f} none of these rivals is at work (noise alone: "
+            f"{diagnosis.probability_nothing:.2f}), which the probabilities count with: "
+            "measure more poses of any kind first"
+        )
+    if (after := expected(tasks, chosen)) < enough:
+        reachable = share * expected(tasks, range(N))
+        yield (
+            f"with {counted(len(chosen), 'pose')} the probability is {share * after:.2f} "
+            f"only; many more would reach {reachable:.2f}: allow more poses "
+            f"({option('poses')}), or repeat each of them"
+        )
 
 
-def _pull_notes(
-    base: Baseline, pool: VisitPool, suspects: Suspects, seed: int,
-    tasks: Sequence[Discrimination], hopeless: dict[tuple[str, str], float], n: int, after: float,
-) -> list[str]:  # fmt: skip
+def _of_pulls(
+    base: Baseline, pool: VisitPool, tasks: Sequence[Discrimination], chosen: Sequence[int],
+    enough: float, share: float, diagnosis: Diagnosis, seed: int,
+) -> Iterator[str]:  # fmt: skip
     """Advice to pull along x and y as well, as hard as by the load, where that helps.
 
     None without a load, nor for what is unknown: how it takes a pull nobody can say.
     """
-    newton, notes = float(np.linalg.norm(pool.forces, axis=1).max()), []
-    if newton == 0 or suspects.unknown:
-        return []
-    forces, table = np.vstack([pool.forces, newton * np.eye(3)[:2]]), base.observed.table
-    wide = visit_pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
-    pulled = discriminations_of(base, wide, suspects, seed)
+    newton, after = float(np.linalg.norm(pool.forces, axis=1).max()), expected(tasks, chosen)
+    settled = after >= enough and not any(c.inseparable for c in tasks)
+    if newton == 0 or settled or diagnosis.verdict == "unknown_effect":
+        return
+    forces = np.vstack([pool.forces, newton * np.eye(3)[:2]])
+    wide = VisitPool.of(base, pool.q, pool.approach, pool.time, forces)
+    pulled = discriminations(base, wide, diagnosis, seed, [c.rivals for c in tasks])
     # As many readings more under the loads that there are would help too: d² by their number.
-    more = len(forces) / len(pool.forces)
-    within = pairs_of(pulled, range(len(wide)))
-    reach = {(pair.first, pair.second): pair.distance_after for pair in within}
-    apart = ", ".join(
-        " and ".join(pair) for pair, d in hopeless.items()
-        if reach.get(pair, 0.0) > max(APART_AT_LAST, d * math.sqrt(more))
-    )  # fmt: skip
+    more, apart = len(forces) / len(pool.forces), list[str]()
+    for c, wider in zip(tasks, pulled, strict=True):
+        news = wider.apart > np.maximum(APART_AT_LAST, c.apart * math.sqrt(more))
+        pairs = np.argwhere(np.triu((c.apart < APART_AT_LAST) & news, 1))
+        apart += [" and ".join(c.rivals.names[k] for k in pair) for pair in pairs]
+        wider.classes = c.classes
+    by = f"{rounded(newton)} N along x and"
     if apart:
-        notes.append(
-            f"a horizontal pull of {rounded(newton)} N along x and along y, e.g. by a rope over a "
-            f"pulley, would separate {apart}: measure poses under it, too"
+        yield (
+            f"a horizontal pull of {by} along y, e.g. by a rope over a pulley, would separate "
+            f"{', '.join(apart)}: measure poses under it, too"
         )
-    if pulled and n:
-        for same, c in zip(pulled, tasks, strict=True):
-            same.classes = c.classes
-        chosen = fewest(pulled, n)
-        reached = expected(pulled, chosen)
-        as_many = expected(tasks, fewest(tasks, math.ceil(more * n)))
+    if chosen:
+        under = fewest(pulled, len(chosen))
+        reached = expected(pulled, under)
+        as_many = expected(tasks, fewest(tasks, math.ceil(more * len(chosen))))
         if reached > max(after, as_many) + GAIN:
-            poses = counted(len(chosen), "pose")
-            notes.append(
-                f"pull horizontally: {poses}, measured also under {rounded(newton)} N along x and "
+            yield (
+                f"pull horizontally: {counted(len(under), 'pose')}, measured also under {by} "
                 "along y, e.g. by a rope over a pulley, would raise the probability from "
-                f"{suspects.covered * after:.2f} to {suspects.covered * reached:.2f}"
+                f"{share * after:.2f} to {share * reached:.2f}"
             )
-    return notes

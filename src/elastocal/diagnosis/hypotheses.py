@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
-from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
+from elastocal.diagnosis.diagnosis import FoundEffect, Untested
 from elastocal.measurements import Measurements, by_rows, in_any_order
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
@@ -218,20 +218,14 @@ CHOICES = (
 )
 
 
-def with_recorded_drivers(
-    model: Model, table: Measurements, found: Diagnosis | None = None
-) -> Model:
+def with_recorded_drivers(model: Model, table: Measurements) -> Model:
     """The model with effects driven by the best that the table records.
 
     Growth follows a measured temperature rather than a warm-up curve, and play rests where the
-    last motion left it where that is known.  Effects that the cell has active stay as they are;
-    those of a diagnosis are driven as `found`.  Where there are no times, what changes once does so
-    between rows, if the poses are in any order.
+    last motion left it where that is known.  Effects that the cell has active stay as they are.
+    Where there are no times, what changes once does so between rows, if the poses are in any order.
     """
     active = {p.effect for p in model.parameters}
-    if found is not None:
-        otherwise = {effect for key, _, _, effect in CHOICES if key not in found.model_keys}
-        active |= otherwise & {e.effect for e in found.effects}
     keys = {
         key: value
         for key, value, column, effect in CHOICES
