@@ -55,8 +55,6 @@ class NextPoses(Result):
         gain: What the batch adds, with and without what the model may lack, in m.
         required: The error at new poses that is asked for, in m; None where none is.
         reached: The error that the model as it is now keeps with 95 %, in m.
-        found: The effects that the diagnosis found, which the model then has.
-        doubts: What it may lack besides, with its probability, the likeliest first.
         source: The readings that it is said of.
         diagnosis: Of these readings; None for fewer than can be diagnosed.
         calibration: The arm identified with what was found; None where they do not suffice.
@@ -68,12 +66,24 @@ class NextPoses(Result):
     gain: Gain
     required: float | None
     reached: float
-    found: tuple[FoundEffect, ...]
-    doubts: tuple[tuple[str, str, float], ...]
     least_gain: float = 0.01
     source: str = ""
     diagnosis: Diagnosis | None = None
     calibration: Calibration | None = None
+
+    @property
+    def found(self) -> tuple[FoundEffect, ...]:
+        """The effects that the diagnosis found, which the model then has."""
+        return () if self.diagnosis is None else self.diagnosis.effects
+
+    @property
+    def doubts(self) -> tuple[tuple[str, str, float], ...]:
+        """What it may lack besides, or instead: effect, place and probability, the likeliest
+        first."""
+        found = {(f.effect, f.where) for f in self.found}
+        every = () if self.diagnosis is None else self.diagnosis.candidates
+        likely = ((c.effect, c.where, c.probability) for c in every if c.probability > DOUBT)
+        return tuple(sorted((c for c in likely if c[:2] not in found), key=lambda c: -c[2]))
 
     @property
     def beside(self) -> float | None:
@@ -153,27 +163,18 @@ def next_poses(
     model = model if isinstance(model, Model) else Model(model)
     table = data if isinstance(data, Measurements) else model.read(data)
     model = model.with_markers_of(table)
-    required = model.cell.require.new_poses if require is None else require
-    spec = model.cell.design
-    spec = replace(
-        spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,
-        loads=load_forces(table) if spec.loads is None else spec.loads,
-        # A joint whose compliance is known at its levels only can be nowhere else.
-        levels=spec.levels or model.cell.model.compliance_levels,
-    )  # fmt: skip
-    shares_of(replace(model.cell, design=spec), batch, "batch")  # each level takes a pose
-    unstated = lacks_noise(replace(model.cell, design=spec))
-    why = None
+    asked = _asked(model.cell, table, batch, candidates)
+    shares_of(asked, batch, "batch")  # each level takes a pose
+    unstated, why, fit, sure, lacking = lacks_noise(asked), None, None, math.inf, 0.0
     if len(np.unique(table.configuration)) >= FEWEST:
         tell("diagnosing")
         why = diagnose(model, table, DiagnosisOptions(seed), tell)
         model = with_effects_of(model, why)
     tell("identifying")
-    fit, sure, lacking = None, math.inf, 0.0
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table)
         sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
-    cell = replace(model.cell, design=spec)
+    cell = replace(model.cell, design=asked.design)
     cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
     options = DesignOptions("batch", seed, jobs, done=table, notes=notes, hold=True)
     plan = design(cell, options, progress=tell)
@@ -181,13 +182,23 @@ def next_poses(
     own = plan.gain.sure
     reached = max(own, sure) if sure else math.hypot(own, lacking)
     plan = replace(plan, gain=(gain := plan.gain.lacking(lacking, reached)))
+    required = model.cell.require.new_poses if require is None else require
     verdict = verdict_of(gain, reached, required, least_gain)
     return NextPoses(
-        verdict=verdict, plan=plan if verdict == "measure" else None, batch=len(plan), gain=gain,
-        required=required, reached=reached, found=() if why is None else why.effects,
-        doubts=() if why is None else _in_doubt(why), least_gain=least_gain, source=table.source,
-        diagnosis=why, calibration=fit,
+        verdict, plan if verdict == "measure" else None, len(plan), gain, required, reached,
+        least_gain, table.source, why, fit,
     )  # fmt: skip
+
+
+def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell:
+    """The cell that asks for a batch in the table's load states, chosen for the test poses."""
+    spec = cell.design
+    return replace(cell, design=replace(
+        spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,
+        loads=load_forces(table) if spec.loads is None else spec.loads,
+        # A joint whose compliance is known at its levels only can be nowhere else.
+        levels=spec.levels or cell.model.compliance_levels,
+    ))  # fmt: skip
 
 
 def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
@@ -206,13 +217,6 @@ def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
     poses = test_poses(cell, model.chain) if stated else over_the_workspace(cell, model, table)
     error = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
     return (math.inf, 0.0) if error is None else (error.sure, error.lacking or 0.0)
-
-
-def _in_doubt(why: Diagnosis) -> tuple[tuple[str, str, float], ...]:
-    """What may be missing beside or instead of what was found: effect, place and probability."""
-    found = {(f.effect, f.where) for f in why.effects}
-    every = ((c.effect, c.where, c.probability) for c in why.candidates if c.probability > DOUBT)
-    return tuple(sorted((c for c in every if c[:2] not in found), key=lambda c: -c[2]))
 
 
 def verdict_of(
