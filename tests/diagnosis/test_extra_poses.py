@@ -71,9 +71,12 @@ def eccentric(joint: str, sine: float, cosine: float = 0.0) -> Fault:
     return Fault("gear_eccentricity", joint, {"eccentricity_sin": sine, "eccentricity_cos": cosine})
 
 
+CIRCLE = eccentric("joint3", 1.5e-4, -1e-4)
+
+
 @pytest.fixture(scope="module")
 def narrow() -> tuple[Model, Measurements]:
-    return campaign(0.5, eccentric("joint3", 1.5e-4, -1e-4))
+    return campaign(0.5, CIRCLE)
 
 
 @pytest.fixture(scope="module")
@@ -83,12 +86,17 @@ def few(narrow: tuple[Model, Measurements]) -> Any:
 
 def test_few_poses_of_a_wide_range_separate_scale_from_eccentricity(narrow, few) -> None:
     """Over ±0.5 rad a circle looks like a line; beyond, it does not."""
-    _, table = narrow
+    model, table = narrow
     (pair,) = few.pairs
     assert pair.distance_before < 2 and few.probability_before < 0.6
     assert few.separable and few.n_poses <= 4 and few.probability_after >= 0.97
     assert pair.distance_after > 3.5 and few.probability_after > few.probability_random + 0.1
     assert np.abs(few.plan.q[:, 2]).max() > 1.0 > 2 * 0.5 - 1e-9 >= np.abs(table.q[:, 2]).max()
+    # Once they are measured the rivals are about as far apart as was said.
+    both = table_of(np.vstack([table.q[::6], few.plan.q[::2]]), DOWN, both=True)
+    both = measured(model.chain, model.cell, [CIRCLE], both, 0)
+    (then,) = planned(model, both, {ECCENTRIC: 0.5, SCALE: 0.5}).pairs
+    assert then.distance_before > pair.distance_after / 2
 
 
 def test_the_written_plan_repeats_the_load_states_after_the_campaign(narrow, few, tmp_path) -> None:

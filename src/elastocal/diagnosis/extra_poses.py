@@ -228,7 +228,7 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
         order += due[np.array(nearest_first(travel)) - 1].tolist()
         at = pool.q[order[-1]]
     L, markers = len(pool.forces), len(table.marker_names)
-    first_rows = [(k * L + load) * markers for k in order for load in range(L)]
+    first_rows = [len(table) + (k * L + load) * markers for k in order for load in range(L)]
     taken = set(table.configuration_labels)
     names = (name for k in count(1) if (name := f"extra{k}") not in taken)
     rows = pool.table.take(np.array(first_rows))

@@ -86,8 +86,8 @@ def rival_sets(so_far: DiagnosisData, noise: NoiseValues, diagnosis: Diagnosis) 
     hypotheses, items = {h.key: h for h in so_far.hypotheses}, dict[Key, Item]()
     chance = {(c.effect, c.where): c.probability for c in diagnosis.candidates}
     for c in diagnosis.candidates:
-        h = hypotheses[c.effect, c.where]
-        items[h.key] = Item(h, np.array([c.settings[s.key] for s in h.settings]), 0.0)
+        if h := hypotheses.get((c.effect, c.where)):
+            items[h.key] = Item(h, np.array([c.settings[s.key] for s in h.settings]), 0.0)
     found, sets = [(f.effect, f.where) for f in diagnosis.effects], list[RivalSet]()
     # Those named have their probability given that there is something, as others need, too.
     something = max(1 - diagnosis.probability_nothing, 1e-9)
