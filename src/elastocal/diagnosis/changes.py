@@ -229,8 +229,19 @@ def compare(
         f"{option('poses')} takes a whole number from 2 to {MOST_POSES}; found {poses}",
     )
     require(0 < level < 1, f"{option('level')} takes a number between 0 and 1; found {level}")
+    # The parameters of the arm itself; base and markers are set up anew in each campaign.
+    own, theirs = (
+        {p.name for p in arm.model.parameters if not CATALOGUE[p.effect].registered}
+        for arm in (before, after)
+    )
+    other = listed(sorted(own ^ theirs), NAMED)
+    require(
+        not other,
+        f"{before.source} and {after.source} are of two models: one alone has {other}; identify "
+        "both with the same effects",
+    )
     loads = _loads(before, after, given_force(load))
-    return _compared(before, after, *loads, float(level), int(poses), int(seed))
+    return _compared(before, after, own, *loads, float(level), int(poses), int(seed))
 
 
 def _loads(old: CalibratedArm, new: CalibratedArm, force: Array | None) -> tuple[Array, str]:
@@ -247,24 +258,14 @@ def _loads(old: CalibratedArm, new: CalibratedArm, force: Array | None) -> tuple
 
 
 def _compared(
-    old: CalibratedArm, new: CalibratedArm, forces: Array, whose: str, level: float, poses: int,
-    seed: int,
+    old: CalibratedArm, new: CalibratedArm, own: set[str], forces: Array, whose: str, level: float,
+    poses: int, seed: int,
 ) -> Comparison:  # fmt: skip
-    # The parameters of the arm itself; base and markers are set up anew in each campaign.
-    own, theirs = (
-        {p.name for p in arm.model.parameters if not CATALOGUE[p.effect].registered}
-        for arm in (old, new)
-    )
-    other = listed(sorted(own ^ theirs), NAMED)
-    require(
-        not other,
-        f"{old.source} and {new.source} are of two models: one alone has {other}; identify both "
-        "with the same effects",
-    )
+    """Of the parameters `own` of the arm itself, under `forces` (L, 3), which are `whose`."""
     conditions = Conditions()
     unstated = unstated_needs(old, conditions)
     before = arm_with(old, [name for name, needs in unstated.items() if not needs])
-    own &= {*before.model.names}
+    own = own & {*before.model.names}
     left = defaultdict[str, list[str]](list)
     for name, needs in unstated.items():
         if needs:

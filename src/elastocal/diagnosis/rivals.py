@@ -249,7 +249,7 @@ class Discrimination:
             _posterior_draws(item, S[of[0], of[0]], S[of[0], -1], rng)
             for item, of in zip(rivals.rivals, self.columns, strict=True)
         ]
-        self.before = self._apart(S[:-1, :-1])
+        self.before = self._squared_by(S[:-1, :-1])
         self.apart = self.distances(self.squared(range(candidates)))
         self.classes = connected_components(self.apart < APART_AT_LAST, directed=False)[1]
 
@@ -261,14 +261,14 @@ class Discrimination:
     def squared(self, chosen: Sequence[int]) -> Array:
         """d² (rivals, rivals, draws) of every ordered pair by the data so far and the chosen
         candidates; zero of a rival with itself."""
-        return self._apart(eliminated(self._gram(chosen), self.nuisance))
+        return self._squared_by(eliminated(self._gram(chosen), self.nuisance))
 
     def squared_with_each(self, chosen: Sequence[int]) -> Array:
         """d² (N, rivals, rivals, draws) with each candidate added to those chosen."""
         each = self._gram(chosen) + self.pool.transpose(0, 2, 1) @ self.pool
-        return self._apart(eliminated(each, self.nuisance))
+        return self._squared_by(eliminated(each, self.nuisance))
 
-    def _apart(self, S: Array) -> Array:
+    def _squared_by(self, S: Array) -> Array:
         n = len(self.draws)
         out = np.zeros((*S.shape[:-2], n, n, 2 * DRAWS))
         for a, b in permutations(range(n), 2):
