@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.diagnosis.baseline import SMALLEST_NOISE, Baseline, NoiseValues
+from elastocal.diagnosis.baseline import SMALLEST_NOISE, Baseline, NoiseValues, fit_baseline
 from elastocal.diagnosis.diagnosis import Diagnosis, ExtraPlan
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible, with_keys
@@ -266,7 +266,7 @@ def plan_extra(
     base, advice, none = diagnosis.calibrated, list[str](), ""
     assert base is not None
     if base.model.cell.model.torque == "measured":
-        base = replace(base, model=with_keys(base.model, torque="computed"))
+        base = fit_baseline(with_keys(base.model, torque="computed"), base.observed.table, seed)
         advice.append("torques of poses not measured yet are computed from load and weights")
     progress("extra poses: drawing candidates")
     try:
