@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Container, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -69,16 +70,26 @@ MOST_FIELDS = 4  # that one search adds
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """What a sum beside the fitted parameters grows by: `every` component may return, `others` may
-    stand in the place of one, and what was `tried` from the start, curves too, completes a kind; it
-    does without the effects `without`."""
+    """What a sum beside the fitted parameters grows by: `every` component may return, and `curves`
+    are tried from the start as well; it does without the effects `without`."""
 
     dataset: DiagnosisData
     every: Sequence[Component]
-    others: Sequence[Component]
-    tried: Sequence[Component]
-    without: frozenset[str]
+    curves: Sequence[Component]
+    without: set[str]
     progress: Progress
+
+    @cached_property
+    def others(self) -> list[Component]:
+        """What may stand in the place of another one: no joint's sag by itself where link weights
+        are one component, which hold it."""
+        shared = any(isinstance(c.effect, LinkWeights) for c in self.every)
+        return [c for c in self.every if not (shared and isinstance(c.effect, GravitySag))]
+
+    @cached_property
+    def tried(self) -> list[Component]:
+        """What completes a kind; one object, by which a sum knows what completed it."""
+        return [*self.curves, *self.others]
 
     def grown(self, found: FittedSum) -> FittedSum:
         """The sum with what shows beside it, and without what this makes needless."""
@@ -110,18 +121,15 @@ class Growth:
         """What grows from the sum where this kind of cause does not exist."""
         self.progress(f"what else may be at work than {kind}")
         gone = [c for c in found.components if c.effect.name == kind]
-        every, others, tried = (
-            [c for c in some if c.effect.name != kind]
-            for some in (self.every, self.others, self.tried)
-        )
-        bare = Growth(self.dataset, every, others, tried, self.without | {kind}, self.progress)
+        every, curves = ([c for c in some if c.effect.name != kind]
+                         for some in (self.every, self.curves))  # fmt: skip
+        bare = replace(self, every=every, curves=curves, without=self.without | {kind})
         return bare.grown(_with_lines(self.dataset, exchanged(found, gone)))
 
 
 def search_components(
-    dataset: DiagnosisData, chosen: ModelSet, open_: bool, without: Collection[str] = (),
-    progress: Progress = lambda message: None,
-) -> tuple[Growth, FittedSum] | None:  # fmt: skip
+    dataset: DiagnosisData, chosen: ModelSet, open_: bool, without: set[str], progress: Progress
+) -> tuple[Growth, FittedSum] | None:
     """The most probable sum beside the fitted parameters, and what it has grown by.
 
     `chosen` is what the forward search found: its searched constants are tried as they are, the
@@ -139,49 +147,38 @@ def search_components(
         searched = (i for i in chosen.items if i.known and len(i.settings))
         every = [*moving, *known, *(component_of(full, item) for item in searched)]
         curves = [] if JointCurve.name in without else list(joint_curves(full))
-        # A joint's sag by itself where link weights are not one component, which hold it.
-        shared = any(isinstance(c.effect, LinkWeights) for c in every)
-        others = [c for c in every if not (shared and isinstance(c.effect, GravitySag))]
-        tried = [*curves, *others]  # one object, by which a sum knows what completed it
-        if not (weighed or open_ or promised(chosen, tried) > PROMISING):
+        growth = Growth(full, every, curves, without, progress)
+        if not (weighed or open_ or promised(chosen, growth.tried) > PROMISING):
             return None
-        progress(f"sizes of {len(tried)} components at once")
-        found = fit_sum(data, tried, instrument)
+        progress(f"sizes of {len(growth.tried)} components at once")
+        found = fit_sum(data, growth.tried, instrument)
         if weighed or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
     found, few = with_own_axes(found), len(full.blocks.member) <= FEW_POSES
     progress(f"families of lines {'before curves' if few else 'beside the components'}")
-    if few:
-        found = _with_lines_first(full, found, curves, others, tried, instrument)
-    else:
-        found = _with_lines(full, found)
-    growth = Growth(full, every, others, tried, frozenset(without), progress)
+    found = _with_lines_first(growth, found, instrument) if few else _with_lines(full, found)
     return growth, growth.grown(found)
 
 
-def _with_lines_first(
-    dataset: DiagnosisData, found: FittedSum, curves: Sequence[Component],
-    others: Sequence[Component], tried: Sequence[Component], instrument: NoiseValues,
-) -> FittedSum:  # fmt: skip
+def _with_lines_first(growth: Growth, found: FittedSum, instrument: NoiseValues) -> FittedSum:
     """The sum with families of lines, sought beside the others before curves join.
 
     A curve takes up the lines of its joint as far as few poses show them, and then none of them
     stands out.  A sum without curves is one of the others already.
     """
-    curved = any(c in curves for c in found.components)
-    first, pool = found, tried
-    if curved:
-        first, pool = fit_sum(found.sums.data, others, instrument), others
+    dataset, first, pool = growth.dataset, found, growth.tried
+    if curved := any(c in growth.curves for c in found.components):
+        first, pool = fit_sum(found.sums.data, growth.others, instrument), growth.others
     first = begun = completed(first, pool)
     for _ in range(TWICE):
         before = first
-        first = completed(_with_lines(dataset, first), tried)
+        first = completed(_with_lines(dataset, first), growth.tried)
         if first.score <= before.score + GAINED:
             break
     if curved or first is not begun:
-        first = _wider(first, curves)
+        first = _wider(first, growth.curves)
     return first if not curved or first.score > found.score else _with_lines(dataset, found)
 
 

@@ -228,15 +228,11 @@ def _diagnosed(
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
-    dataset, search, found, suspects = _searched(dataset, options, progress)
-    rng = np.random.default_rng(options.seed)
-    few = FewAnswer.of(dataset, found, rng)
+    dataset, found, suspects = _searched(dataset, options, progress)
+    few = FewAnswer.of(dataset, found, np.random.default_rng(options.seed))
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
-    tests = structure_tests(found.first)
-    if not whole and (settled := search.settled(found)) is not found:
-        found, few = settled, FewAnswer.of(dataset, settled, rng)
-    answer = whole or few
+    tests, answer = structure_tests(found.first), whole or few
     answers = _pieces(answer, dataset, found.nothing.noise, tests, fields)
     added = (*answers["effects"], *answers["slight"])
     there = () if whole is None else {(f.effect, f.where) for f in added}
@@ -350,24 +346,22 @@ def _pieces(
 
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, ForwardSelection, SelectedEffects, BoolArray]:
+) -> tuple[DiagnosisData, SelectedEffects, BoolArray]:
     """What is missing, the data without the faulty readings, which are sought twice, since beside
     a large effect nothing looks faulty, or the wrong readings do, and suspects (N,) that stay."""
 
-    def search_without(faulty: BoolArray) -> tuple[ForwardSelection, SelectedEffects]:
+    def search_without(faulty: BoolArray) -> SelectedEffects:
         good = dataset.without(faulty)
-        blocks = generic_blocks(good)
-        search = ForwardSelection(good, blocks, options.false_alarm, options.seed)
-        return search, search.run()
+        return ForwardSelection(good, generic_blocks(good), options.false_alarm, options.seed).run()
 
     progress("noise floor")
     faulty, suspects = screen_outliers(dataset, dataset.data)
     progress("searching for what is missing")
-    search, found = search_without(faulty)
+    found = search_without(faulty)
     if found.chosen.items:
         before, every = faulty, found.chosen.data.without(np.zeros_like(faulty))
         faulty, suspects = screen_outliers(found.dataset, every)
         if (faulty != before).any():
             progress("searching again without outliers")
-            search, found = search_without(faulty)
-    return dataset.without(faulty), search, found, suspects
+            found = search_without(faulty)
+    return dataset.without(faulty), found, suspects

@@ -470,8 +470,6 @@ FAR_BEHIND, BEHIND_COMPLETE = 60.0, 20.0
 DOUBT_MORE = 0.05
 LARGEST_SET = 3  # effects that one claim names: more are no answer
 CLOSE_BLOCKS = 3
-CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
-PART = 0.3
 # Causes from which on a sum of all that may act is the better judge: of fewer this search is.
 MANY = 3
 
@@ -500,9 +498,6 @@ class ForwardSelection:
     level: float
     seed: int
     _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._start = self.dataset
 
     @cached_property
     def signs(self) -> Array:
@@ -555,32 +550,11 @@ class ForwardSelection:
         if not current.items or p is None:
             current, p = nothing, first.chance
             self.dataset = dataset
-        self._turn_to(self.dataset)
         slots = slots or [start]
         return SelectedEffects(self.dataset, current, tuple(slots), p, nothing, first, alone)
 
-    def settled(self, found: SelectedEffects) -> SelectedEffects:
-        """What effects of the catalogue alone would make of it, where that is clearly better.
-
-        A block without a name fits a little of everything, and may come first where several
-        effects act at once.
-        """
-        slot = found.slots[0]
-        alone = max((s for i, s in zip(slot.items, slot.scores, strict=True) if i.known),
-                    default=-np.inf)  # fmt: skip
-        if not found.chosen.unknown or alone <= PART * slot.scores.max():
-            return found
-        named = ForwardSelection(self._start, [], self.level, self.seed).run()
-        if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
-            return found
-        self._turn_to(named.dataset)
-        chosen, slots = self._reexamined(named.chosen, list(named.slots))
-        return replace(found, dataset=self.dataset, chosen=chosen, slots=tuple(slots),
-                       p_value=named.p_value)  # fmt: skip
-
     def _turn_to(self, dataset: DiagnosisData) -> None:
-        """What was fitted about another fit is void, and after a search only fills the memory:
-        each set holds its columns."""
+        """What was fitted about another fit is void."""
         self.dataset = dataset
         self._fitted.clear()
 

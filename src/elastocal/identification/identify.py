@@ -427,10 +427,12 @@ def _adapted(
     values and the kept parameters fitted anew with these weights, until neither changes.  Then the
     parameters are chosen again by what is there now, if other readings are good or the weights show
     more, and with them, as whenever the good readings have changed, the kind of noise.  Noise that
-    knows the arm's `visits` counts, and readings are judged, unless told otherwise.
+    knows the arm's `visits` counts, and readings are judged, unless told otherwise.  More
+    parameters that do not settle are none: the fit without them stays.
     """
     every, same = course.every, True
     noise: NoiseFit | None = None
+    fewer: tuple[Solution, NoiseFit, BoolArray, Readings] | None = None
     problem, solution, now, fitted, restarts = every.problem, start, good, good, 0
 
     def linear() -> Readings:
@@ -454,7 +456,7 @@ def _adapted(
             continue
         if judging and restarts < RESTARTS and not np.array_equal(now, fitted):
             start, fitted, restarts = every if now.all() else course.refit(now), now, restarts + 1
-            solution = start
+            solution, fewer = start, None
         else:
             # Weights that make light of what is noisy may show more than those of the first fit.
             more = start.reduction
@@ -463,8 +465,12 @@ def _adapted(
                 more = choose(fit.problem, fit.of_free, sigma, more.threshold)
             if len(more.kept) <= len(kept):
                 break
+            fewer = solution, noise, now, readings
             start = replace(start, reduction=more)
         readings, same = linear(), False
+    else:
+        if fewer is not None:
+            solution, noise, now, readings = fewer
     assert noise is not None
     final = readings.take(now)
     return solution, not_knowing_times(estimate_noise(final, like=noise)), now
