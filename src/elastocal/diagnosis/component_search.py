@@ -375,24 +375,13 @@ def _with_corrections(
     shared = np.where(loud, np.minimum(noise.shared, usual.shared), noise.shared)
     quieter = replace(found, noise=replace(noise, joint=joint, shared=shared))
     for begun in [found, quieter] if loud.any() else [found]:
-        more = _without_imitators(begun, without_a_name(dataset, begun, MOST_FIELDS, without))
+        more = without_a_name(dataset, begun, MOST_FIELDS, without)
         some = [more, *([c] for c in more[:TRIED] if few and len(more) > 1)]
         for chosen in filter(None, some):
             fitted = exchanged(begun, [], chosen)
             if fitted.score > found.score + GAINED:
                 return fitted
     return found
-
-
-def _without_imitators(found: FittedSum, more: Sequence[Component]) -> list[Component]:
-    """The likeliest first; of a step and a smooth course in time at one place, which imitate each
-    other, the likelier alone."""
-    likeliest: dict[tuple[str, ...], Component] = {}
-    each = zip(evidence_beside(found, more), more, strict=True)
-    for _, c in sorted(each, key=lambda pair: -pair[0]):
-        of = (c.where, c.family, "" if c.family == "time" else c.follows)
-        likeliest.setdefault(of, c)
-    return list(likeliest.values())
 
 
 def _refitted(found: FittedSum) -> FittedSum:
