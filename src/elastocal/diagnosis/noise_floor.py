@@ -424,7 +424,8 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
     B = blocks.unpack(data.X / np.sqrt(data.precision)).reshape(e.size, -1)
     # What the readings tell of the parameters, beside what was known of them.
     U, shown, _ = linalg.svd(B, full_matrices=False, lapack_driver="gesvd")
-    B = U[:, shown > np.sqrt(data.mean_variance)].reshape(*e.shape[:2], -1)
+    told = max(int((shown > np.sqrt(data.mean_variance)).sum()), 1)
+    B = U[:, :told].reshape(*e.shape[:2], told)
     in_visit, own = np.bincount(blocks.visit), "stated" if data.stated else "independent"
     # A visit that is off as a whole widens the scatter of joints that all readings tell.
     kinds = [own, f"{own}+{JOINTS}"] if np.median(in_visit) >= SEVERAL else [own]
