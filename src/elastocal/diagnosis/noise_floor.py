@@ -435,7 +435,8 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
         with suppress(ElastocalError):  # so few judge none
             for kind in kinds:
                 good = settle(now, kind, good)[1]
-        return ~good
+            return ~good
+        return np.zeros_like(good)
 
     suspects = contradicted(B, e)
     if suspects.mean() > MOST:
@@ -448,8 +449,8 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
             rows = blocks.visit == visit
             Q = linalg.orth(moved[rows].reshape(-1, moved.shape[2]), rcond=1e-6)
             for values in (B, e):
-                own = values[rows].reshape(len(Q), -1)
-                values[rows] = (own - Q @ (Q.T @ own)).reshape(values[rows].shape)
+                mine = values[rows].reshape(len(Q), -1)
+                values[rows] = (mine - Q @ (Q.T @ mine)).reshape(values[rows].shape)
         place = base.observed.place
         agree = np.bincount(place, ~suspects)[place] > 0
         faulty &= ~np.isin(blocks.visit, whole) | agree | contradicted(B, e)
