@@ -421,25 +421,10 @@ def kept_of(dof: float, values: int, size: int) -> TrimmedNoise:
 APART = 1e8  # times its own: it then moves nothing, and taking it off again leaves digits
 
 
-def deleted(P: Array, u: Array, own: Array, apart: Array) -> tuple[Array, Array, Array]:
-    """Errors (N, size) of predicting observations from all others, of blocks P_ii (N, size, size)
-    and u = P e; axes (N, size, size) and variances (N, size) along them.
-
-    Observations have the noise `own` (N, size, size) and `apart` (N,) times more of it, which the
-    variances are without.  Along a direction that an observation alone determines all are zero.
-    """
-    root = np.linalg.cholesky(own) * np.sqrt(1 + apart)[:, None, None]
-    values, vectors = np.linalg.eigh(root.transpose(0, 2, 1) @ P @ root)
-    inverse = np.where(values > ALONE, 1 / np.maximum(values, ALONE), 0.0)
-    axes = root @ vectors
-    d = (axes * inverse[:, None, :]) @ (axes.transpose(0, 2, 1) @ u[..., None])
-    left = np.where(values > ALONE, inverse - (apart / (1 + apart))[:, None], 0.0)
-    return d[..., 0], axes, np.maximum(left, 0.0)
-
-
 def prediction_errors(found: NoiseFit, readings: Readings, good: BoolArray, own: Array) -> Array:
     """Errors (N, size) of predicting each reading from the `good` ones (N,) that are not it, over
-    their deviations; `own` (N, size, size) is the noise of single readings."""
+    their deviations; `own` (N, size, size) is the noise of single readings.  Along a direction that
+    a reading alone determines its error is zero."""
     n, size = len(readings), readings.size
     apart = np.where(good, 0.0, APART)
     weights = weights_of(found, readings, apart[:, None, None] * own)
@@ -451,8 +436,14 @@ def prediction_errors(found: NoiseFit, readings: Readings, good: BoolArray, own:
     at = np.arange(n * size).reshape(n, size)
     i, j = np.broadcast_arrays(at[:, :, None], at[:, None, :])
     inverse = np.asarray((back @ weights.whiten).tocsr()[i.ravel(), j.ravel()]).reshape(i.shape)
-    d, axes, left = deleted(inverse - H @ H.transpose(0, 2, 1), u, own, apart)
-    deviation = np.sqrt((axes**2 @ left[..., None])[..., 0])
+    P = inverse - H @ H.transpose(0, 2, 1)
+    root = np.linalg.cholesky(own) * np.sqrt(1 + apart)[:, None, None]
+    values, vectors = np.linalg.eigh(root.transpose(0, 2, 1) @ P @ root)
+    seen, axes = values > ALONE, root @ vectors
+    inverse = np.where(seen, 1 / np.maximum(values, ALONE), 0.0)
+    d = ((axes * inverse[:, None, :]) @ (axes.transpose(0, 2, 1) @ u[..., None]))[..., 0]
+    left = np.where(seen, inverse - (apart / (1 + apart))[:, None], 0.0)
+    deviation = np.sqrt((axes**2 @ np.maximum(left, 0.0)[..., None])[..., 0])
     return np.divide(d, deviation, out=np.zeros_like(d), where=deviation > 0)
 
 
