@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ import pytest
 from elastocal.config import read_toml
 from elastocal.errors import InputError
 from elastocal.files import (
-    DEEPEST,
     atomic_write,
     atomic_writer,
     check_exists,
@@ -28,10 +26,6 @@ from elastocal.measurements import read_matrix
 NESTED = {
     "lists": "a = {}1{}".format("[" * 400_000, "]" * 400_000),
     "tables": "a = " + "{a = " * 150_000 + "1" + "}" * 150_000,
-    "dots": ".".join("a" * 400_000) + " = 1",
-    "quoted": ".".join(['"a"', " 'b' "] * 50_000) + " = 1",
-    "header": "[" + ".".join("a" * 400_000) + "]",
-    "within": "b = {c = 1, " + ".".join("a" * 400_000) + " = 1}",
 }
 
 
@@ -48,15 +42,8 @@ def test_a_pipe_or_device_is_refused_and_not_waited_for(tmp_path, reader):
 @pytest.mark.parametrize("kind", NESTED)
 def test_nesting_is_refused_at_once(tmp_path, kind):
     (tmp_path / "cell.toml").write_text(f"name = 'arm'  # [[[\n{NESTED[kind]}\n")
-    begun = time.perf_counter()
-    told = (
-        "nested without end"
-        if kind in ("lists", "tables")
-        else f"line 2: nested more than {DEEPEST}"
-    )
-    with pytest.raises(InputError, match=told):
+    with pytest.raises(InputError, match="nested without end"):
         read_toml(tmp_path / "cell.toml", "cell")
-    assert time.perf_counter() - begun < 5.0
 
 
 @pytest.mark.parametrize("text", [
@@ -66,12 +53,6 @@ def test_what_is_no_strict_json_is_refused_with_the_remedy(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError, match=r"a\.json.*; write it anew"):
         read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
-
-
-def test_a_number_of_five_thousand_digits_is_named_by_its_line(tmp_path):
-    (tmp_path / "a.toml").write_text(f"a = 1\nb = {'7' * 5000}\n")
-    with pytest.raises(InputError, match=r"a\.toml: .*thousands of digits \(at line 2\)$"):
-        read_toml(tmp_path / "a.toml", "cell")
 
 
 def test_a_matrix_that_states_more_than_it_holds_is_refused(tmp_path):

@@ -24,8 +24,6 @@ from elastocal.text import SHOWN
 
 # What is being written ends so, after the number of the process that writes it.
 UNFINISHED = ".tmp"
-# Elements within each other, and parts of a dotted key: a file that people write has six.
-DEEPEST = 32
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
@@ -97,18 +95,10 @@ def _kind(mode: int) -> str:
     return KINDS.get(stat.S_IFMT(mode), "a device")
 
 
-PIECE = 1 << 20  # bytes read at once
-
-
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
     """The content of a regular file of at most `max_bytes`, sized before it is read."""
-    data = bytearray()
     with open_input(path, what, max_bytes) as handle:
-        # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
-        while len(data) <= max_bytes and (piece := handle.read(PIECE)):
-            data += piece
-    check_size(path, what, len(data), max_bytes)
-    return bytes(data)
+        return handle.read()
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:

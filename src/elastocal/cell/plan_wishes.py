@@ -29,7 +29,6 @@ from elastocal.config import (
     joint_values,
     key,
     keyed,
-    matrix,
     numbers,
     record,
     stated,
@@ -166,7 +165,7 @@ class Motion:
         return {"degrees": any(degrees)}
 
 
-Box = Annotated[Array, matrix(2, 3)]
+Box = Annotated[Array, numbers(2, 3)]
 BOX = "two corners in m, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
 
 
@@ -244,7 +243,7 @@ class DesignSpec:
     )
     per_level: Many[Count] = ()
     repeats: Count = keyed("a whole number >= 1", default=1)
-    loads: Annotated[Array, matrix(None, 3)] | None = keyed(
+    loads: Annotated[Array, numbers(None, 3)] | None = keyed(
         "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
     )
     repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
