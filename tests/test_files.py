@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -111,45 +109,6 @@ def test_what_replaces_a_file_is_as_secret_as_it_was(tmp_path):
     (tmp_path / "a.txt").chmod(0o600)
     atomic_write(tmp_path / "a.txt", "new")
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o600
-
-
-WRITER = """
-import os, sys
-from elastocal.files import atomic_writer, atomic_write, together
-with together():
-    atomic_write(sys.argv[1], "half")
-    with atomic_writer(sys.argv[2]) as handle:
-        handle.write("half")
-        print(flush=True)
-        sys.stdin.read()
-"""
-
-
-def test_what_a_killed_process_left_goes_when_the_output_is_written_again(tmp_path):
-    """Not before it is killed; and nothing but what it wrote."""
-    outputs = [tmp_path / "a.txt", tmp_path / ("b" * 60)]
-    others = [
-        tmp_path / name for name in (".a.txt.tmp", ".c.txt.999999999-0123abcd.tmp", "a.txt.tmp")
-    ]
-    (tmp_path / ".a.txt.999999999-0123abcd.tmp").symlink_to("link")
-    for path in (*others, tmp_path / "link"):
-        path.write_text("of the user")
-    command = [sys.executable, "-c", WRITER, *map(str, outputs)]
-    writer = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    writer.stdout.readline()
-
-    def unfinished() -> int:
-        return len([n for n in os.listdir(tmp_path) if n.startswith((".a", ".b"))]) - 2
-
-    for output in outputs:
-        atomic_write(output, "new")
-    assert unfinished() == 2
-    writer.kill()
-    writer.communicate()
-    for output, left in zip(outputs, (1, 0), strict=True):
-        atomic_write(output, "newer")
-        assert unfinished() == left and output.read_text() == "newer"
-    assert all(path.read_text() == "of the user" for path in others)
 
 
 def test_files_written_together_appear_at_the_end(tmp_path):

@@ -514,12 +514,6 @@ def _direction(value: object) -> Array:
     return vector if np.abs(vector - unit).max() < 1e-12 else unit
 
 
-def direction(vector: Array, spot: Spot, name: str) -> Array:
-    """The same of a key."""
-    spot.require(np.any(vector), f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]")
-    return _direction(vector)
-
-
 def existing_file(found: str, spot: Spot, name: str) -> Path:
     return check_exists(spot.path.parent / found, spot.key(name), spot.path)
 
@@ -544,7 +538,6 @@ File = Annotated[Path, AS_PATH]
 Rotation = Annotated[Array, numbers(3, 3)]
 Transform = Annotated[Array, numbers(4, 4)]
 Direction = Annotated[Array, PlainValidator(_direction)]
-# Fields of these three types, which a file states otherwise.
+# Fields of these two types, which a file states otherwise.
 file_key = partial(keyed, form=Text, into=existing_file)
 turn_key = partial(keyed, form=Vector3, into=lambda v, *_: rotation_from_rpy(np.radians(v)))
-direction_key = partial(keyed, form=Vector3, into=direction)

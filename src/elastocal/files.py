@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import secrets
 import signal
 import stat
@@ -22,8 +21,6 @@ from typing import Any, BinaryIO
 from elastocal.errors import InputError, require
 from elastocal.text import SHOWN
 
-# What is being written ends so, after the number of the process that writes it.
-UNFINISHED = ".tmp"
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
@@ -231,10 +228,7 @@ def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
             with open(path, f"w{mode}", **how) as device:
                 yield device
             return
-        with suppress(OSError):
-            remove_abandoned(target.parent, re.escape(target.name[:40]))
-        own = f"{os.getpid()}-{secrets.token_hex(4)}"
-        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
         try:
             with open(temporary, f"x{mode}", **how) as handle:
                 if target.exists():  # what others may not read they may not read afterwards
@@ -280,24 +274,3 @@ def _undisturbed() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if noted:
         before(signal.SIGINT, None)
-
-
-def remove_abandoned(folder: Path, name: str) -> None:
-    """Remove what killed processes left in `folder` of files whose names match the pattern `name`:
-    regular files named as unfinished ones are, whose process runs no longer."""
-    known = re.compile(rf"\.{name}\.(\d+)-[0-9a-f]{{8}}{re.escape(UNFINISHED)}", re.DOTALL)
-    for path in folder.iterdir():
-        found = known.fullmatch(path.name)
-        if found and stat.S_ISREG(path.lstat().st_mode) and not _runs(int(found[1])):
-            path.unlink()
-
-
-def _runs(process: int) -> bool:
-    try:
-        if os.name == "posix":  # elsewhere the signal 0 would end it
-            os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # somebody else's
-        return True
-    return True

@@ -449,20 +449,16 @@ def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int 
     from joblib.externals import loky
 
     jobs = jobs or loky.cpu_count()
+    if jobs == 1:
+        yield from (execute(study.sources, task) for task in tasks if not stop.asked)
+        return
     env = {name: os.environ.get(name, "1") for name in ONE_THREAD}
     # Of a pool that is started anew where a process died.
     pool = partial(loky.get_reusable_executor, min(jobs, len(tasks)), initializer=IGNORING, env=env)
-
-    def at_once(*call: Any) -> Future[Row]:
-        done = Future[Row]()
-        done.set_result(call[0](*call[1:]))
-        return done
-
     try:
-        submit = at_once if jobs == 1 else lambda *call: pool().submit(*call)
-        yield from _lines(study, tasks, stop, submit, lambda: jobs)
+        yield from _lines(study, tasks, stop, lambda *call: pool().submit(*call), lambda: jobs)
     finally:
-        if jobs > 1 and tasks:
+        if tasks:
             pool().shutdown(kill_workers=True)
 
 
