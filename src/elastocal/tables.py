@@ -239,6 +239,15 @@ def column(stem: str, unit: str) -> str:
     return f"{stem}_{unit}" if unit else stem
 
 
+NUMBERING = "(id|no|nr|num|number|name)?"
+# What other people's tables call a column, without its unit, _ and capitals → its stem.
+CALLED = {
+    rf"(pose|conf|config|configuration|point|posture){NUMBERING}": "configuration",
+    rf"(marker|target|reflector|smr){NUMBERING}": "marker",
+    r"(?:j|joint|axis|a|theta)(\d+)": r"q\1",
+    r"(?:f|force)([xyz])": r"force_\1",
+    r"(?:m|tau|trq|torque)(\d+)": r"torque_\1",
+}
 # The columns of a table by their families, each in the order of its stems.
 Columns = Mapping[str, tuple[Column, ...]]
 Choose = Callable[[Sequence[str]], Columns]  # by the header
@@ -248,10 +257,12 @@ def match_columns(
     source: str, header: Sequence[str], known: Mapping[str, Family],
     passed_over: Callable[[str], bool] = lambda text: False,
     explain: Callable[[str], str | None] = lambda text: None,
+    called: Mapping[str, str] = CALLED, valid: str = "",
 ) -> Columns:  # fmt: skip
     """Which column of a header is which of the `known` families.
 
-    `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
+    `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one;
+    `called`: what its name may mean, as CALLED; `valid`: what to say where it is like none.
     """
     for i, text in enumerate(header, start=1):
         told = "has no name in the header; name it or remove the separator too many"
@@ -270,7 +281,8 @@ def match_columns(
         if text.startswith(IGNORED) or passed_over(text):
             continue
         if text not in meaning:
-            raise InputError(f"{source}: {explain(text) or _unknown(text, known, header)}")
+            told = explain(text) or _unknown(text, known, header, called, valid)
+            raise InputError(f"{source}: {told}")
         family, stem, unit = meaning[text]
         found = present.setdefault(family.name, {})
         if stem in found:
@@ -331,18 +343,10 @@ def check_columns(
     return columns
 
 
-NUMBERING = "(_?(id|no|nr|num|number|name))?"
-# What other people's tables call a column, without its unit and in small letters → its stem.
-CALLED = {
-    rf"(pose|conf|config|configuration|point|posture){NUMBERING}": "configuration",
-    rf"(marker|target|reflector|smr){NUMBERING}": "marker",
-    r"(?:j|joint|axis|a|theta)_?(\d+)": r"q\1",
-    r"(?:f|force)_?([xyz])": r"force_\1",
-    r"(?:m|tau|trq|torque)_?(\d+)": r"torque_\1",
-}
-
-
-def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> str:
+def _unknown(
+    text: str, known: Mapping[str, Family], header: Sequence[str], called: Mapping[str, str],
+    valid: str,
+) -> str:  # fmt: skip
     ways: dict[str, list[str]] = {}
     for family in known.values():
         for stem in family.units:
@@ -355,14 +359,13 @@ def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> s
             f"column {quoted(text)}: the unit {unit} is not taken here; write "
             f"{' or '.join(ways[stem])}"
         )
-    name = (stem if unit in OTHER_UNITS else text).lower()
-    called = (
-        found.expand(own) for way, own in CALLED.items() if (found := re.fullmatch(way, name))
-    )
-    meant = next(called, "")
-    valid = [way for way in ways.get(meant, []) if way.endswith(f"_{unit}")] or ways.get(meant, [])
-    hint = f" (did you mean '{valid[0]}'?)" if valid and not {*ways[meant]} & {*header} else ""
-    hint = hint or did_you_mean(text, [way for own in ways.values() for way in own])
+    name = (stem if unit in OTHER_UNITS else text).lower().replace("_", "")
+    meant = (found.expand(own) for way, own in called.items() if (found := re.fullmatch(way, name)))
+    own = ways.get(next(meant, ""), [])
+    near = next((way for way in own if way.endswith(f"_{unit}")), own[0] if own else "")
+    hint = f" (did you mean '{near}'?)" if own and not {*own} & {*header} else ""
+    if not own:
+        hint = did_you_mean(text, [way for each in ways.values() for way in each]) or valid
     return (
         f"unknown column {quoted(text)}{hint}; correct the name, or start "
         "it with '#', '_' or 'note' to have it ignored"
