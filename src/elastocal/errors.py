@@ -156,33 +156,27 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
     Memory that ends and numbers that cannot be computed with come from the input; whatever else
     is raised by code of elastocal is a fault of its own, and asked to be reported.
     """
-    import traceback
-
-    if plugin := _of_plugin(error):
+    what = f"{type(error).__name__}: {error}".rstrip(": ")
+    if plugin := _of_plugin(error, what):
         return plugin, 2
     named = [str(p) for p in read if p is not None for p in (p if isinstance(p, list) else [p])]
-    files = listed(map(str, named)) or "the options"
-    what = f"{type(error).__name__}: {error}".rstrip(": ")
-    where = traceback.extract_tb(error.__traceback__)[-1:]
-    ours = any(Path(frame.filename).is_relative_to(Path(__file__).parent) for frame in where)
+    files, (file, line) = listed(named) or "the options", raised_at(error, bool) or ("", 0)
+    ours = Path(file).is_relative_to(Path(__file__).parent)
     numbers = isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError"
     if isinstance(error, MemoryError):
-        return (
-            f"{files}: memory ends ({what}); give fewer readings, or ask for less by the options",
-            1,
+        told = f"memory ends ({what}); give fewer readings, or ask for less by the options"
+    elif numbers or (isinstance(error, ValueError | RuntimeError) and not ours):
+        told = (
+            f"holds numbers, or options give some, that cannot be computed with ({what}); look for "
+            "values far too large or too small, or in another unit"
         )
-    if numbers or (isinstance(error, ValueError | RuntimeError) and not ours):
-        return (
-            f"{files}: holds numbers, or options give some, that cannot be computed with ({what}); "
-            "look for values far too large or too small, or in another unit",
-            1,
+    else:
+        told = (
+            f"not foreseen: {what} at {Path(file).name}, line {line}. Please report this fault of "
+            f"elastocal with the command and its files ({TRACEBACK}=1 shows where)"
         )
-    place = "".join(f" at {Path(f.filename).name}, line {f.lineno}" for f in where)
-    return (
-        f"{files}: not foreseen: {what}{place}. Please report this fault of elastocal with the "
-        f"command and its files ({TRACEBACK}=1 shows where)",
-        INTERNAL,
-    )
+        return f"{files}: {told}", INTERNAL
+    return f"{files}: {told}", 1
 
 
 def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, int] | None:
@@ -196,7 +190,7 @@ def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, in
     return next(((f.filename, f.lineno or 1) for f in frames[::-1] if own(f.filename)), None)
 
 
-def _of_plugin(error: Exception) -> str:
+def _of_plugin(error: Exception, what: str) -> str:
     """Whose fault it is where a plug-in raised `error`, or what it gave did; else empty."""
     import sys
     import traceback
@@ -204,7 +198,6 @@ def _of_plugin(error: Exception) -> str:
     loader: Any = sys.modules.get("elastocal.plugin_loader")
     if loader is None:
         return ""
-    what = f"{type(error).__name__}: {error}".rstrip(": ")
     ran = {str(path) for path in loader._files}
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         file, mine = frame.f_code.co_filename, frame.f_locals.values()
