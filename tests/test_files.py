@@ -45,7 +45,7 @@ def test_nesting_is_refused_at_once(tmp_path, kind):
 
 
 @pytest.mark.parametrize("text", [
-    "[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{", "9" * 5000, "-1e400",
+    "[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{", "9" * 5000,
 ])  # fmt: skip
 def test_what_is_no_strict_json_is_refused_with_the_remedy(tmp_path, text):
     (tmp_path / "a.json").write_text(text)

@@ -249,11 +249,9 @@ def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[s
     except RecursionError:
         raise InputError(f"{path}: nested without end; check its brackets") from None
     except ValueError as error:
-        reason = str(error)
-        if "(at end of document)" in reason:
-            lines = text.split("\n")
-            end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
-            reason = reason.replace("(at end of document)", end)
+        lines = text.split("\n")
+        end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
+        reason = str(error).replace("(at end of document)", end)
         raise InputError(f"{path}: not valid TOML: {reason}") from None
 
 

@@ -11,13 +11,12 @@ argument, on the command line the flag.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from elastocal.text import SHOWN, did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
 FLAGS = {
@@ -43,25 +42,12 @@ GONE = {
     "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
     "design.robust_samples": "it went with design.robust; drop it",
 }
-# No name of a file is as long, and nobody reads more.
-LONGEST_WORD, LONGEST_MESSAGE = 400, 8000
-_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
-
-
-def bounded(message: str) -> str:
-    """A message whose words, keys and names of files among them, have an end."""
-    short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
-    half = LONGEST_MESSAGE // 2
-    return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
 
 
 class ElastocalError(Exception):
     """Root of all errors that elastocal raises on purpose."""
 
     exit_code = 2
-
-    def __init__(self, message: object = "") -> None:
-        super().__init__(bounded(str(message)))
 
 
 class InputError(ElastocalError):

@@ -7,7 +7,6 @@ without end, and a device such as /dev/zero has no end.
 from __future__ import annotations
 
 import json
-import math
 import os
 import secrets
 import signal
@@ -19,9 +18,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from elastocal.errors import InputError, require
-from elastocal.text import SHOWN
-
-LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
 def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> int:
@@ -104,25 +100,17 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
 
 
 def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
-    """What a JSON file of at most `max_bytes` holds; whole numbers too long for that are floats.
+    """What a JSON file of at most `max_bytes` holds.
 
     Raises InputError, with `remedy`, where it is no strict JSON: names the line where there is one.
     """
     text = read_text(path, what, max_bytes)
 
-    def number(digits: str) -> float:
-        if math.isinf(value := float(digits)):
-            raise ValueError(f"{digits[:SHOWN]}… is beyond all numbers")
-        return value
-
-    def whole(digits: str) -> int | float:
-        return int(digits) if len(digits) <= LONGEST_INTEGER else number(digits)
-
     def refuse(name: str) -> None:
         raise ValueError(f"{name} is no number of JSON")
 
     try:
-        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=refuse)
+        return json.loads(text, parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
     except ValueError as error:

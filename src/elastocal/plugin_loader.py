@@ -29,7 +29,6 @@ MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
 TRUSTED = "ELASTOCAL_PLUGINS"  # 1, or folders whose cells may have their plug-ins run
 
-_installed: list[str] = []  # entry points that were run
 _files: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
 REGISTERED: set[type] = set()  # the classes of effects, noise models and criteria that they gave
 
@@ -97,28 +96,26 @@ def is_plugin_file(module: str) -> bool:
     return module.endswith(".py")
 
 
+def load_installed() -> None:
+    _load_installed_in(tuple(sys.path))
+
+
 @cache
-def _installed_in(folders: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """The entry points of packages in the folders of sys.path: looking for them reads what every
-    package says of itself, so it is done once in a process, or again after `cache_clear`."""
+def _load_installed_in(folders: tuple[str, ...]) -> None:
+    """Of packages in these folders: looking for them reads what every package says of itself, so it
+    is done once in a process."""
     from importlib.metadata import entry_points
 
-    return tuple(entry_points(group=GROUP))
+    for point in entry_points(group=GROUP):
+        source = f" of the package {point.dist.name}" if point.dist else ""
 
+        def enter(point: EntryPoint = point) -> None:
+            """A module registers when it is imported, a function when it is called."""
+            found = point.load()
+            if not isinstance(found, ModuleType):
+                found()
 
-def load_installed() -> None:
-    for point in _installed_in(tuple(sys.path)):
-        if point.value not in _installed:
-            source = f" of the package {point.dist.name}" if point.dist else ""
-
-            def enter(point: EntryPoint = point) -> None:
-                """A module registers when it is imported, a function when it is called."""
-                found = point.load()
-                if not isinstance(found, ModuleType):
-                    found()
-
-            _run(f"plug-in '{point.name}'{source}", None, enter)
-            _installed.append(point.value)
+        _run(f"plug-in '{point.name}'{source}", None, enter)
 
 
 def _import(name: str) -> None:
