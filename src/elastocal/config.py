@@ -276,7 +276,7 @@ class Spot:
 
     def require(self, condition: object, sentence: str) -> None:
         """Raises InputError with the file and `sentence` unless `condition` holds."""
-        require(bool(condition), f"{self.path}: {sentence}")
+        require(condition, f"{self.path}: {sentence}")
 
 
 def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> Record:

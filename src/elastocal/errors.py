@@ -207,7 +207,7 @@ def said_of(where: object) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from None
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: object, message: str) -> None:
     if not condition:
         raise InputError(message)
 

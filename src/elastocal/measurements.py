@@ -653,7 +653,7 @@ def read_matrix(path: str | Path, what: str) -> Array:
         return np.array(found, dtype=float)
     lines = enumerate(read_text(path, what, tables.MOST_BYTES).splitlines(), start=1)
     rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if line.strip()]
-    require(bool(rows), f"{path}: empty file; a {what} is a square table of numbers")
+    require(rows, f"{path}: empty file; a {what} is a square table of numbers")
     width = len(rows[0][1])
     for number, cells in rows:
         told = f"{len(cells)} numbers, the first line has {width}; a {what} is a square table"

@@ -44,7 +44,7 @@ def values_from(model: Model, chosen: dict[str, float]) -> Array:
             hint = did_you_mean(name, names) or "; it has: " + listed(names)
             raise InputError(f"the model has no parameter '{name}'{hint}")
         told = f"parameter '{name}' must be a finite number, found {value}"
-        require(bool(np.isfinite(value)), told)
+        require(np.isfinite(value), told)
         x[names.index(name)] = value
     return x
 

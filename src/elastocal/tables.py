@@ -73,7 +73,7 @@ def csv_lines(
     require(number > 0, f"{source}: empty file; the first line names the columns")
     first = first.removeprefix("\ufeff")
     told = f"{source}: line 1 is blank; the first line must name the columns"
-    require(bool(first.strip()), told)
+    require(first.strip(), told)
     delimiter = max(DELIMITERS, key=first.count)
     header = tuple(name.strip() for name in _split(source, number, first, delimiter))
     return header, delimiter != ",", _rows(source, lines, header, delimiter)
@@ -266,7 +266,7 @@ def match_columns(
     """
     for i, text in enumerate(header, start=1):
         told = "has no name in the header; name it or remove the separator too many"
-        require(bool(text), f"{source}: column {i} of {len(header)} {told}")
+        require(text, f"{source}: column {i} of {len(header)} {told}")
     for text, times in Counter(header).items():
         if times > 1:
             raise InputError(f"{source}: column {quoted(text)} appears {times} times; keep one")

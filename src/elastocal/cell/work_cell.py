@@ -217,7 +217,7 @@ class Visibility:
             "[workspace.visibility]; a corner-cube reflector takes about 30",
         )
         require(
-            bool(self.normals) or self.max_incidence is None,
+            self.normals or self.max_incidence is None,
             "key workspace.visibility.max_incidence_deg has no meaning without the "
             "reflectors' axes; give them in [workspace.visibility.normals], as in M1 = [0, 0, 1]",
         )
@@ -278,7 +278,7 @@ class Workspace:
         radius = stated(table, spot, fields_of(cls)["link_radius"])
         geometry = table.get("geometry", "capsules" if radius else "none")
         spot.require(
-            bool(radius) or geometry != "capsules",
+            radius or geometry != "capsules",
             'key workspace.link_radius_mm is missing; beside geometry = "capsules" it takes a '
             "positive number in mm, or one per link",
         )
@@ -380,7 +380,7 @@ class CertificateEntries:
 
     def __post_init__(self) -> None:
         require(
-            self.country is None or bool(re.fullmatch("[A-Z]{2}", self.country)),
+            self.country is None or re.fullmatch("[A-Z]{2}", self.country),
             f"key certificate.country is {quoted(self.country)}, which takes the two letters of "
             'ISO 3166, as in "DE"',
         )
