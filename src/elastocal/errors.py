@@ -12,7 +12,7 @@ argument, on the command line the flag.
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,8 @@ IN_PYTHON = {"cell_out": 'save("found.toml")', "plan": "extra_poses"}
 # Keyword arguments that take a list, and flags that are repeated.
 LISTS = ("fixed", "without", "options", "presets")
 
-_flags = False
+# How messages name options now: by their flags, and which are given in the place of a key.
+_said: dict[str, Any] = {"flags": False, "given": frozenset()}
 
 # Keys of cells, and keywords of verbs, that there were, and what does it instead.
 GONE = {
@@ -89,7 +90,7 @@ def option(keyword: str, value: object = None) -> str:
     command line, its flag: --seed or --outliers drop.  It is worded where the message is made,
     since messages end in results, their files and reports as well as in exceptions.
     """
-    if _flags:
+    if _said["flags"]:
         flag = flag_of(keyword)
         if value is False:
             return f"--no-{flag[2:]}"
@@ -100,35 +101,30 @@ def option(keyword: str, value: object = None) -> str:
 
 
 @contextmanager
-def options_as_flags() -> Iterator[None]:
-    """Within it messages name options by their flags, as the command line has them."""
-    global _flags
-    before, _flags = _flags, True
+def _saying(**how: Any) -> Iterator[None]:
+    before = _said.copy()
+    _said.update(how)
     try:
         yield
     finally:
-        _flags = before
+        _said.update(before)
 
 
-_given: frozenset[str] = frozenset()
+def options_as_flags() -> AbstractContextManager[None]:
+    """Within it messages name options by their flags, as the command line has them."""
+    return _saying(flags=True)
 
 
-@contextmanager
-def options_given(keywords: Iterable[str]) -> Iterator[None]:
+def options_given(keywords: Iterable[str]) -> AbstractContextManager[None]:
     """Within it messages on a key of the cell in whose place one of these options is given name the
     option, where they name the key by `wish`."""
-    global _given
-    before, _given = _given, frozenset(keywords)
-    try:
-        yield
-    finally:
-        _given = before
+    return _saying(given=frozenset(keywords))
 
 
 def wish(keyword: str, key: str) -> str:
     """What the user asks for as messages name it: the option where one is given in the place of a
     key of the cell, else the `key`."""
-    return option(keyword) if keyword in _given else key
+    return option(keyword) if keyword in _said["given"] else key
 
 
 # Set, the command line shows the traceback of what no message foresees.
