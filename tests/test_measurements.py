@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import sys
 
 import numpy as np
+import pandas
 import pytest
 
 from elastocal import tables
@@ -261,14 +263,12 @@ def test_more_rows_than_any_campaign_has_are_refused(refusal, small_chunks, monk
 
 
 @pytest.fixture
-def parquet(tmp_path, monkeypatch):
-    """Reads a frame as if it came out of a Parquet file, whatever engines are installed."""
-    pandas = pytest.importorskip("pandas")
+def parquet(tmp_path):
+    pytest.importorskip("pyarrow")
 
     def parquet(columns, **options):
         path = tmp_path / "data.parquet"
-        path.write_bytes(b"PAR1")
-        monkeypatch.setattr(pandas, "read_parquet", lambda _: pandas.DataFrame(columns))
+        pandas.DataFrame(columns).to_parquet(path)
         return read_measurements(path, joint_kinds=("revolute", "revolute"), **options)
 
     return parquet
@@ -293,17 +293,15 @@ def test_parquet_columns_follow_the_same_rules(parquet):
 
 
 def test_parquet_needs_an_engine_and_a_parquet_file(tmp_path, monkeypatch):
-    pandas = pytest.importorskip("pandas")
-
-    def no_engine(_):
-        raise ImportError
-
     path = tmp_path / "data.pq"
     path.write_bytes(b"not parquet")
     with pytest.raises(InputError, match="not a Parquet file"):
         read_measurements(path, joint_kinds=())
     path.write_bytes(b"PAR1")
-    monkeypatch.setattr(pandas, "read_parquet", no_engine)
+    pytest.importorskip("pyarrow")
+    with pytest.raises(InputError, match="damaged Parquet file"):
+        read_measurements(path, joint_kinds=())
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     with pytest.raises(InputError, match="pip install pyarrow"):
         read_measurements(path, joint_kinds=())
 

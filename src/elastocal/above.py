@@ -300,7 +300,7 @@ KINDS: dict[str, tuple[str, Check]] = {
     "None": ("None", lambda v: v is None),
     "Any": ("anything", lambda v: True),
 }  # fmt: skip
-CLASSES = {"a path", "a Mapping"}  # words for what a function tells apart itself
+CLASSES = ("Path", "Mapping")  # like those that KINDS does not name
 ALIASES = {
     "AnyModel": "Model | Cell | str | Path",
     "Table": "Measurements | str | Path | DataFrame",
@@ -324,12 +324,15 @@ def checked_arguments(function: F) -> F:
     In place of a `seed` it takes a numpy Generator, of which one is drawn, and what SAME says.
     """
     signature = inspect.signature(function)
-    kinds = {
-        name: [SEED] if name == "seed" else [_kind(text) for text in kinds_of(given.annotation)]
+    named = {
+        name: kinds_of(given.annotation)
         for name, given in signature.parameters.items()
         if isinstance(given.annotation, str) and name != "self"
     }
-
+    kinds = {
+        name: [SEED] if name == "seed" else [KINDS.get(k, (f"a {k}", _is_a(k))) for k in own]
+        for name, own in named.items()
+    }
     renamed = {o: n for o, n in SAME.items() if n in kinds and o not in kinds}
 
     def check(given: Mapping[str, Any], names: Collection[str]) -> None:
@@ -341,8 +344,8 @@ def checked_arguments(function: F) -> F:
     # What may be one of several classes the function tells apart itself, and says it better.
     simple = [
         name
-        for name, known in kinds.items()
-        if name != "load" and sum(words in CLASSES for words, _ in known) < 2
+        for name, own in named.items()
+        if name != "load" and sum(k in CLASSES or k not in KINDS for k in own) < 2
     ]
 
     @functools.wraps(function)
@@ -390,12 +393,6 @@ def kinds_of(annotation: str) -> list[str]:
         part = "str" if part.startswith("Literal[") else part
         found += kinds_of(ALIASES[part]) if part in ALIASES else [part]
     return found
-
-
-def _kind(name: str) -> tuple[str, Check]:
-    if name not in KINDS:
-        CLASSES.add(f"a {name}")
-    return KINDS.get(name, (f"a {name}", _is_a(name)))
 
 
 def shown(value: Any) -> str:

@@ -11,13 +11,12 @@ argument, on the command line the flag.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from elastocal.text import SHOWN, did_you_mean, listed, quoted
+from elastocal.text import did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
 FLAGS = {
@@ -29,7 +28,8 @@ IN_PYTHON = {"cell_out": 'save("found.toml")', "plan": "extra_poses"}
 # Keyword arguments that take a list, and flags that are repeated.
 LISTS = ("fixed", "without", "options", "presets")
 
-_flags = False
+# How messages name options now: by their flags, and which are given in the place of a key.
+_said: dict[str, Any] = {"flags": False, "given": frozenset()}
 
 # Keys of cells, and keywords of verbs, that there were, and what does it instead.
 GONE = {
@@ -43,25 +43,12 @@ GONE = {
     "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
     "design.robust_samples": "it went with design.robust; drop it",
 }
-# No name of a file is as long, and nobody reads more.
-LONGEST_WORD, LONGEST_MESSAGE = 400, 8000
-_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
-
-
-def bounded(message: str) -> str:
-    """A message whose words, keys and names of files among them, have an end."""
-    short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
-    half = LONGEST_MESSAGE // 2
-    return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
 
 
 class ElastocalError(Exception):
     """Root of all errors that elastocal raises on purpose."""
 
     exit_code = 2
-
-    def __init__(self, message: object = "") -> None:
-        super().__init__(bounded(str(message)))
 
 
 class InputError(ElastocalError):
@@ -103,7 +90,7 @@ def option(keyword: str, value: object = None) -> str:
     command line, its flag: --seed or --outliers drop.  It is worded where the message is made,
     since messages end in results, their files and reports as well as in exceptions.
     """
-    if _flags:
+    if _said["flags"]:
         flag = flag_of(keyword)
         if value is False:
             return f"--no-{flag[2:]}"
@@ -114,35 +101,30 @@ def option(keyword: str, value: object = None) -> str:
 
 
 @contextmanager
-def options_as_flags() -> Iterator[None]:
-    """Within it messages name options by their flags, as the command line has them."""
-    global _flags
-    before, _flags = _flags, True
+def _saying(**how: Any) -> Iterator[None]:
+    before = _said.copy()
+    _said.update(how)
     try:
         yield
     finally:
-        _flags = before
+        _said.update(before)
 
 
-_given: frozenset[str] = frozenset()
+def options_as_flags() -> AbstractContextManager[None]:
+    """Within it messages name options by their flags, as the command line has them."""
+    return _saying(flags=True)
 
 
-@contextmanager
-def options_given(keywords: Iterable[str]) -> Iterator[None]:
+def options_given(keywords: Iterable[str]) -> AbstractContextManager[None]:
     """Within it messages on a key of the cell in whose place one of these options is given name the
     option, where they name the key by `wish`."""
-    global _given
-    before, _given = _given, frozenset(keywords)
-    try:
-        yield
-    finally:
-        _given = before
+    return _saying(given=frozenset(keywords))
 
 
 def wish(keyword: str, key: str) -> str:
     """What the user asks for as messages name it: the option where one is given in the place of a
     key of the cell, else the `key`."""
-    return option(keyword) if keyword in _given else key
+    return option(keyword) if keyword in _said["given"] else key
 
 
 # Set, the command line shows the traceback of what no message foresees.
@@ -156,33 +138,27 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
     Memory that ends and numbers that cannot be computed with come from the input; whatever else
     is raised by code of elastocal is a fault of its own, and asked to be reported.
     """
-    import traceback
-
-    if plugin := _of_plugin(error):
+    what = f"{type(error).__name__}: {error}".rstrip(": ")
+    if plugin := _of_plugin(error, what):
         return plugin, 2
     named = [str(p) for p in read if p is not None for p in (p if isinstance(p, list) else [p])]
-    files = listed(map(str, named)) or "the options"
-    what = f"{type(error).__name__}: {error}".rstrip(": ")
-    where = traceback.extract_tb(error.__traceback__)[-1:]
-    ours = any(Path(frame.filename).is_relative_to(Path(__file__).parent) for frame in where)
+    files, (file, line) = listed(named) or "the options", raised_at(error, bool) or ("", 0)
+    ours = Path(file).is_relative_to(Path(__file__).parent)
     numbers = isinstance(error, ArithmeticError) or type(error).__name__ == "LinAlgError"
     if isinstance(error, MemoryError):
-        return (
-            f"{files}: memory ends ({what}); give fewer readings, or ask for less by the options",
-            1,
+        told = f"memory ends ({what}); give fewer readings, or ask for less by the options"
+    elif numbers or (isinstance(error, ValueError | RuntimeError) and not ours):
+        told = (
+            f"holds numbers, or options give some, that cannot be computed with ({what}); look for "
+            "values far too large or too small, or in another unit"
         )
-    if numbers or (isinstance(error, ValueError | RuntimeError) and not ours):
-        return (
-            f"{files}: holds numbers, or options give some, that cannot be computed with ({what}); "
-            "look for values far too large or too small, or in another unit",
-            1,
+    else:
+        told = (
+            f"not foreseen: {what} at {Path(file).name}, line {line}. Please report this fault of "
+            f"elastocal with the command and its files ({TRACEBACK}=1 shows where)"
         )
-    place = "".join(f" at {Path(f.filename).name}, line {f.lineno}" for f in where)
-    return (
-        f"{files}: not foreseen: {what}{place}. Please report this fault of elastocal with the "
-        f"command and its files ({TRACEBACK}=1 shows where)",
-        INTERNAL,
-    )
+        return f"{files}: {told}", INTERNAL
+    return f"{files}: {told}", 1
 
 
 def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, int] | None:
@@ -196,7 +172,7 @@ def raised_at(error: BaseException, own: Callable[[str], bool]) -> tuple[str, in
     return next(((f.filename, f.lineno or 1) for f in frames[::-1] if own(f.filename)), None)
 
 
-def _of_plugin(error: Exception) -> str:
+def _of_plugin(error: Exception, what: str) -> str:
     """Whose fault it is where a plug-in raised `error`, or what it gave did; else empty."""
     import sys
     import traceback
@@ -204,7 +180,6 @@ def _of_plugin(error: Exception) -> str:
     loader: Any = sys.modules.get("elastocal.plugin_loader")
     if loader is None:
         return ""
-    what = f"{type(error).__name__}: {error}".rstrip(": ")
     ran = {str(path) for path in loader._files}
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         file, mine = frame.f_code.co_filename, frame.f_locals.values()
@@ -228,7 +203,7 @@ def said_of(where: object) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from None
 
 
-def require(condition: bool, message: str) -> None:
+def require(condition: object, message: str) -> None:
     if not condition:
         raise InputError(message)
 

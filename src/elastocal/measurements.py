@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal import tables
 from elastocal.above import DataFrame, Result, checked_arguments
-from elastocal.errors import InputError, option, require
+from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import NO_UNIT, Columns, Family, Labels, RawTable, column
-from elastocal.text import did_you_mean, is_label, listed, quoted
+from elastocal.text import is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
@@ -584,12 +584,9 @@ def _marker(raw: RawTable, known: tuple[str, ...]) -> Labels:
     if not known:
         return labels
     for code, name in enumerate(labels.names):
-        if name not in known:
-            i = int(np.argmax(labels.codes == code))
-            raise InputError(
-                f"{raw.where(i, 'marker')}: {quoted(name)} is no marker of the cell"
-                f"{did_you_mean(name, known)}; its markers: {listed(known)}"
-            )
+        where = raw.where(int(np.argmax(labels.codes == code)), "marker")
+        told = f"{where}: {quoted(name)} is no marker of the cell"
+        check_known(name, known, told, "its markers:")
     return Labels(np.array([known.index(name) for name in labels.names])[labels.codes], known)
 
 
@@ -656,7 +653,7 @@ def read_matrix(path: str | Path, what: str) -> Array:
         return np.array(found, dtype=float)
     lines = enumerate(read_text(path, what, tables.MOST_BYTES).splitlines(), start=1)
     rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if line.strip()]
-    require(bool(rows), f"{path}: empty file; a {what} is a square table of numbers")
+    require(rows, f"{path}: empty file; a {what} is a square table of numbers")
     width = len(rows[0][1])
     for number, cells in rows:
         told = f"{len(cells)} numbers, the first line has {width}; a {what} is a square table"

@@ -29,46 +29,39 @@ MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
 TRUSTED = "ELASTOCAL_PLUGINS"  # 1, or folders whose cells may have their plug-ins run
 
-_installed: list[str] = []  # entry points that were run
 _files: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
 REGISTERED: set[type] = set()  # the classes of effects, noise models and criteria that they gave
 
 
-def load_plugins(cell: Path | None = None, modules: Sequence[str] = ()) -> None:
+def load_plugins(
+    cell: Path | None = None, modules: Sequence[str] = (), asked: bool = True, fresh: bool = True
+) -> None:
     """Run the plug-ins of installed packages, and the `modules` that the file `cell` names.
 
     A name that ends with .py is the path of a file; any other is a module that can be imported.
-    What has been run is not run again, but for a file that has changed.
+    What has been run is not run again, but where `fresh` for a file that has changed.  `asked`:
+    whether the user said that they may run, as the environment variable TRUSTED says of folders.
 
     Raises InputError that names the plug-in, its file and the line, where one cannot be run.
     """
     load_installed()
+    owner = cell or Path("plug-ins")
     for k, name in enumerate(modules):
-        key = f"plugins.modules[{k}]"
-        owner = cell or Path("plug-ins")
-        where = f"{owner}: key {key}"
-        if is_plugin_file(name):
-            _run_file(check_exists(Path(name), key, owner), where)
-        else:
-            _run(where, None, partial(_import, name))
-
-
-def load_named(cell: Path, modules: Sequence[str], asked: bool, fresh: bool) -> None:
-    """`load_plugins` of a cell, whose `modules` run where the user says so: by what was `asked`, or
-    the environment variable TRUSTED.
-
-    `fresh`: the cell has just been read, and a file that has changed is run again.
-    """
-    pending = [name for name in modules if not _has_run(name, fresh)]
-    for name in pending:
-        what = f"the Python file {Path(name)}" if is_plugin_file(name) else f"the module {name!r}"
+        if _has_run(name, fresh):
+            continue
+        key, path = f"plugins.modules[{k}]", Path(name) if is_plugin_file(name) else None
+        what = f"the module {name!r}" if path is None else f"the Python file {path}"
         require(
-            asked or _trusted(cell),
-            f"{cell}: key plugins.modules[{modules.index(name)}] names {what}, which runs with "
-            f"your rights and so not unasked; read it, then say {option('plugins', True)}, or set "
-            f"{TRUSTED}={cell.absolute().parent} for all cells of this folder",
+            asked or _trusted(owner),
+            f"{owner}: key {key} names {what}, which runs with your rights and so not unasked; "
+            f"read it, then say {option('plugins', True)}, or set {TRUSTED}="
+            f"{owner.absolute().parent} for all cells of this folder",
         )
-    load_plugins(cell, modules if pending else ())
+        where = f"{owner}: key {key}"
+        if path is None:
+            _run(where, None, partial(_import, name))
+        else:
+            _run_file(check_exists(path, key, owner), where)
 
 
 class Carried:
@@ -83,7 +76,7 @@ class Carried:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return load_named, (self.cell, self.modules, True, False)
+        return load_plugins, (self.cell, self.modules, True, False)
 
 
 def _has_run(name: str, fresh: bool) -> bool:
@@ -103,28 +96,26 @@ def is_plugin_file(module: str) -> bool:
     return module.endswith(".py")
 
 
+def load_installed() -> None:
+    _load_installed_in(tuple(sys.path))
+
+
 @cache
-def _installed_in(folders: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """The entry points of packages in the folders of sys.path: looking for them reads what every
-    package says of itself, so it is done once in a process, or again after `cache_clear`."""
+def _load_installed_in(folders: tuple[str, ...]) -> None:
+    """Of packages in these folders: looking for them reads what every package says of itself, so it
+    is done once in a process."""
     from importlib.metadata import entry_points
 
-    return tuple(entry_points(group=GROUP))
+    for point in entry_points(group=GROUP):
+        source = f" of the package {point.dist.name}" if point.dist else ""
 
+        def enter(point: EntryPoint = point) -> None:
+            """A module registers when it is imported, a function when it is called."""
+            found = point.load()
+            if not isinstance(found, ModuleType):
+                found()
 
-def load_installed() -> None:
-    for point in _installed_in(tuple(sys.path)):
-        if point.value not in _installed:
-            source = f" of the package {point.dist.name}" if point.dist else ""
-
-            def enter(point: EntryPoint = point) -> None:
-                """A module registers when it is imported, a function when it is called."""
-                found = point.load()
-                if not isinstance(found, ModuleType):
-                    found()
-
-            _run(f"plug-in '{point.name}'{source}", None, enter)
-            _installed.append(point.value)
+        _run(f"plug-in '{point.name}'{source}", None, enter)
 
 
 def _import(name: str) -> None:
@@ -156,8 +147,6 @@ def _run_file(path: Path, where: str) -> None:
 
     path = path.resolve()
     version = _version(path)
-    if _files.get(path) == version:
-        return
     source = read_text(path, "plug-in", MAX_BYTES)
     # No file is written beside the user's own, as an import would.
     module = ModuleType(f"plugin_{path.stem}_{zlib.crc32(str(path).encode()):08x}")
@@ -184,12 +173,9 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:
-        file, line = (  # the last that is the plug-in's own
-            raised_at(error, lambda f: f == str(path))
-            or raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
-            or raised_at(error, lambda f: True)
-            or ("", 0)
-        )
+        found = raised_at(error, lambda f: f == str(path))
+        foreign = raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
+        file, line = found or foreign or ("", 0)
         text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
         raise InputError(f"{where}: {file}, line {line}: {text}; correct the plug-in") from error
 

@@ -69,7 +69,6 @@ def close_streams() -> None:
 # Ctrl-C: noted besides being raised, since libraries swallow it or make another error of it.
 
 interrupts: list[int] = []
-_ended: list[bool] = []  # not empty when all is written
 
 
 @contextmanager
@@ -100,7 +99,7 @@ def noting_interrupts() -> Iterator[list[int]]:
 
 
 def _press_again() -> None:
-    if not _ended:
+    if signal.getsignal(signal.SIGINT) is _note:  # not all is written
         os.kill(os.getpid(), signal.SIGINT)
 
 
@@ -162,7 +161,6 @@ def end_at_once() -> None:
         os.write(2, b"elastocal: interrupted\n")
         os._exit(128 + number)
 
-    _ended.append(True)
     if signal.getsignal(signal.SIGINT) is _note:
         signal.signal(signal.SIGINT, end)
 

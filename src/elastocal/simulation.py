@@ -38,14 +38,13 @@ def values_from(model: Model, chosen: dict[str, float]) -> Array:
 
     Raises InputError for a name the model does not have.
     """
-    x = model.nominal.copy()
-    names = list(model.names)
+    x, names = model.nominal.copy(), list(model.names)
     for name, value in chosen.items():
         if name not in names:
             hint = did_you_mean(name, names) or "; it has: " + listed(names)
             raise InputError(f"the model has no parameter '{name}'{hint}")
-        if not np.isfinite(value):
-            raise InputError(f"parameter '{name}' must be a finite number, found {value}")
+        told = f"parameter '{name}' must be a finite number, found {value}"
+        require(np.isfinite(value), told)
         x[names.index(name)] = value
     return x
 
@@ -94,19 +93,13 @@ def _sizes_shown(model: Model) -> Array:
     cell = model.cell
     own = tuple(choice for choice in cell.model.effects if choice.name in unsized)
     spec = replace(cell.model, observe="position", torque="computed", effects=own)
-    seen = Model.assembled(model.chain, replace(cell, model=spec))
+    seen = model.specified(spec)
     loads = np.zeros((1, 3)) if cell.design.loads is None else np.asarray(cell.design.loads)
     load = np.linalg.norm(loads, axis=1).max() or suitable_load(reach_of(model.chain))
-    markers = tuple(cell.tool.markers)
-    poses = random_table(seen, Conditions(), POSES, 0)
-    rows = poses.take(np.repeat(np.arange(POSES), 3 * len(markers)))
-    rows = replace(
-        rows,
-        marker_names=markers,
-        marker=np.tile(np.arange(len(markers)), 3 * POSES),
-        force=np.tile(np.repeat(load * np.eye(3), len(markers), axis=0), (POSES, 1)),
-        position=np.zeros((len(rows), 3)),
-    )
+    poses = random_table(seen, Conditions(), POSES, 0).take(np.repeat(np.arange(POSES), 3))
+    poses = replace(poses, force=np.tile(load * np.eye(3), (POSES, 1)))
+    rows = expand_plan(poses, tuple(cell.tool.markers))
+    rows = replace(rows, position=np.zeros((len(rows), 3)))
     known = dict(zip(seen.names, np.abs(seen.regressor(rows).B).max(axis=0), strict=True))
     moved = np.array([known.get(name, 0.0) for name in model.names])
     # A load on a joint's own axis leaves rounding, from which no size follows.

@@ -156,7 +156,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
     for text in given:
         key, equals, written = (part.strip() for part in text.partition("="))
         here = option("options", text)
-        require(bool(equals), f"{option('options')} takes KEY=VALUE; found {quoted(text)}")
+        require(equals, f"{option('options')} takes KEY=VALUE; found {quoted(text)}")
         check_known(key, options, f"{here}: {path} has no option {quoted(key)}", "it has")
         default, value = defaults[key], None
         with suppress(tomllib.TOMLDecodeError):
@@ -178,7 +178,7 @@ def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
         require(callable(getattr(module, name, None)), f"{script}: {told}")
     given = dict(stated.options)
     found = calling(folder, "tasks()", lambda: list(islice(module.tasks(given), MAX_TASKS + 1)))
-    require(bool(found), f"{script}: tasks() gives no task with these options; nothing to do")
+    require(found, f"{script}: tasks() gives no task with these options; nothing to do")
     told = f"tasks() gives more than {MAX_TASKS} tasks with these options; let each do more"
     require(len(found) <= MAX_TASKS, f"{script}: {told}")
     for index, task in enumerate(found):
@@ -413,7 +413,7 @@ def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
     import pandas as pd
 
     found, columns = result_lines(Path(folder)), statement_of(Path(folder)).get("columns", {})
-    require(bool(found), f"{folder}: holds no results; run elastocal study first")
+    require(found, f"{folder}: holds no results; run elastocal study first")
     values = list(dict.fromkeys(name for line in found for name in line["values"]))
     names = ["task", "task_hash", *values, "task_row", *columns, "task_seconds", "elastocal"]
     rows = [
@@ -449,20 +449,16 @@ def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int 
     from joblib.externals import loky
 
     jobs = jobs or loky.cpu_count()
+    if jobs == 1:
+        yield from (execute(study.sources, task) for task in tasks if not stop.asked)
+        return
     env = {name: os.environ.get(name, "1") for name in ONE_THREAD}
     # Of a pool that is started anew where a process died.
     pool = partial(loky.get_reusable_executor, min(jobs, len(tasks)), initializer=IGNORING, env=env)
-
-    def at_once(*call: Any) -> Future[Row]:
-        done = Future[Row]()
-        done.set_result(call[0](*call[1:]))
-        return done
-
     try:
-        submit = at_once if jobs == 1 else lambda *call: pool().submit(*call)
-        yield from _lines(study, tasks, stop, submit, lambda: jobs)
+        yield from _lines(study, tasks, stop, lambda *call: pool().submit(*call), lambda: jobs)
     finally:
-        if jobs > 1 and tasks:
+        if tasks:
             pool().shutdown(kill_workers=True)
 
 

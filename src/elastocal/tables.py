@@ -13,7 +13,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO, StringIO
 from itertools import count, islice
@@ -64,17 +63,20 @@ def csv_lines(
 
     `comments`: lines that begin with # are passed over, and so are lines of empty cells.
     """
-    lines = _sound_lines(source, handle, what)
-    told = (one for one in lines if not (comments and _says_nothing(one[1])))
-    number, line = next(told, (0, b""))
-    if not line:
-        raise InputError(f"{source}: empty file; the first line names the columns")
-    first = _text(source, number, line).removeprefix("\ufeff")
-    if not first.strip():
-        raise InputError(f"{source}: line 1 is blank; the first line must name the columns")
+    remedy = "save the table as CSV in UTF-8"
+    lines = (
+        (number, decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n"))
+        for number, line in _sound_lines(source, handle, what)
+        if not (comments and _says_nothing(line))
+    )
+    number, first = next(lines, (0, ""))
+    require(number > 0, f"{source}: empty file; the first line names the columns")
+    first = first.removeprefix("\ufeff")
+    told = f"{source}: line 1 is blank; the first line must name the columns"
+    require(first.strip(), told)
     delimiter = max(DELIMITERS, key=first.count)
     header = tuple(name.strip() for name in _split(source, number, first, delimiter))
-    return header, delimiter != ",", _rows(source, told, header, delimiter)
+    return header, delimiter != ",", _rows(source, lines, header, delimiter)
 
 
 def _sound_lines(source: str, handle: BinaryIO, what: str) -> Iterator[tuple[int, bytes]]:
@@ -109,11 +111,6 @@ def _says_nothing(line: bytes) -> bool:
     return not bare or bare.startswith(b"#")
 
 
-def _text(source: str, number: int, line: bytes) -> str:
-    remedy = "save the table as CSV in UTF-8"
-    return decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n")
-
-
 def _split(source: str, number: int, line: str, delimiter: str) -> list[str]:
     """The cells of a line.  Raises InputError where quotes do not close or are stray."""
     if '"' not in line:
@@ -128,14 +125,14 @@ def _split(source: str, number: int, line: str, delimiter: str) -> list[str]:
 
 
 def _rows(
-    source: str, lines: Iterator[tuple[int, bytes]], header: tuple[str, ...], delimiter: str
+    source: str, lines: Iterator[tuple[int, str]], header: tuple[str, ...], delimiter: str
 ) -> Iterator[Row]:
     """The lines that are not blank, each with as many cells as the header."""
-    blank, rows = b" \r\n" if delimiter == "\t" else b" \t\r\n", 0
+    blank, rows = " " if delimiter == "\t" else " \t", 0
     for number, line in lines:
         if not line.strip(blank):
             continue
-        rows, cells = rows + 1, _split(source, number, _text(source, number, line), delimiter)
+        rows, cells = rows + 1, _split(source, number, line, delimiter)
         if len(cells) != len(header):
             commas = len(cells) > len(header) and delimiter == ","
             hint = "where decimals are written with a comma, separate the columns by ';'"
@@ -242,6 +239,15 @@ def column(stem: str, unit: str) -> str:
     return f"{stem}_{unit}" if unit else stem
 
 
+NUMBERING = "(id|no|nr|num|number|name)?"
+# What other people's tables call a column, without its unit, _ and capitals → its stem.
+CALLED = {
+    rf"(pose|conf|config|configuration|point|posture){NUMBERING}": "configuration",
+    rf"(marker|target|reflector|smr){NUMBERING}": "marker",
+    r"(?:j|joint|axis|a|theta)(\d+)": r"q\1",
+    r"(?:f|force)([xyz])": r"force_\1",
+    r"(?:m|tau|trq|torque)(\d+)": r"torque_\1",
+}
 # The columns of a table by their families, each in the order of its stems.
 Columns = Mapping[str, tuple[Column, ...]]
 Choose = Callable[[Sequence[str]], Columns]  # by the header
@@ -251,14 +257,16 @@ def match_columns(
     source: str, header: Sequence[str], known: Mapping[str, Family],
     passed_over: Callable[[str], bool] = lambda text: False,
     explain: Callable[[str], str | None] = lambda text: None,
+    called: Mapping[str, str] = CALLED, valid: str = "",
 ) -> Columns:  # fmt: skip
     """Which column of a header is which of the `known` families.
 
-    `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
+    `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one;
+    `called`: what its name may mean, as CALLED; `valid`: what to say where it is like none.
     """
     for i, text in enumerate(header, start=1):
         told = "has no name in the header; name it or remove the separator too many"
-        require(bool(text), f"{source}: column {i} of {len(header)} {told}")
+        require(text, f"{source}: column {i} of {len(header)} {told}")
     for text, times in Counter(header).items():
         if times > 1:
             raise InputError(f"{source}: column {quoted(text)} appears {times} times; keep one")
@@ -273,7 +281,8 @@ def match_columns(
         if text.startswith(IGNORED) or passed_over(text):
             continue
         if text not in meaning:
-            raise InputError(f"{source}: {explain(text) or _unknown(text, known, header)}")
+            told = explain(text) or _unknown(text, known, header, called, valid)
+            raise InputError(f"{source}: {told}")
         family, stem, unit = meaning[text]
         found = present.setdefault(family.name, {})
         if stem in found:
@@ -334,18 +343,10 @@ def check_columns(
     return columns
 
 
-NUMBERING = "(_?(id|no|nr|num|number|name))?"
-# What other people's tables call a column, without its unit and in small letters → its stem.
-CALLED = {
-    rf"(pose|conf|config|configuration|point|posture){NUMBERING}": "configuration",
-    rf"(marker|target|reflector|smr){NUMBERING}": "marker",
-    r"(?:j|joint|axis|a|theta)_?(\d+)": r"q\1",
-    r"(?:f|force)_?([xyz])": r"force_\1",
-    r"(?:m|tau|trq|torque)_?(\d+)": r"torque_\1",
-}
-
-
-def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> str:
+def _unknown(
+    text: str, known: Mapping[str, Family], header: Sequence[str], called: Mapping[str, str],
+    valid: str,
+) -> str:  # fmt: skip
     ways: dict[str, list[str]] = {}
     for family in known.values():
         for stem in family.units:
@@ -358,14 +359,13 @@ def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> s
             f"column {quoted(text)}: the unit {unit} is not taken here; write "
             f"{' or '.join(ways[stem])}"
         )
-    name = (stem if unit in OTHER_UNITS else text).lower()
-    called = (
-        found.expand(own) for way, own in CALLED.items() if (found := re.fullmatch(way, name))
-    )
-    meant = next(called, "")
-    valid = [way for way in ways.get(meant, []) if way.endswith(f"_{unit}")] or ways.get(meant, [])
-    hint = f" (did you mean '{valid[0]}'?)" if valid and not {*ways[meant]} & {*header} else ""
-    hint = hint or did_you_mean(text, [way for own in ways.values() for way in own])
+    name = (stem if unit in OTHER_UNITS else text).lower().replace("_", "")
+    meant = (found.expand(own) for way, own in called.items() if (found := re.fullmatch(way, name)))
+    own = ways.get(next(meant, ""), [])
+    near = next((way for way in own if way.endswith(f"_{unit}")), own[0] if own else "")
+    hint = f" (did you mean '{near}'?)" if own and not {*own} & {*header} else ""
+    if not own:
+        hint = did_you_mean(text, [way for each in ways.values() for way in each]) or valid
     return (
         f"unknown column {quoted(text)}{hint}; correct the name, or start "
         "it with '#', '_' or 'note' to have it ignored"
@@ -529,32 +529,27 @@ PLAIN = re.compile(r"(?:[ \t]*[+-]?[0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]+)?[ \t]*
 
 
 def _parquet(source: str, what: str) -> pd.DataFrame:
-    """What a Parquet file holds, where pandas finds an engine to read it."""
-    import pandas as pd
-
-    unpacked = 0
     with open_input(source, what, MOST_BYTES) as handle:
-        if handle.read(4) != b"PAR1":
-            raise InputError(f"{source}: is not a Parquet file; check it, or name a CSV .csv")
-    with suppress(Exception):  # missing or damaged, which its reader says
-        from pyarrow.parquet import ParquetFile
+        told = f"{source}: is not a Parquet file; check it, or name a CSV .csv"
+        require(handle.read(4) == b"PAR1", told)
+        try:
+            from pyarrow.parquet import ParquetFile
 
-        facts = ParquetFile(source).metadata
-        groups = map(facts.row_group, range(facts.num_row_groups))
-        unpacked = sum(group.total_byte_size for group in groups)
-    check_size(source, what, unpacked, MOST_BYTES)
-    try:
-        frame = pd.read_parquet(source)
-    except ImportError:
-        raise InputError(
-            f"{source}: reading Parquet needs pyarrow; run 'pip install pyarrow', or save the "
-            "table as CSV"
-        ) from None
-    except Exception as error:  # each engine has its own exceptions
-        raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
+            file = ParquetFile(handle)
+            groups = map(file.metadata.row_group, range(file.num_row_groups))
+            check_size(source, what, sum(group.total_byte_size for group in groups), MOST_BYTES)
+            frame: pd.DataFrame = file.read().to_pandas()
+        except InputError:
+            raise
+        except ImportError:
+            raise InputError(
+                f"{source}: reading Parquet needs pyarrow; run 'pip install pyarrow', or save the "
+                "table as CSV"
+            ) from None
+        except Exception as error:  # it has exceptions of its own
+            raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
     frame.columns = [str(name) for name in frame.columns]
-    if not len(frame):
-        raise InputError(f"{source}: has columns but no rows; add measurements")
+    require(len(frame) > 0, f"{source}: has columns but no rows; add measurements")
     return frame
 
 

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 Value = TypeVar("Value", float, NDArray[np.float64])
 
-# Divisors for the small units: 0.1 mm / 1000 is the float nearest to 0.0001 m, 0.1 mm * 1e-3
-# need not be.
-_MULTIPLY = {"deg": math.pi / 180.0, "deg_per_s": math.pi / 180.0, "min": 60.0}
-_DIVIDE = {"mm": 1e3, "um": 1e6, "urad": 1e6, "ppm": 1e6}
-_SI = {"", "si", "m", "rad", "N", "Nm", "s", "C", "kg"}
+# Factor and divisor: 0.1 mm / 1000 is the float nearest to 0.0001 m, 0.1 mm * 1e-3 need not be.
+_TO_SI = {
+    **dict.fromkeys(("deg", "deg_per_s"), (math.pi / 180.0, 1.0)), "min": (60.0, 1.0),
+    "mm": (1.0, 1e3), **dict.fromkeys(("um", "urad", "ppm"), (1.0, 1e6)),
+    **dict.fromkeys(("", "si", "m", "rad", "N", "Nm", "s", "C", "kg"), (1.0, 1.0)),
+}  # fmt: skip
 
 # The types that every room passes on: arrays of numbers, and who is told of progress.
 Array = NDArray[np.float64]
@@ -92,13 +93,8 @@ def to_si(value: Value, unit: str) -> Value:
 
     Raises KeyError for a unit not known here, which is a mistake of the program.
     """
-    if unit in _MULTIPLY:
-        return value * _MULTIPLY[unit]
-    if unit in _DIVIDE:
-        return value / _DIVIDE[unit]
-    if unit not in _SI:
-        raise KeyError(unit)
-    return value
+    factor, divisor = _TO_SI[unit]
+    return value * factor / divisor
 
 
 def quantities(unit: str) -> tuple[str, ...]:

@@ -381,7 +381,7 @@ def simulated(
     else:
         x = np.asarray(values, dtype=float)
         require(
-            x.shape == (len(made.parameters),) and bool(np.isfinite(x).all()),
+            x.shape == (len(made.parameters),) and np.isfinite(x).all(),
             f"{option('values')} takes {len(made.parameters)} finite numbers, one per parameter, "
             f"or some of them by name; found an array of shape {x.shape}",
         )
@@ -625,7 +625,7 @@ def compensate(
     chain = arm.model.chain
     start = None if near is None else np.asarray(near, dtype=float)
     require(
-        start is None or (start.shape == (chain.n_joints,) and bool(np.isfinite(start).all())),
+        start is None or (start.shape == (chain.n_joints,) and np.isfinite(start).all()),
         f"{option('near')} takes {chain.n_joints} joints in rad or m; found {near!r}",
     )
     if point is not None and not isinstance(point, str):

@@ -44,7 +44,6 @@ from elastocal.cell.work_cell import (
     Workspace,
     read_cell,
 )
-from elastocal.config import Spot, direction
 from elastocal.errors import InputError
 
 ROBOT = '[robot]\nurdf = "arm.urdf"\n'
@@ -226,7 +225,7 @@ def test_nothing_of_a_cell_can_be_set_but_all_can_be_replaced(folder):
 
 @given(st.lists(st.floats(-1e308, 1e308), min_size=3, max_size=3).filter(any))
 def test_a_direction_has_length_one_whatever_its_size(vector):
-    unit = direction(vector, Spot(Path("cell.toml")), "normal")
+    unit = HalfSpace("wall", np.zeros(3), vector).normal
     scaled = np.array(vector) / np.abs(vector).max()
     assert np.linalg.norm(unit) == pytest.approx(1.0, abs=1e-12)
     assert np.linalg.norm(np.cross(unit, scaled)) < 1e-12 and unit @ scaled > 0

@@ -216,7 +216,7 @@ def with_cells(*cells):
     ("name", "meant"),
     [
         ("qmin_deg", "lower_deg"), ("min_deg", "lower_deg"), ("q_max_deg", "upper_deg"),
-        ("upper_limit_rad", "upper_rad"), ("θ_deg", "theta0_deg"), ("direction", "sign"),
+        ("upper_limit_rad", "upper_rad"), ("direction", "sign"),
     ],
 )  # fmt: skip
 def test_an_unknown_column_is_never_taken_for_a_twist(name, meant, tmp_path):

@@ -89,7 +89,7 @@ class Robot:
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         given = [name for name in SOURCES if name in table]
         told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
-        spot.require(bool(given), told)
+        spot.require(given, told)
         of_a_table = ("dh_convention", "masses", "ur_model")
         other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():
@@ -302,7 +302,7 @@ class EffectChoice:
         """
         name, colon, where = entry.partition(":")
         ok = name and (where or not colon) and entry == entry.strip()
-        require(bool(ok), f'takes "effect" or "effect:where"; found {quoted(entry)}')
+        require(ok, f'takes "effect" or "effect:where"; found {quoted(entry)}')
         return cls(name, where or None)
 
     def __str__(self) -> str:

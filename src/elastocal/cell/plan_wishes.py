@@ -29,7 +29,6 @@ from elastocal.config import (
     joint_values,
     key,
     keyed,
-    matrix,
     numbers,
     record,
     stated,
@@ -117,7 +116,7 @@ class TargetBox:
     def __post_init__(self) -> None:
         k = int(np.argmin(self.lower < self.upper))
         require(
-            bool(self.lower[k] < self.upper[k]),
+            self.lower[k] < self.upper[k],
             f"{wish('test_box', '[design.test_box]')} takes lower_m < upper_m in x, y and z; "
             f"found {self.lower[k]:g} and {self.upper[k]:g} in {'xyz'[k]}; swap or correct them",
         )
@@ -166,7 +165,7 @@ class Motion:
         return {"degrees": any(degrees)}
 
 
-Box = Annotated[Array, matrix(2, 3)]
+Box = Annotated[Array, numbers(2, 3)]
 BOX = "two corners in m, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
 
 
@@ -187,7 +186,7 @@ class Freedom:
         boxes = [(f"markers_m.{name}", box) for name, box in self.markers.items()]
         for name, box in (*boxes, ("load_point_m", self.load_point), ("tracker_m", self.tracker)):
             require(
-                box is None or bool((box[0] <= box[1]).all()),
+                box is None or (box[0] <= box[1]).all(),
                 f"[design.choose] {name} takes the lower corner and then the upper; "
                 "swap or correct them",
             )
@@ -244,7 +243,7 @@ class DesignSpec:
     )
     per_level: Many[Count] = ()
     repeats: Count = keyed("a whole number >= 1", default=1)
-    loads: Annotated[Array, matrix(None, 3)] | None = keyed(
+    loads: Annotated[Array, numbers(None, 3)] | None = keyed(
         "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
     )
     repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
@@ -364,7 +363,7 @@ def _per_level(
     if given is None or len(levels) > 1:
         return ()
     spot.require(
-        bool(levels),
+        levels,
         "key design.levels.poses_per_level has no meaning without levels; name the joint, as in "
         "joint2_deg = [-90, -45, 0]",
     )

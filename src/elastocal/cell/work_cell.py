@@ -33,8 +33,6 @@ from elastocal.config import (
     Vector2,
     Vector3,
     checked,
-    direction,
-    direction_key,
     fields_of,
     file_key,
     from_table,
@@ -151,7 +149,7 @@ class HalfSpace:
     point: Vector3 = keyed(
         "three numbers in m, a point of the boundary plane", "point_m", required=True
     )
-    normal: Direction = direction_key(
+    normal: Direction = keyed(
         "three numbers, a direction to the side where the arm may be", required=True
     )
 
@@ -168,7 +166,7 @@ class HangingLoad:
     solid: Solid = keyed(keys=keys_of(Solid, without=("name", "position_m", "rpy_deg")))
     rope: NonNegative = keyed("a number >= 0 in m, from load point to load", "rope_m", default=0.0)
     rope_radius: Positive = keyed("a positive number in mm", "rope_radius_mm", default=0.01)
-    rope_axis: Direction | None = direction_key(
+    rope_axis: Direction | None = keyed(
         "three numbers, a direction in the flange frame", default=None
     )
     max_angle: float | None = keyed(ANGLE, "max_angle_deg", form=Angle, default=None)
@@ -196,10 +194,7 @@ class Visibility:
     """
 
     normals: dict[str, Direction] = keyed(
-        "three numbers per marker, in the flange frame",
-        form=dict[str, Vector3],
-        into=lambda found, spot, name: {m: direction(v, spot / name, m) for m, v in found.items()},
-        default_factory=dict,
+        "three numbers per marker, in the flange frame", default_factory=dict
     )
     max_incidence: float | None = keyed(ANGLE, "max_incidence_deg", form=Angle, default=None)
     range: Annotated[tuple[AnyFloat, AnyFloat], TUPLE] = keyed(
@@ -222,7 +217,7 @@ class Visibility:
             "[workspace.visibility]; a corner-cube reflector takes about 30",
         )
         require(
-            bool(self.normals) or self.max_incidence is None,
+            self.normals or self.max_incidence is None,
             "key workspace.visibility.max_incidence_deg has no meaning without the "
             "reflectors' axes; give them in [workspace.visibility.normals], as in M1 = [0, 0, 1]",
         )
@@ -283,7 +278,7 @@ class Workspace:
         radius = stated(table, spot, fields_of(cls)["link_radius"])
         geometry = table.get("geometry", "capsules" if radius else "none")
         spot.require(
-            bool(radius) or geometry != "capsules",
+            radius or geometry != "capsules",
             'key workspace.link_radius_mm is missing; beside geometry = "capsules" it takes a '
             "positive number in mm, or one per link",
         )
@@ -385,7 +380,7 @@ class CertificateEntries:
 
     def __post_init__(self) -> None:
         require(
-            self.country is None or bool(re.fullmatch("[A-Z]{2}", self.country)),
+            self.country is None or re.fullmatch("[A-Z]{2}", self.country),
             f"key certificate.country is {quoted(self.country)}, which takes the two letters of "
             'ISO 3166, as in "DE"',
         )

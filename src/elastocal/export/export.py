@@ -87,7 +87,7 @@ class Wish:
         ending = ENDINGS.get(self.path.suffix.lower(), "")
         found = ending if self.format is None else self.format.lower()
         require(
-            self.format is not None or bool(ending),
+            self.format is not None or ending,
             f"{self.path}: the ending '{self.path.suffix}' names no known format; use one of "
             f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}",
         )
@@ -331,7 +331,7 @@ class _Writing:
                         str(number + 1), MICRO.get(unit, unit), *micro,
                     ))  # fmt: skip
         require(
-            bool(rows),
+            rows,
             f"{self.calibrated.source}: this arm has no smooth function to be written as "
             "corrections; elastocal diagnose finds those that the readings show",
         )

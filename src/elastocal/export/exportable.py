@@ -444,7 +444,7 @@ def read_joint_correction(path: str | Path) -> JointCorrection:
     text = read_text(path, "joint correction", MOST_BYTES)
     lines = [line for line in text.splitlines() if line[:1] != "#"]
     require(
-        bool(lines) and lines[0] == ",".join(HEADER),
+        lines and lines[0] == ",".join(HEADER),
         f"{path}: its columns are not {', '.join(HEADER)}; give the file that export wrote",
     )
     rows: dict[tuple[int, str], list[tuple[float, float]]] = {}

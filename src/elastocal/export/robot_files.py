@@ -259,10 +259,7 @@ def _is_file(tag: Tag, key: str) -> bool:
 
 
 def _from(folder: Path, place: Path) -> str:
-    try:
-        return Path(os.path.relpath(place, folder)).as_posix()
-    except ValueError:  # on another drive
-        return place.as_posix()
+    return Path(os.path.relpath(place, folder)).as_posix()
 
 
 # The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.

@@ -40,7 +40,7 @@ from elastocal.tables import (
     match_columns,
     read_table,
 )
-from elastocal.text import did_you_mean, listed, nearest, quoted, rounded
+from elastocal.text import did_you_mean, listed, quoted, rounded
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -157,7 +157,11 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
     named = {family.name: family for family in known}
 
     def choose(header: Sequence[str]) -> Columns:
-        found = match_columns(str(path), header, named, explain=partial(_meant, known, what))
+        every = listed(way for f in known for stem in f.units for way in f.columns(stem))
+        found = match_columns(
+            str(path), header, named, explain=partial(_no_table, what), called=CALLED,
+            valid=f"; a {what} takes {every}",
+        )  # fmt: skip
         return check_columns(str(path), found, named, [(n,) for n in needed], f"a {what} needs")
 
     return read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
@@ -211,44 +215,21 @@ def _closer(table: RawTable, chain: Chain) -> Chain:
     return replace(closer, notes=(*closer.notes, told))
 
 
-# Other people's names of columns, by the ones here; units stay.
-ALIASES = {
-    "lower": ("qmin", "min", "low", "qlow", "lb", "qlimmin", "limitmin", "lowerlimit", "jmin"),
-    "upper": ("qmax", "max", "high", "qhigh", "ub", "qlimmax", "limitmax", "upperlimit", "jmax"),
-    "theta0": ("theta", "θ", "θ0", "offset", "q0", "thetaoffset"),
-    "alpha": ("α",), "beta": ("β",), "a": ("r",), "joint": ("name",), "type": ("sigma", "kind"),
-    "sign": ("direction", "flip", "dir"),
+# Other people's names of columns, as of `match_columns`.
+CALLED = {
+    "q?min|q?low|lb|qlimmin|limitmin|lowerlimit|jmin": "lower",
+    "q?max|q?high|ub|qlimmax|limitmax|upperlimit|jmax": "upper",
+    "theta|θ|θ0|offset|q0|thetaoffset": "theta0",
+    "α": "alpha", "β": "beta", "r": "a", "name": "joint", "sigma|kind": "type",
+    "direction|flip|dir": "sign",
 }  # fmt: skip
 
 
-def _meant(known: Sequence[Family], what: str, header: str) -> str | None:
-    """What to say of an unknown column: its name here, or the columns that there are.  Names are
-    compared without their unit, so that min_deg is not taken for beta_deg."""
-    if header.startswith(("<", "version https://git-lfs")):
-        kind = "a web page or XML" if header.startswith("<") else "a pointer of Git LFS"
-        return f"is {kind}, not a {what}; download the file itself"
-    ways: dict[str, tuple[str, ...]] = {}
-    for family in known:
-        for stem in family.units:
-            ways[stem] = ways.get(stem, ()) + family.columns(stem)
-    stem, _, unit = header.rpartition("_")
-    if not stem or unit not in SI:
-        stem, unit = header, ""
-    if stem in ways:
+def _no_table(what: str, header: str) -> str | None:
+    if not header.startswith(("<", "version https://git-lfs")):
         return None
-    plain = stem.lower().replace("_", "")
-    near = next((k for k, names in ALIASES.items() if plain in names and k in ways), None)
-    near = near or nearest(stem, ways, 0.7)
-    if near is None:
-        told = f"; a {what} takes {listed(way for family in ways.values() for way in family)}"
-    else:
-        same = [way for way in ways[near] if way == f"{near}_{unit}"]
-        told = f" (did you mean {' or '.join(map(repr, same or ways[near]))}?)"
-        told += ": 1, or -1 where a joint turns against its axis" if near == "sign" else ""
-    return (
-        f"unknown column {quoted(header)}{told}; correct the name, or start it with '#', '_' or "
-        "'note' to have it ignored"
-    )
+    kind = "a web page or XML" if header.startswith("<") else "a pointer of Git LFS"
+    return f"is {kind}, not a {what}; download the file itself"
 
 
 def _kind(table: RawTable, i: int) -> JointKind | None:

@@ -19,7 +19,7 @@ from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
 from elastocal.model.effects import compliances, gears, loads, placements, smooth
 from elastocal.model.effects.base import Effect, check
-from elastocal.plugin_loader import load_installed, load_named, same_class
+from elastocal.plugin_loader import load_installed, load_plugins, same_class
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
@@ -85,7 +85,7 @@ def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
     read = cell if isinstance(cell, Cell) else read_cell(cell)
     load_installed()
     if plugins is not None or any(each.name not in CATALOGUE for each in read.model.effects):
-        load_named(Path(read.source), read.plugins, bool(plugins), fresh)
+        load_plugins(Path(read.source), read.plugins, bool(plugins), fresh)
     if fresh:
         read.check(known_effects=tuple(CATALOGUE))
     return read
