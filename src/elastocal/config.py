@@ -55,6 +55,14 @@ UNIT_SUFFIX = re.compile(
     r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"
     r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
 )
+# A key of DEEPEST parts where a key may begin, for which tomllib takes time that grows with their
+# square.
+DEEPEST = 32
+_DOTTED = re.compile(
+    r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.)"""
+    rf"{{{DEEPEST - 1}}}",
+    re.MULTILINE,
+)
 JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(.+)_(deg|rad|mm|m)", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
@@ -244,6 +252,12 @@ def tables_in(kind: Any) -> list[tuple[Any, bool]]:
 def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
     """The parsed TOML file of at most `max_bytes`; `what` names it in messages."""
     text = read_text(path, what, max_bytes)
+    if found := _DOTTED.search(text):
+        line = text.count("\n", 0, found.end()) + 1
+        raise InputError(
+            f"{path}, line {line}: nested more than {DEEPEST} deep; no key needs more than a few "
+            "levels, so check the dots there"
+        )
     try:
         return tomllib.loads(text)
     except RecursionError:

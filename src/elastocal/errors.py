@@ -11,12 +11,13 @@ argument, on the command line the flag.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import SHOWN, did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
 FLAGS = {
@@ -44,11 +45,16 @@ GONE = {
     "design.robust_samples": "it went with design.robust; drop it",
 }
 
+LONG_WORD = re.compile(r"\S{400,}")  # no name of a file is as long, and nobody reads more
+
 
 class ElastocalError(Exception):
     """Root of all errors that elastocal raises on purpose."""
 
     exit_code = 2
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(LONG_WORD.sub(lambda w: f"{w[0][:SHOWN]}…{w[0][-SHOWN:]}", str(message)))
 
 
 class InputError(ElastocalError):

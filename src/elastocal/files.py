@@ -7,6 +7,7 @@ without end, and a device such as /dev/zero has no end.
 from __future__ import annotations
 
 import json
+import math
 import os
 import secrets
 import signal
@@ -15,7 +16,7 @@ import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NoReturn
 
 from elastocal.errors import InputError, require
 
@@ -106,11 +107,14 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
     """
     text = read_text(path, what, max_bytes)
 
-    def refuse(name: str) -> None:
+    def refuse(name: str) -> NoReturn:
         raise ValueError(f"{name} is no number of JSON")
 
+    def number(digits: str) -> float:
+        return refuse(digits) if math.isinf(value := float(digits)) else value
+
     try:
-        return json.loads(text, parse_constant=refuse)
+        return json.loads(text, parse_float=number, parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
     except ValueError as error:
