@@ -408,6 +408,7 @@ class MixedFit:
 Objective = Callable[[Array], tuple[float, Array, Array]]
 
 STRIDE = 1.5  # longest step of a logarithm
+ROUNDED = 1e-11  # of a sum over tens of thousands of rows: its rounding
 EXCHANGES = 30  # of what is held at a bound, after which another method has to end the search
 
 
@@ -416,8 +417,9 @@ def climb(
 ) -> tuple[Array, bool]:
     """Where −2ℓ is least, and whether it ended there.  What has no room between its limits stays.
 
-    A step that promises less than `enough` is not taken any more; none is longer than STRIDE in
-    any logarithm.  What the curvature exceeds the information by is learned from the steps.
+    A step that promises less than `enough`, or than rounding, is not taken any more; none is longer
+    than STRIDE in any logarithm.  What the curvature exceeds the information by is learned from the
+    steps.
     """
     value, slope, information = evaluate(theta)
     free = np.flatnonzero(lower < upper)
@@ -431,7 +433,7 @@ def climb(
             step[free] = step_within(H[np.ix_(free, free)], slope[free], low, high)
         except linalg.LinAlgError:
             break
-        if -float(slope @ step) < enough:
+        if -float(slope @ step) < max(enough, ROUNDED * abs(value)):
             return theta, True
         for length in (1.0, 0.5, 0.25, 0.0625):
             tried = evaluate(theta + length * step)

@@ -420,12 +420,12 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
     """
     base, blocks = dataset.base, dataset.blocks
     readings = linearised(base.model, base.observed, base.x, np.zeros(0, dtype=np.int64))
-    e = blocks.unpack(data.r[..., None])
-    B = blocks.unpack(data.X / np.sqrt(data.precision)).reshape(e.size, -1)
+    r = blocks.unpack(data.r[..., None])
+    B = blocks.unpack(data.X / np.sqrt(data.precision)).reshape(r.size, -1)
     # What the readings tell of the parameters, beside what was known of them.
     U, shown, _ = linalg.svd(B, full_matrices=False, lapack_driver="gesvd")
-    told = max(int((shown > np.sqrt(data.mean_variance)).sum()), 1)
-    B = U[:, :told].reshape(*e.shape[:2], told)
+    U = U[:, : max(int((shown > np.sqrt(data.mean_variance)).sum()), 1)]
+    B, e = U.reshape(*r.shape[:2], -1), r - (U @ (U.T @ r.ravel())).reshape(r.shape)
     in_visit, own = np.bincount(blocks.visit), "stated" if data.stated else "independent"
     # A visit that is off as a whole widens the scatter of joints that all readings tell.
     kinds = [own, f"{own}+{JOINTS}"] if np.median(in_visit) >= SEVERAL else [own]
