@@ -44,7 +44,7 @@ from pydantic_core import PydanticCustomError
 
 from elastocal.above import ByValue
 from elastocal.errors import GONE, InputError, require, said_of, wish
-from elastocal.files import check_exists, read_text
+from elastocal.files import DEEPEST, check_exists, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array, rotation_from_rpy, to_si
 
@@ -57,7 +57,6 @@ UNIT_SUFFIX = re.compile(
 )
 # A key of DEEPEST parts where a key may begin, for which tomllib takes time that grows with their
 # square.
-DEEPEST = 32
 _DOTTED = re.compile(
     r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.)"""
     rf"{{{DEEPEST - 1}}}",
@@ -266,6 +265,9 @@ def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[s
         lines = text.split("\n")
         end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
         reason = str(error).replace("(at end of document)", end)
+        if long := re.search(r"(?<!\d)\d{4300}", text):  # what Python refuses to read
+            line = text.count("\n", 0, long.start()) + 1
+            reason = f"a number of thousands of digits (at line {line})"
         raise InputError(f"{path}: not valid TOML: {reason}") from None
 
 

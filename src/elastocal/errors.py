@@ -44,8 +44,16 @@ GONE = {
     "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
     "design.robust_samples": "it went with design.robust; drop it",
 }
+# No name of a file is as long, and nobody reads more.
+LONGEST_WORD, LONGEST_MESSAGE = 400, 8000
+_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
 
-LONG_WORD = re.compile(r"\S{400,}")  # no name of a file is as long, and nobody reads more
+
+def bounded(message: str) -> str:
+    """A message whose words, keys and names of files among them, have an end."""
+    short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
+    half = LONGEST_MESSAGE // 2
+    return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
 
 
 class ElastocalError(Exception):
@@ -54,7 +62,7 @@ class ElastocalError(Exception):
     exit_code = 2
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(LONG_WORD.sub(lambda w: f"{w[0][:SHOWN]}…{w[0][-SHOWN:]}", str(message)))
+        super().__init__(bounded(str(message)))
 
 
 class InputError(ElastocalError):

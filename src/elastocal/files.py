@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import secrets
 import signal
 import stat
@@ -16,9 +17,16 @@ import threading
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO
 
 from elastocal.errors import InputError, require
+from elastocal.text import SHOWN
+
+# What is being written ends so, after the number of the process that writes it.
+UNFINISHED = ".tmp"
+# Elements within each other, and parts of a dotted key: a file that people write has six.
+DEEPEST = 32
+LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
 def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> int:
@@ -89,10 +97,18 @@ def _kind(mode: int) -> str:
     return KINDS.get(stat.S_IFMT(mode), "a device")
 
 
+PIECE = 1 << 20  # bytes read at once
+
+
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
     """The content of a regular file of at most `max_bytes`, sized before it is read."""
+    data = bytearray()
     with open_input(path, what, max_bytes) as handle:
-        return handle.read()
+        # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
+        while len(data) <= max_bytes and (piece := handle.read(PIECE)):
+            data += piece
+    check_size(path, what, len(data), max_bytes)
+    return bytes(data)
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
@@ -101,20 +117,25 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
 
 
 def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
-    """What a JSON file of at most `max_bytes` holds.
+    """What a JSON file of at most `max_bytes` holds; whole numbers too long for that are floats.
 
     Raises InputError, with `remedy`, where it is no strict JSON: names the line where there is one.
     """
     text = read_text(path, what, max_bytes)
 
-    def refuse(name: str) -> NoReturn:
+    def number(digits: str) -> float:
+        if math.isinf(value := float(digits)):
+            raise ValueError(f"{digits[:SHOWN]}… is beyond all numbers")
+        return value
+
+    def whole(digits: str) -> int | float:
+        return int(digits) if len(digits) <= LONGEST_INTEGER else number(digits)
+
+    def refuse(name: str) -> None:
         raise ValueError(f"{name} is no number of JSON")
 
-    def number(digits: str) -> float:
-        return refuse(digits) if math.isinf(value := float(digits)) else value
-
     try:
-        return json.loads(text, parse_float=number, parse_constant=refuse)
+        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
     except ValueError as error:
@@ -220,7 +241,10 @@ def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
             with open(path, f"w{mode}", **how) as device:
                 yield device
             return
-        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
+        with suppress(OSError):
+            remove_abandoned(target.parent, re.escape(target.name[:40]))
+        own = f"{os.getpid()}-{secrets.token_hex(4)}"
+        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
         try:
             with open(temporary, f"x{mode}", **how) as handle:
                 if target.exists():  # what others may not read they may not read afterwards
@@ -266,3 +290,24 @@ def _undisturbed() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if noted:
         before(signal.SIGINT, None)
+
+
+def remove_abandoned(folder: Path, name: str) -> None:
+    """Remove what killed processes left in `folder` of files whose names match the pattern `name`:
+    regular files named as unfinished ones are, whose process runs no longer."""
+    known = re.compile(rf"\.{name}\.(\d+)-[0-9a-f]{{8}}{re.escape(UNFINISHED)}", re.DOTALL)
+    for path in folder.iterdir():
+        found = known.fullmatch(path.name)
+        if found and stat.S_ISREG(path.lstat().st_mode) and not _runs(int(found[1])):
+            path.unlink()
+
+
+def _runs(process: int) -> bool:
+    try:
+        if os.name == "posix":  # elsewhere the signal 0 would end it
+            os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # somebody else's
+        return True
+    return True

@@ -22,7 +22,7 @@ from fuzz.campaign import Command
 from fuzz.harness import OLD, OLD_BESIDE, Ended, malformed, put_old, run, seen
 
 OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree")
-# What a killed run may leave, for the next one to go on from or unfinished.
+# What a killed run may leave for the next one to go on from, or to sweep up.
 BEGUN = re.compile(r"\.resume$|^results(/|\.md$)|(^|/)\.[^/]+\.tmp$")
 INTERRUPTED = 128 + signal.SIGINT
 KILLED = ("identify", "design", "diagnose", "simulate", "export", "study")
@@ -112,6 +112,7 @@ class Victim:
             again = self.run()
             found += [f"the next run ends with {again.told()}"] * (again.code != 0)
             found += [f"after the next run: {what}" for what in self.wrong()]
+            found += [f"it leaves {name}" for name in seen(self.folder) if name.endswith(".tmp")]
         return f"{harm} {where}", found, harm != "killed" or ended.code < 0
 
     def wrong(self) -> Iterator[str]:

@@ -151,7 +151,7 @@ NEARLY = 4.0  # in d²: two standard deviations
 SETTINGS = 6  # of a rival that are tried, at most
 
 
-def imitators(
+def imitating_columns(
     dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, rivals: RivalSet
 ) -> list[list[Array]]:
     """Columns (C, m, k) of each rival as it was found; then at the settings that explain most of
@@ -231,7 +231,7 @@ class Discrimination:
         data, measured = dataset.data, len(dataset.data.X) - candidates
         # What is beside counts by the widest size of its prior.
         beside = [dataset.packed(i.what, i.settings) * i.what.scales.max() for i in rivals.beside]
-        each = imitators(dataset, so_far, noise, rivals)
+        each = imitating_columns(dataset, so_far, noise, rivals)
         own, fitted = [*chain.from_iterable(each)], data.X.shape[2]
         self.rivals, self.nuisance = rivals, fitted + sum(C.shape[2] for C in beside)
         W = np.concatenate([data.X, *beside, *own, data.r[:, :, None]], axis=2)

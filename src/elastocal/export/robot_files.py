@@ -259,7 +259,10 @@ def _is_file(tag: Tag, key: str) -> bool:
 
 
 def _from(folder: Path, place: Path) -> str:
-    return Path(os.path.relpath(place, folder)).as_posix()
+    try:
+        return Path(os.path.relpath(place, folder)).as_posix()
+    except ValueError:  # on another drive
+        return place.as_posix()
 
 
 # The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.

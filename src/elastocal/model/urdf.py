@@ -22,7 +22,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.files import read_bytes
+from elastocal.files import DEEPEST, read_bytes
 from elastocal.model import rigid
 from elastocal.model.chain import (
     FINGERS,
@@ -43,7 +43,6 @@ from elastocal.units import Array, pose_at, rotation_from_rpy
 # white space.  Here a parser only says where the start tags stand; the text between is not touched.
 
 MAX_BYTES = 10_000_000
-DEEPEST = 32  # elements within each other: a file that people write has six
 UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
 END_OF_TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a > in quotes is none
