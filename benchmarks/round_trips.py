@@ -22,10 +22,10 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import elastocal as ec
-from elastocal.errors import ElastocalError
 from elastocal.export.export import Wish, export
 from elastocal.export.robot_files import MujocoRest, urdf_flanges
 from elastocal.measurements import Measurements
+from elastocal.messages import ElastocalError
 from elastocal.model.chain import extent, finite_ranges, joint_limits
 from elastocal.model.dh import read_dh
 from elastocal.model.rigid import nominal_flanges

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from elastocal.config import read_toml
-from elastocal.errors import InputError
 from elastocal.files import (
     DEEPEST,
     atomic_write,
@@ -24,6 +23,7 @@ from elastocal.files import (
     together,
 )
 from elastocal.measurements import read_matrix
+from elastocal.messages import InputError
 
 NESTED = {
     "lists": "a = {}1{}".format("[" * 400_000, "]" * 400_000),

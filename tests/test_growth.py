@@ -11,11 +11,11 @@ import pytest
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.compensation.compensate import read_targets
-from elastocal.errors import ElastocalError
 from elastocal.files import read_json
 from elastocal.importing.assemble import import_files
 from elastocal.importing.mapping_file import read_mapping
 from elastocal.measurements import read_matrix, read_measurements
+from elastocal.messages import ElastocalError
 from elastocal.model.dh import read_dh
 from elastocal.model.mjcf import read_mjcf
 from elastocal.model.urdf import read_urdf

@@ -10,8 +10,8 @@ import pandas
 import pytest
 
 from elastocal import tables
-from elastocal.errors import InputError
 from elastocal.measurements import read_measurements, write_measurements
+from elastocal.messages import InputError
 
 HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
 ROW = "1,2,3,4,5"

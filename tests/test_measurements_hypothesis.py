@@ -11,9 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from elastocal.errors import InputError
 from elastocal.measurements import Measurements, read_measurements, with_moves, write_measurements
-from elastocal.text import is_label
+from elastocal.messages import InputError, is_label
 
 SETTINGS = settings(
     deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "elastocal"
 
 # Lowest first.  A layer imports from those below it, and within itself one way only.  A module
-# or package that no layer names (cell, measurements, errors, files, units, ...) is at the bottom
+# or package that no layer names (cell, measurements, messages, files, ...) is at the bottom
 # of all, so it imports from its like alone; what needs more is named here.
 LAYERS = (
     {"model"},
@@ -212,7 +212,7 @@ def test_only_the_door_exports() -> None:
 
 
 def test_no_message_of_the_library_names_a_flag() -> None:
-    """Options are named by `errors.option`: a keyword in Python, a flag on the command line."""
+    """Options are named by `messages.option`: a keyword in Python, a flag on the command line."""
     named = {
         f"{module}: {text}"
         for module, path in MODULES.items()

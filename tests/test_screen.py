@@ -15,8 +15,8 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal.cli.app import Told, reading
+from elastocal.messages import printable
 from elastocal.screen import complain, safe_console
-from elastocal.text import printable
 
 TITLE, MARK = "\x1b]0;owned\x07", "\u202egpj.exe"
 HOSTILE = st.text(

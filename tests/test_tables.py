@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError, cell_text
 from elastocal.tables import NO_UNIT, Family, check_columns, csv_text, match_columns, read_table
-from elastocal.text import cell_text
 
 FAMILIES = {
     family.name: family

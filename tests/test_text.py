@@ -6,8 +6,8 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
+from elastocal.messages import cell_meaning, cell_text, is_label, json_text, printable
 from elastocal.tables import NUMBER
-from elastocal.text import cell_meaning, cell_text, is_label, json_text, printable
 
 ANYTHING = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(),

@@ -31,7 +31,7 @@ ROOMS = {
     "measurements": (5.25, 1, 1.0, "the table of\nreadings"),
 }
 MISSION = ("model", "engine", "identification", "planning", "diagnosis")
-COMMON = "arguments · config · errors · files · screen · tables · text · units"
+COMMON = "config · files · messages · screen · tables · units"
 HEIGHT, STEP = 0.72, 1.14
 
 

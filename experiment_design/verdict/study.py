@@ -24,10 +24,10 @@ from elastocal.cell.arm_description import (
     Tracker,
 )
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import ElastocalError
 from elastocal.identification.identify import identify
 from elastocal.identification.residuals import rms_3d
 from elastocal.measurements import Measurements
+from elastocal.messages import ElastocalError
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

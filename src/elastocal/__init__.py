@@ -22,11 +22,16 @@ if TYPE_CHECKING:
     from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.diagnosis.next_poses import next_poses
-    from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
     from elastocal.importing.first_cell import init
     from elastocal.measurements import Measurements, table
+    from elastocal.messages import (
+        ElastocalError,
+        InputError,
+        InsufficientDataError,
+        UnknownNameError,
+    )
     from elastocal.model.arm import Parameter
     from elastocal.model.calibrated import CalibratedArm, read_calibrated
     from elastocal.model.effects.base import Effect
@@ -46,11 +51,11 @@ ROOMS = {
     "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.changes": "Comparison compare",
     "diagnosis.next_poses": "next_poses",
-    "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
     "importing.first_cell": "init",
     "measurements": "Measurements table",
+    "messages": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "model.arm": "Parameter",
     "model.calibrated": "CalibratedArm read_calibrated",
     "model.effects.base": "Effect",

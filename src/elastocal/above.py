@@ -27,8 +27,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ForwardRef, TypeVar
 
-from elastocal.errors import GONE, InputError, option, require
-from elastocal.text import quoted
+from elastocal.messages import GONE, InputError, option, quoted, require
 
 if TYPE_CHECKING:
     from pandas import DataFrame as DataFrame  # for those who import it from here

@@ -43,9 +43,18 @@ from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import PydanticCustomError
 
 from elastocal.above import ByValue
-from elastocal.errors import GONE, InputError, require, said_of, wish
 from elastocal.files import DEEPEST, check_exists, read_text
-from elastocal.text import did_you_mean, listed, nearest, quoted
+from elastocal.messages import (
+    GONE,
+    InputError,
+    did_you_mean,
+    listed,
+    nearest,
+    quoted,
+    require,
+    said_of,
+    wish,
+)
 from elastocal.units import Array, rotation_from_rpy, to_si
 
 MAX_BYTES = 1_000_000

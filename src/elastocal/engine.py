@@ -21,7 +21,7 @@ import numpy as np
 import scipy
 from scipy import linalg, sparse
 
-from elastocal.errors import InsufficientDataError
+from elastocal.messages import InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
 
 LOG_2PI = float(np.log(2 * np.pi))

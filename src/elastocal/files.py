@@ -19,8 +19,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from elastocal.errors import InputError, require
-from elastocal.text import SHOWN
+from elastocal.messages import SHOWN, InputError, require
 
 # What is being written ends so, after the number of the process that writes it.
 UNFINISHED = ".tmp"

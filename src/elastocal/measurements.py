@@ -17,10 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal import tables
 from elastocal.above import DataFrame, Result, checked_arguments
-from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import atomic_writer, open_input, read_text
+from elastocal.messages import InputError, check_known, is_label, listed, option, quoted, require
 from elastocal.tables import NO_UNIT, Columns, Family, Labels, RawTable, column
-from elastocal.text import is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")

@@ -17,9 +17,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from elastocal.errors import InputError, option, raised_at, require
 from elastocal.files import check_exists, read_text
-from elastocal.text import quoted
+from elastocal.messages import InputError, option, quoted, raised_at, require
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint

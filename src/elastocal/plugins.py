@@ -23,9 +23,9 @@ from typing import Any, TypeVar
 
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
 from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
+from elastocal.messages import InputError
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain

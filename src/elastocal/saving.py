@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elastocal.above import checked_arguments
-from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
+from elastocal.messages import InputError, json_text, option, require
 from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.manipulator import Model
 from elastocal.tables import PARQUET, Labels, csv_text
-from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell

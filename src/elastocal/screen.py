@@ -2,7 +2,7 @@
 
 Names come from files and arguments, and a terminal obeys what stands in them: escape sequences
 that change its title or colours, marks that turn the direction of writing round.  What is shown
-here is shown as it can be read (`elastocal.text.printable`), in letters that the terminal has.
+here is shown as it can be read (`elastocal.messages.printable`), in letters that the terminal has.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from time import monotonic
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Self
 
-from elastocal.text import printable
+from elastocal.messages import printable
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, option, require, wish
 from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, wish
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Conditions, random_table
 from elastocal.model.effects.base import index
@@ -24,7 +24,6 @@ from elastocal.model.effects.compliances import (
 from elastocal.model.manipulator import NOMINAL, Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
-from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
 POSES = 50  # from which sizes are taken

@@ -47,10 +47,21 @@ from pydantic import Field
 
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
-from elastocal.errors import ElastocalError, InputError, check_known, option, raised_at, require
 from elastocal.files import atomic_write, read_bytes, read_json, read_text
+from elastocal.messages import (
+    ElastocalError,
+    InputError,
+    check_known,
+    did_you_mean,
+    json_text,
+    listed,
+    option,
+    printable,
+    quoted,
+    raised_at,
+    require,
+)
 from elastocal.screen import StudyStop, shown
-from elastocal.text import did_you_mean, json_text, listed, printable, quoted
 
 if TYPE_CHECKING:
     import pandas

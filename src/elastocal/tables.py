@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO
 
 import numpy as np
 
-from elastocal.errors import InputError, require
 from elastocal.files import atomic_write, check_size, decoded, open_input
-from elastocal.text import (
+from elastocal.messages import (
+    InputError,
     cell_meaning,
     cell_text,
     did_you_mean,
@@ -32,6 +32,7 @@ from elastocal.text import (
     plain_minus,
     printable,
     quoted,
+    require,
 )
 from elastocal.units import FACTORS, Array, IntArray, to_si
 

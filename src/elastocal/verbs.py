@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 from elastocal.above import checked_arguments, later, shown, whole
-from elastocal.errors import InputError, option, options_given, require
-from elastocal.text import quoted
+from elastocal.messages import InputError, option, options_given, quoted, require
 
 if TYPE_CHECKING:
     from numpy.random import Generator

@@ -44,7 +44,7 @@ from elastocal.cell.work_cell import (
     Workspace,
     read_cell,
 )
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 
 ROBOT = '[robot]\nurdf = "arm.urdf"\n'
 MARKERS = '[tool.markers_m]\nM1 = [0, 0, 0.1]\n"ball, left" = [0.1, 0, 0.1]\n'

@@ -23,7 +23,7 @@ from typer.testing import Result
 import elastocal as ec
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import read_cell
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.plugins import load_plugins

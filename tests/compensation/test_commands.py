@@ -21,7 +21,7 @@ from elastocal.compensation.compensate import (
     targets_at,
 )
 from elastocal.compensation.correction_table import EXACT, CorrectionGrid, correction_table
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.calibrated import CalibratedArm, ShownPoses, tool_point
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.manipulator import Model

@@ -19,7 +19,7 @@ from support.robots import KR270
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import read_cell
 from elastocal.diagnosis.diagnose import write_extended_cell
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 
 ROOT = Path(__file__).parents[2]

@@ -14,7 +14,7 @@ import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell.arm_description import Nominal
 from elastocal.diagnosis.baseline import thinned
-from elastocal.errors import InsufficientDataError
+from elastocal.messages import InsufficientDataError
 from elastocal.model.manipulator import Model
 
 ECCENTRIC, TILTED = "gear_eccentricity:joint4", "off_axis_compliance:joint3"

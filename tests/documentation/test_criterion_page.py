@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.design_cells import plan_cell
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning.criteria import CRITERIA, register
 from elastocal.planning.design import DesignOptions, design
 from elastocal.report.plan_view import plan_lines

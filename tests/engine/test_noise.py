@@ -8,10 +8,10 @@ import pytest
 from engine.dense import Table, own_parts, readings, shared_part
 from scipy import stats
 
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.noise_choice import estimate_noise, own_noise
 from elastocal.identification.noise_structure import noise_models
 from elastocal.identification.outliers import FALSE_ALARM, prediction_errors, settle
+from elastocal.messages import InputError, InsufficientDataError
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 

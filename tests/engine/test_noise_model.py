@@ -10,9 +10,9 @@ import pytest
 from engine.dense import Table, readings
 from support.registered import forgotten
 
-from elastocal.errors import InputError
 from elastocal.identification.noise_choice import estimate_noise, own_noise
 from elastocal.identification.noise_structure import NoiseModel, Readings
+from elastocal.messages import InputError
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)

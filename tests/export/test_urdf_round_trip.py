@@ -12,8 +12,8 @@ from support.exports import GEOMETRY, exported, flanges_in_base, poses_of, write
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
-from elastocal.errors import InputError
 from elastocal.export.robot_files import urdf_flanges
+from elastocal.messages import InputError
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.urdf import XmlFile, check_urdf
 

@@ -19,9 +19,9 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.start import check_limits
+from elastocal.messages import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5

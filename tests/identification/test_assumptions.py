@@ -11,12 +11,12 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker, Unsteadiness
-from elastocal.errors import InputError
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.scrutiny import autocorrelation
 from elastocal.identification.start import copied
+from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import undetermined_lines

@@ -10,8 +10,8 @@ from support.cells import kr270_chain, random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
+from elastocal.messages import json_text
 from elastocal.model.manipulator import Model
-from elastocal.text import json_text
 
 HELD = 2e-6  # rad/(N m), what the cell states for every joint
 

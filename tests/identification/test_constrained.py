@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.constrained import Minimum, minimise
 from elastocal.identification.knowledge import (
     Bounds,
@@ -17,6 +16,7 @@ from elastocal.identification.knowledge import (
     SemidefiniteMatrix,
     System,
 )
+from elastocal.messages import InputError, InsufficientDataError
 
 NONE = Constraints()
 

@@ -12,8 +12,8 @@ import pytest
 import statsmodels.api as sm
 from scipy import stats
 
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.least_squares import Covariance, clustered, drawing_root, orthogonal
+from elastocal.messages import InputError, InsufficientDataError
 
 
 def cluster_robust(B, e, cluster, kind="CR2"):

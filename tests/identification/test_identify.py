@@ -23,10 +23,10 @@ from support.cells import COMPLIANCE, kr270_chain, random_poses
 from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.errors import InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.mistakes import nominal_fit
 from elastocal.identification.solve import reduce
+from elastocal.messages import InsufficientDataError
 from elastocal.model.manipulator import Model
 from elastocal.model.urdf import read_urdf
 from elastocal.simulation import simulate

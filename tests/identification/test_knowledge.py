@@ -11,7 +11,6 @@ from support.calibration import measured, with_values
 from support.cells import DOWN, TABLE_2, kr270_cell, table_of
 
 import elastocal as ec
-from elastocal.errors import InputError
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import (
     Constraints,
@@ -21,6 +20,7 @@ from elastocal.identification.knowledge import (
 )
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
+from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise

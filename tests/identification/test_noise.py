@@ -8,8 +8,8 @@ from scipy import linalg
 from support.calibration import table_at
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
-from elastocal.errors import InputError
 from elastocal.identification.weighted_problem import weights_for
+from elastocal.messages import InputError
 from elastocal.model.observations import observe
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))

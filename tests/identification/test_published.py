@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from elastocal.errors import InputError
 from elastocal.identification.published import eq14, eq14_weights, ols, wls
+from elastocal.messages import InputError
 
 RNG = np.random.default_rng(14)
 B = RNG.normal(size=(90, 4))

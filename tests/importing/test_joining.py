@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.tracker_exports import imported
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 
 NAMED = r"""
 [[source]]

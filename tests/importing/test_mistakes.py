@@ -13,7 +13,7 @@ from support.tracker_exports import (
     spatialanalyzer,
 )
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 
 DATA = "name,x,y,z,a\n" + "".join(f"{i}_M1,{100 * i},{i},{i},{7 * i}\n" for i in range(1, 7))
 GOOD = """

@@ -17,8 +17,8 @@ from support.tracker_exports import (
 from typer.testing import CliRunner
 
 from elastocal.cli.main import app
-from elastocal.errors import InputError
 from elastocal.importing.exports import likely_presets
+from elastocal.messages import InputError
 
 PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.tracker_exports import MARKERS, imported, kr270_readings, krl
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.units import FACTORS
 
 TURN = {"deg": 360.0, "gon": 400.0, "rad": 2 * np.pi}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.tracker_exports import imported
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.units import convert, split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.evaluate import CHUNK, FEW, ONCE, BatchFunction, chosen_backend
 
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")

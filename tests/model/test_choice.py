@@ -13,7 +13,7 @@ from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_t
 from support.registered import forgotten, write_example
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.arm import Arm
 from elastocal.model.effects.base import DrivenEffect
 from elastocal.model.effects.catalogue import CATALOGUE, register

@@ -9,7 +9,7 @@ import pytest
 from support.robot_files import told_by_init
 
 import elastocal as ec
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.chain import Chain
 from elastocal.model.dh import read_dh
 from elastocal.model.rigid import nominal_flanges

@@ -25,7 +25,7 @@ from support.cells import (
 from support.robots import KR270
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.errors import ElastocalError
+from elastocal.messages import ElastocalError
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 

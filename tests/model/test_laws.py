@@ -11,8 +11,8 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 from support.stick import model, positions, rows, stick
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.errors import InputError
 from elastocal.measurements import read_measurements, with_moves
+from elastocal.messages import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.compliances import rated_torque, torque_scale, weight_torque
 from elastocal.model.manipulator import Model

@@ -7,7 +7,7 @@ from support.mjcf_text import ARM, LOADABLE, write_arm
 
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm, read_mjcf
 from elastocal.model.rigid import nominal_flanges

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.mjcf import read_mjcf
 
 pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")

@@ -11,7 +11,7 @@ from support.robot_files import frame, slide, told_by_init, urdf
 from support.urdf_text import LIMIT, arm, joint, link
 
 import elastocal as ec
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.urdf import read_urdf
 
 

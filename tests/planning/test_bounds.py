@@ -7,7 +7,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from elastocal.errors import InsufficientDataError
+from elastocal.messages import InsufficientDataError
 from elastocal.planning.criteria import CRITERIA, CriterionInputs
 from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, relax, sized_plans
 

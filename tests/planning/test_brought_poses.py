@@ -24,7 +24,7 @@ from support.design_commands import (
 
 import elastocal as ec
 from elastocal.cell.work_cell import HalfSpace, Workspace
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning.feasibility import NEARBY
 from elastocal.planning.plan import Plan
 

@@ -16,7 +16,7 @@ import elastocal as ec
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.plan_wishes import Freedom, Motion, TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.messages import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
 from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses

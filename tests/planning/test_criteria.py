@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning.criteria import (
     CRITERIA,
     CriterionInputs,

@@ -16,8 +16,8 @@ from support.design_cells import AXIS, as_table, plan_cell, setup_of, value_of
 import elastocal as ec
 from elastocal.cell.arm_description import PolarNoise, Tool, Tracker, Unsteadiness
 from elastocal.cell.work_cell import Cell, Visibility, Workspace
-from elastocal.errors import InputError
 from elastocal.measurements import Measurements
+from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.information import Known, PoseInformation, measured, next_number, whitened

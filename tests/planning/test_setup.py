@@ -15,11 +15,11 @@ from support.design_cells import FULL, any_cell, as_table, plan_cell, scara, set
 from elastocal.cell.arm_description import Nominal, PolarNoise
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.options import Options
 from elastocal.identification.weighted_problem import weights_for
+from elastocal.messages import InsufficientDataError
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

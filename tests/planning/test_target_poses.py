@@ -18,7 +18,7 @@ from support.design_cells import plan_cell, scara, setup_of
 from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell, Solid, Workspace
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.candidates import joint_space
 from elastocal.planning.test_poses import DEFAULT_COUNT, TargetPoses, check_cell

@@ -15,7 +15,7 @@ from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_ch
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError
+from elastocal.messages import InsufficientDataError
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model

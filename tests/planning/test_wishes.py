@@ -15,7 +15,7 @@ from support.design_cells import plan_cell, setup_of
 import elastocal as ec
 from elastocal.cell.plan_wishes import Motion, TargetPose
 from elastocal.cell.work_cell import Solid, Workspace
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.design import DesignOptions, _Design

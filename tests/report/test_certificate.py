@@ -13,7 +13,7 @@ import pytest
 from support.pages import Page
 
 from elastocal.cell.work_cell import CertificateEntries
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.report.smaller_views import Certified, pose_repeatability
 
 ENTRIES = CertificateEntries(

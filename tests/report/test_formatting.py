@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from elastocal.messages import length, rounded, significant
 from elastocal.report.blocks import estimate, plain, with_ends, with_uncertainty
-from elastocal.text import length, rounded, significant
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from support.pages import Page
 
 import elastocal as ec
 from elastocal.above import Result
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 
 
 def test_names_of_the_user_are_no_markup(hostile):

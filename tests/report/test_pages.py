@@ -20,7 +20,7 @@ from support.pages import Page
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

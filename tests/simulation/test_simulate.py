@@ -16,7 +16,7 @@ from elastocal.cell.arm_description import (
     Unsteadiness,
 )
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import position_covariance
 from elastocal.simulation import draw_errors, simulate

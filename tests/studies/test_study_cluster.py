@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from support.study_folders import numbers, run_study, write_study
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.studies import (
     ClusterLostError,
     StudyStop,

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.study_folders import SCRIPT, TOML, here, numbers, on_processes, run_study, write_study
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.studies import opened, read_results, read_study
 from elastocal.studies import run_study as run_prepared
 

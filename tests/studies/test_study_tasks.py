@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from support.study_folders import SCRIPT, TOML, numbers, on_processes, run_study, write_study
 
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.studies import StudyStop, execute, read_results, read_study
 
 posix = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")

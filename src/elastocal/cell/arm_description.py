@@ -34,8 +34,7 @@ from elastocal.config import (
     record,
     turn_key,
 )
-from elastocal.errors import InputError, require
-from elastocal.text import is_label, listed, quoted
+from elastocal.messages import InputError, is_label, listed, quoted, require
 from elastocal.units import Array
 
 Observe = Literal["position", "deflection", "pose", "distance"]

@@ -34,7 +34,7 @@ from elastocal.config import (
     stated,
     turn_key,
 )
-from elastocal.errors import require, wish
+from elastocal.messages import require, wish
 from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]

@@ -45,10 +45,9 @@ from elastocal.config import (
     record,
     stated,
 )
-from elastocal.errors import check_known, require, wish
 from elastocal.files import check_exists
+from elastocal.messages import check_known, is_label, listed, quoted, require, wish
 from elastocal.plugin_loader import is_plugin_file
-from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]

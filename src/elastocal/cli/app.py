@@ -32,18 +32,18 @@ import typer
 from typer.core import TyperGroup
 
 from elastocal.above import LARGEST_SEED, kinds_of
-from elastocal.errors import (
+from elastocal.files import check_output, together
+from elastocal.messages import (
     TRACEBACK,
     ElastocalError,
     InputError,
     explained,
     flag_of,
+    json_text,
     options_as_flags,
     require,
 )
-from elastocal.files import check_output, together
 from elastocal.screen import complain, interrupts, progress_line, safe_console, say
-from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from rich.console import Console

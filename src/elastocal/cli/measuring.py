@@ -26,9 +26,8 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.errors import InputError, require, said_of
+from elastocal.messages import InputError, listed, require, said_of
 from elastocal.screen import interrupts, say
-from elastocal.text import listed
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -32,9 +32,8 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.errors import InsufficientDataError, NotAcceptedError, option, require
+from elastocal.messages import InsufficientDataError, NotAcceptedError, listed, option, require
 from elastocal.screen import complain, progress_line, say
-from elastocal.text import listed
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.diagnosis import Diagnosis

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.above import Result
-from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
 from elastocal.measurements import (
@@ -23,6 +22,17 @@ from elastocal.measurements import (
     joint_columns,
     read_measurements,
     with_moves,
+)
+from elastocal.messages import (
+    InputError,
+    InsufficientDataError,
+    length,
+    listed,
+    option,
+    plain,
+    require,
+    rounded,
+    some,
 )
 from elastocal.model.calibrated import (
     CalibratedArm,
@@ -46,7 +56,6 @@ from elastocal.model.rigid import (
 )
 from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.tables import column, csv_text
-from elastocal.text import length, listed, plain, rounded, some
 from elastocal.units import Array, BoolArray, IntArray
 
 # Targets: where the tool is to be, and in which frame that is stated.

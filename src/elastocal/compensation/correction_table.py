@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.compensation import compensate as single
-from elastocal.errors import option, require
 from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
+from elastocal.messages import listed, option, require, rounded
 from elastocal.model.arm import COLUMNS
 from elastocal.model.calibrated import (
     CalibratedArm,
@@ -27,7 +27,6 @@ from elastocal.model.calibrated import (
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
-from elastocal.text import listed, rounded
 from elastocal.units import Array, BoolArray
 
 LEAST_STEP = 1e-9  # m between levels

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.errors import InputError
 from elastocal.files import atomic_write
 from elastocal.identification.result import Calibration
+from elastocal.messages import InputError
 
 LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg
 REPEATS = 6

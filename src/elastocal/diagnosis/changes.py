@@ -38,11 +38,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from elastocal.above import Result, checked_arguments
-from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.least_squares import correlations, moved, variance_of
 from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN
+from elastocal.messages import InsufficientDataError, listed, option, require, size_of
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
@@ -56,7 +56,6 @@ from elastocal.model.calibrated import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import smooth_groups
-from elastocal.text import listed, size_of
 from elastocal.units import Array, BoolArray, IntArray
 
 SCHEMA = "elastocal/comparison/1"

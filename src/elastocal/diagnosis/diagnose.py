@@ -52,16 +52,23 @@ from elastocal.diagnosis.verdict import (
     unheard_of,
     warnings,
 )
-from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
+from elastocal.messages import (
+    InputError,
+    InsufficientDataError,
+    did_you_mean,
+    length,
+    listed,
+    option,
+    require,
+)
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
 from elastocal.plugin_loader import is_plugin_file
-from elastocal.text import did_you_mean, length, listed
 from elastocal.units import BoolArray, Progress
 
 # Keys of the cell file, in whatever table, whose texts are paths.

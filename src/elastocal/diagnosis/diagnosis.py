@@ -9,14 +9,13 @@ from typing import Any, Literal
 
 from elastocal.above import Result
 from elastocal.diagnosis.baseline import Baseline
-from elastocal.errors import option
 from elastocal.identification.result import Finding
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.measurements import Measurements
+from elastocal.messages import SMALLEST_P as SMALLEST_P
+from elastocal.messages import option, plain
 from elastocal.model.effects.base import Stage
 from elastocal.model.manipulator import Model
-from elastocal.text import SMALLEST_P as SMALLEST_P
-from elastocal.text import plain
 
 
 @dataclass(frozen=True)

@@ -26,10 +26,10 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     recorded,
 )
-from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit, numbered
+from elastocal.messages import InsufficientDataError
 from elastocal.model.arm import Setting, usual_sizes
 from elastocal.model.effects.base import Stage
 from elastocal.model.effects.catalogue import CATALOGUE

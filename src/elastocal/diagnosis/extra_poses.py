@@ -22,8 +22,8 @@ from elastocal.diagnosis.rivals import (
     named_sets,
     rival_sets,
 )
-from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements, visits, with_moves
+from elastocal.messages import InsufficientDataError, counted, option, rounded
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.observations import observe
 from elastocal.planning.candidates import draw
@@ -31,7 +31,6 @@ from elastocal.planning.execution import nearest_first
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import travel_times
 from elastocal.simulation import simulate
-from elastocal.text import counted, rounded
 from elastocal.units import Array, BoolArray, Progress
 
 # What may be measured next: poses in all load states, from any side, at once or later.

@@ -22,19 +22,18 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
 from elastocal.diagnosis.extra_poses import load_forces
-from elastocal.errors import InsufficientDataError, option
-from elastocal.errors import require as check
 from elastocal.identification.identify import identify
 from elastocal.identification.prediction import over_the_workspace, predicted_error
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
+from elastocal.messages import InsufficientDataError, length, option
+from elastocal.messages import require as check
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import shares_of
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import test_poses
-from elastocal.text import length
 from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.

@@ -32,11 +32,11 @@ from elastocal.diagnosis.diagnosis import (
     StructureTest,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.errors import ElastocalError
 from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.outliers import settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
+from elastocal.messages import ElastocalError
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.observations import pure_error
 from elastocal.units import Array, BoolArray, IntArray

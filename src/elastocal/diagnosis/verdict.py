@@ -37,11 +37,11 @@ from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_bet
 from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
 from elastocal.identification.solve import FAR, far_off
+from elastocal.messages import listed, rounded
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
-from elastocal.text import listed, rounded
 from elastocal.units import Array, BoolArray
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.

@@ -18,12 +18,22 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
 from elastocal.cell.arm_description import Convention, Robot
-from elastocal.errors import ElastocalError, option, require
 from elastocal.export import exportable, robot_files
 from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
 from elastocal.measurements import Measurements
+from elastocal.messages import (
+    ElastocalError,
+    did_you_mean,
+    json_text,
+    length,
+    listed,
+    option,
+    plain,
+    require,
+    rounded,
+)
 from elastocal.model import dh
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
@@ -34,7 +44,6 @@ from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import XmlFile, check_urdf, tree_of
 from elastocal.tables import csv_text
-from elastocal.text import did_you_mean, json_text, length, listed, plain, rounded
 from elastocal.units import Array, microns, pose_at, rpy_from_rotation
 
 ENDINGS = {

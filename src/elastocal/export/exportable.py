@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
 from elastocal.cell.arm_description import EffectChoice, Tool
-from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import read_text
 from elastocal.measurements import Measurements
+from elastocal.messages import InputError, InsufficientDataError, option, require
 from elastocal.model import rigid
 from elastocal.model.arm import Spring, row_inputs
 from elastocal.model.calibrated import (

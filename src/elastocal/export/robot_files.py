@@ -17,9 +17,9 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import Robot
-from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.export.exportable import ExportNumbers
 from elastocal.files import read_bytes
+from elastocal.messages import ElastocalError, InputError, listed, option, require
 from elastocal.model.arm import Spring
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
@@ -34,7 +34,6 @@ from elastocal.model.mjcf import (
     transform,
 )
 from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element, tree_of, urdf_file
-from elastocal.text import listed
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 

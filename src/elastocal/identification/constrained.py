@@ -18,10 +18,9 @@ import numpy as np
 import scipy
 from scipy import linalg
 
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.knowledge import ROUND_OFF, ActiveConstraint, System
 from elastocal.identification.weighted_problem import least_norm
-from elastocal.text import listed
+from elastocal.messages import InputError, InsufficientDataError, listed
 from elastocal.units import Array
 
 # Linear equalities, by the space that they leave.

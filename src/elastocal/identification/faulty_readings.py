@@ -24,8 +24,8 @@ from elastocal.identification.outliers import (
 from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
+from elastocal.messages import length
 from elastocal.model.effects.placements import MarkerPosition
-from elastocal.text import length
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.

@@ -10,7 +10,6 @@ from functools import partial
 import numpy as np
 from scipy import linalg, special
 
-from elastocal.errors import option
 from elastocal.identification import noise_summary
 from elastocal.identification.mistakes import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
@@ -22,6 +21,7 @@ from elastocal.identification.sentences import AT_BOUND, made, more_poses
 from elastocal.identification.solve import Solution, far_off
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, numbered
+from elastocal.messages import EXACT, counted, listed, option, rounded
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import MOSTLY, mostly_prior
 from elastocal.model.effects.base import index
@@ -35,7 +35,6 @@ from elastocal.model.effects.compliances import (
 )
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
-from elastocal.text import EXACT, counted, listed, rounded
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from elastocal.errors import ElastocalError, option, said_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import KNOWN_NOISE, judged
 from elastocal.identification.knowledge import Constraints
@@ -75,6 +74,7 @@ from elastocal.identification.start import (
 )
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
+from elastocal.messages import ElastocalError, option, said_of
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.catalogue import effect_of

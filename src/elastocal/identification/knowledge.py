@@ -27,9 +27,8 @@ from elastocal.config import (
     read_toml,
     record,
 )
-from elastocal.errors import InputError, option, require, said_of
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, said_of
 from elastocal.model.manipulator import Model
-from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
 # Constraints as numbers: bounds, linear equalities and matrix inequalities on a vector.

@@ -8,7 +8,6 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.errors import ElastocalError, InsufficientDataError, option, require
 from elastocal.identification.constrained import Reduced
 from elastocal.identification.knowledge import Constraints, share_of_prior
 from elastocal.identification.least_squares import (
@@ -30,7 +29,16 @@ from elastocal.identification.solve import (
     residual_sigma,
 )
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.text import listed, quoted, size_of, some
+from elastocal.messages import (
+    ElastocalError,
+    InsufficientDataError,
+    listed,
+    option,
+    quoted,
+    require,
+    size_of,
+    some,
+)
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # A fit with knowledge: where its constraints let it go, and how far.

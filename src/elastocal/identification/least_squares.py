@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.constrained import minimise
 from elastocal.identification.knowledge import System
 from elastocal.identification.weighted_problem import (
@@ -27,6 +26,7 @@ from elastocal.identification.weighted_problem import (
     least_norm,
     same_size,
 )
+from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.units import Array, IntArray
 
 SETTLED = "the sum of squares no longer fell"

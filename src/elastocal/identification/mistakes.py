@@ -19,15 +19,14 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError
 from elastocal.identification.outliers import FALSE_ALARM, named_runs
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
 from elastocal.measurements import Measurements
+from elastocal.messages import InsufficientDataError, length, listed, rounded
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.text import length, listed, rounded
 from elastocal.units import Array, IntArray
 
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more

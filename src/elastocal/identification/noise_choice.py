@@ -12,7 +12,6 @@ import numpy as np
 from scipy import sparse, special
 
 from elastocal.engine import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
@@ -41,6 +40,7 @@ from elastocal.identification.weighted_problem import (
     whitener,
 )
 from elastocal.measurements import numbered
+from elastocal.messages import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, polar_axes
 from elastocal.units import Array, IntArray

@@ -11,7 +11,6 @@ import numpy as np
 from scipy import special
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
 from elastocal.identification.noise_choice import (
     NoiseFit,
     NoiseTest,
@@ -30,6 +29,7 @@ from elastocal.identification.weighted_problem import (
     weights_for,
 )
 from elastocal.measurements import Measurements, numbered
+from elastocal.messages import InputError
 from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array, IntArray, microns
 

@@ -9,15 +9,14 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from elastocal.errors import InputError, option
 from elastocal.identification.knowledge import ActiveConstraint, Constraints, GaussianPrior
 from elastocal.identification.least_squares import LEVEL, Covariance, drawing_root, t_quantile
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import WeightKind
+from elastocal.messages import InputError, did_you_mean, option, quoted
 from elastocal.model.manipulator import SmoothGroup
-from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 IntervalKind = Literal[

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, sparse, special
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.least_squares import Covariance, clustered, orthogonal
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
@@ -23,6 +22,7 @@ from elastocal.identification.options import MethodResult
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import Part, Problem
+from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all

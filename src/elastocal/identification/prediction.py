@@ -26,19 +26,18 @@ from scipy import special
 
 from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import ElastocalError
 from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import Solution, deviates, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
+from elastocal.messages import EXACT, ElastocalError
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVisits, OpenParameters
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
-from elastocal.text import EXACT
 from elastocal.units import Array, BoolArray, IntArray, microns
 
 # What the identification knows of where the tool will be, and what it does not.

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from elastocal.errors import InputError
 from elastocal.identification.least_squares import orthogonal
+from elastocal.messages import InputError
 from elastocal.units import Array, IntArray
 
 SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse

@@ -12,8 +12,8 @@ from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
 from elastocal.measurements import numbered
+from elastocal.messages import load_text
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.text import load_text
 from elastocal.units import Array, BoolArray, IntArray
 
 # Held-out residuals: cross-validation over configurations in closed form.

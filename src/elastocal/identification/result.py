@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import VIEWS, WORDS, DataFrame, Result, checked_arguments
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint
@@ -34,6 +33,7 @@ from elastocal.identification.prediction import (
 )
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.measurements import Measurements
+from elastocal.messages import ElastocalError, UnknownNameError, length, plain, rounded
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
@@ -46,7 +46,6 @@ from elastocal.model.calibrated import (
     tool_point,
 )
 from elastocal.model.observations import COMPONENTS, observe
-from elastocal.text import length, plain, rounded
 from elastocal.units import Array, microns
 
 SCHEMA = "elastocal/identification/1"

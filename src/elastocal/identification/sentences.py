@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from elastocal.errors import option
 from elastocal.identification.outliers import named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
-from elastocal.text import counted, gathered, listed, rounded, size_of
+from elastocal.messages import counted, gathered, listed, option, rounded, size_of
 from elastocal.units import display
 
 # What to do about a finding.

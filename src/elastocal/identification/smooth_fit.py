@@ -31,9 +31,9 @@ from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates, own_size
 from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import Part, Problem, RFactor, same_size
+from elastocal.messages import listed
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations
-from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray
 
 # Parameters with a prior beside parameters without one: sizes by restricted likelihood, posterior.

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import EPS, Fit, PriorRows, drawing_root, fit, moved
 from elastocal.identification.residuals import (
     CHANCE,
@@ -25,11 +24,11 @@ from elastocal.identification.residuals import (
 from elastocal.identification.start import nothing_shown
 from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
 from elastocal.measurements import numbered
+from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.text import EXACT
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, and what the rest combine with.

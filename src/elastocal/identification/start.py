@@ -11,14 +11,21 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.measurements import Measurements, numbered, visits
+from elastocal.messages import (
+    InputError,
+    InsufficientDataError,
+    did_you_mean,
+    length,
+    listed,
+    option,
+    rounded,
+)
 from elastocal.model.chain import beyond_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.placements import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.text import did_you_mean, length, listed, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 # The linear map of readings onto the nominal arm.  With G_i m + t_i the nominal place of a marker

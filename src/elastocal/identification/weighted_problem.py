@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import Tracker
-from elastocal.errors import InputError, option
+from elastocal.messages import InputError, length, option
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import (
     Observations,
@@ -22,7 +22,6 @@ from elastocal.model.observations import (
     position_covariance,
     subset,
 )
-from elastocal.text import length
 from elastocal.units import Array, IntArray
 
 # Measurement noise: covariance of the observations and the weights W with W Σ = I.

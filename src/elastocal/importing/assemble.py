@@ -21,18 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
 from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing import joining
 from elastocal.importing.exports import FORCES, Records, joint_stems, read_records
 from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import LoadStatesTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
+from elastocal.messages import InputError, did_you_mean, length, listed, quoted, rounded
 from elastocal.model.chain import beyond_limits
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
-from elastocal.text import did_you_mean, length, listed, quoted, rounded
 from elastocal.units import Array, IntArray
 
 UNLOADED = ("none", "unloaded", "0")

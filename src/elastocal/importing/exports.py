@@ -18,12 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import ColumnKey, SourceTable, TextSourceKeys, UnitsTable
+from elastocal.messages import ElastocalError, InputError, listed, plain_minus, quoted
 from elastocal.tables import MAX_LINE, NUMBER, THOUSANDS, column, first_bad_cell
-from elastocal.text import listed, plain_minus, quoted
 from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
 
 MAX_BYTES = 300_000_000

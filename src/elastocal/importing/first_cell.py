@@ -19,8 +19,8 @@ import numpy as np
 from elastocal.above import checked_arguments
 from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
+from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.compliances import JointCompliance, usual_over_stated_mass
@@ -31,7 +31,6 @@ from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load
 from elastocal.model.urdf import check_urdf, xacro_left
-from elastocal.text import listed, printable
 from elastocal.units import Array, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}

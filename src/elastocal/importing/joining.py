@@ -10,11 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
 from elastocal.importing import exports
 from elastocal.importing.exports import Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, NamesTable
-from elastocal.text import is_label, listed, quoted, rounded
+from elastocal.messages import InputError, is_label, listed, quoted, rounded
 from elastocal.units import Array, IntArray
 
 HEIGHT = ("zenith", "elevation")

@@ -28,10 +28,17 @@ from elastocal.config import (
     place,
     read_toml,
 )
-from elastocal.errors import InputError, check_known, option, said_of
 from elastocal.measurements import families
+from elastocal.messages import (
+    InputError,
+    check_known,
+    did_you_mean,
+    listed,
+    option,
+    quoted,
+    said_of,
+)
 from elastocal.tables import column
-from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
 Place = Annotated[int, Field(ge=1)] | Text

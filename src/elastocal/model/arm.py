@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, option
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
+from elastocal.messages import InputError, option
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, joint_index
 from elastocal.units import Array

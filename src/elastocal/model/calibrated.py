@@ -17,9 +17,9 @@ from pydantic_core import PydanticCustomError
 from elastocal.above import Saved, checked_arguments
 from elastocal.cell.work_cell import Cell
 from elastocal.config import Many, Table, checked, is_number, key, keyed, record
-from elastocal.errors import InputError, option, require
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, rounded
 from elastocal.model import rigid
 from elastocal.model.arm import row_inputs
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
@@ -28,7 +28,6 @@ from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.model.symbolic import Total
-from elastocal.text import did_you_mean, listed, quoted, rounded
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"

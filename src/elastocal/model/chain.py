@@ -12,8 +12,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, require, wish
-from elastocal.text import did_you_mean, listed, printable, rounded
+from elastocal.messages import InputError, did_you_mean, listed, printable, require, rounded, wish
 from elastocal.units import Array, IntArray
 
 JointKind = Literal["revolute", "prismatic"]

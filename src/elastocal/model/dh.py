@@ -13,8 +13,17 @@ from typing import Any
 import numpy as np
 
 from elastocal.cell.arm_description import Convention
-from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import read_text
+from elastocal.messages import (
+    InputError,
+    check_known,
+    did_you_mean,
+    listed,
+    option,
+    quoted,
+    require,
+    rounded,
+)
 from elastocal.model import rigid
 from elastocal.model.chain import (
     MAX_ANGLE,
@@ -40,7 +49,6 @@ from elastocal.tables import (
     match_columns,
     read_table,
 )
-from elastocal.text import did_you_mean, listed, quoted, rounded
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")

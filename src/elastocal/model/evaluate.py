@@ -16,8 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import require
-from elastocal.text import did_you_mean
+from elastocal.messages import did_you_mean, require
 
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
 

@@ -15,9 +15,9 @@ from numpy.typing import ArrayLike, NDArray
 from elastocal.above import ByValue, DataFrame, checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
+from elastocal.messages import InputError, listed, option, require
 from elastocal.model.arm import Parameter, given_force, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
 from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
@@ -27,7 +27,6 @@ from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.plugin_loader import Carried
-from elastocal.text import listed
 from elastocal.units import Array, IntArray
 
 

@@ -27,13 +27,12 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
-from elastocal.errors import InputError, require
 from elastocal.files import check_size
+from elastocal.messages import InputError, listed, printable, quoted, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, JointKind, LinkMass, check_angles
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.urdf import MAX_BYTES, FileJoint, Tag, Tree, XmlFile
-from elastocal.text import listed, printable, quoted
 from elastocal.units import Array, pose_at
 
 WORLD = 0  # MuJoCo's number of the world body

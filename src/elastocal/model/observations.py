@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
-from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements, load_states, numbered
+from elastocal.messages import InputError, require
 from elastocal.units import Array, IntArray
 
 SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}

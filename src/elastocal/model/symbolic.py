@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import require
 from elastocal.measurements import Measurements
+from elastocal.messages import require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain

@@ -21,8 +21,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from elastocal.errors import InputError, require
 from elastocal.files import DEEPEST, read_bytes
+from elastocal.messages import SHOWN, InputError, did_you_mean, listed, printable, require
 from elastocal.model import rigid
 from elastocal.model.chain import (
     FINGERS,
@@ -34,7 +34,6 @@ from elastocal.model.chain import (
     LinkMass,
     check_angles,
 )
-from elastocal.text import SHOWN, did_you_mean, listed, printable
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 # An XML file, edited so that all else stays to the byte.

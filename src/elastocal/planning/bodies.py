@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.errors import InputError, check_known, require, said_of
 from elastocal.files import check_regular
+from elastocal.messages import InputError, check_known, require, said_of
 from elastocal.model.chain import Chain
 from elastocal.units import Array, pose_at
 

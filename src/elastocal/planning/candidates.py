@@ -12,14 +12,22 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, check_known, option, require, wish
 from elastocal.measurements import Measurements, read_measurements
+from elastocal.messages import (
+    InputError,
+    InsufficientDataError,
+    check_known,
+    listed,
+    option,
+    quoted,
+    require,
+    wish,
+)
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits, told
 from elastocal.model.manipulator import Model
 from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import plan_forces
 from elastocal.planning.plan import CandidateCounts
-from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
 # Where poses may lie: joint ranges, and one joint that may be held at fixed levels.

@@ -22,7 +22,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, require, wish
+from elastocal.messages import InsufficientDataError, require, rounded, wish
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
@@ -35,7 +35,6 @@ from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Pla
 from elastocal.planning.relaxation import Relaxed, exact_plan, prospects
 from elastocal.planning.setup import FeasiblePool, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
-from elastocal.text import rounded
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states

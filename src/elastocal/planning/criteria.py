@@ -21,9 +21,8 @@ from typing import ClassVar, Literal, Self, TypeVar
 import numpy as np
 
 from elastocal.cell.plan_wishes import TEST_POSE
-from elastocal.errors import InputError, check_known, require
+from elastocal.messages import InputError, check_known, is_label, listed, quoted, require
 from elastocal.plugin_loader import same_class
-from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
 Need = Literal["test_poses", "combination"]

@@ -15,19 +15,23 @@ from threadpoolctl import threadpool_limits
 
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import (
-    InputError,
-    InsufficientDataError,
-    check_known,
-    option,
-    options_given,
-    require,
-    wish,
-)
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
+from elastocal.messages import (
+    InputError,
+    InsufficientDataError,
+    check_known,
+    length,
+    listed,
+    option,
+    options_given,
+    quoted,
+    require,
+    rounded,
+    wish,
+)
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import (
@@ -75,7 +79,6 @@ from elastocal.planning.search import (
 )
 from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
-from elastocal.text import length, listed, quoted, rounded
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].

@@ -16,8 +16,8 @@ from scipy import linalg
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import require, wish
 from elastocal.identification.noise_structure import course_waves
+from elastocal.messages import require, wish
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.moves import Moves

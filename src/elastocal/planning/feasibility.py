@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
+from elastocal.messages import InputError, rounded
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.planning.bodies import RULES, Body, Pair, cell_bodies, cell_pairs
 from elastocal.planning.collision import (
@@ -27,7 +27,6 @@ from elastocal.planning.collision import (
     marker_positions,
     rope_angle,
 )
-from elastocal.text import rounded
 from elastocal.units import Array, BoolArray
 
 # What a rule of the cell is, and those that bound a quantity of the pose.

@@ -13,7 +13,6 @@ from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import CartesianNoise
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, check_known, option, require, wish
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.noise_structure import (
@@ -33,11 +32,20 @@ from elastocal.identification.weighted_problem import (
     whitener,
 )
 from elastocal.measurements import Measurements, load_states, numbered
+from elastocal.messages import (
+    InsufficientDataError,
+    check_known,
+    length,
+    listed,
+    option,
+    quoted,
+    require,
+    wish,
+)
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import SIZE, Observations, available_noise, observe
 from elastocal.simulation import marker_sigmas, simulate
-from elastocal.text import length, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.messages import InputError, InsufficientDataError, some
 from elastocal.model.chain import Chain, told
 from elastocal.planning.feasibility import Feasibility
-from elastocal.text import some
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which joint moves are free: a graph over joint vectors whose edges are checked when needed.

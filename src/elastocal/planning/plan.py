@@ -20,13 +20,13 @@ from elastocal.measurements import (
     in_file_units,
     joint_columns,
 )
+from elastocal.messages import rounded
 from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import csv_text
-from elastocal.text import rounded
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.

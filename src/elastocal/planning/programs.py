@@ -16,10 +16,9 @@ from typing import Literal
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, require
+from elastocal.messages import ElastocalError, InputError, newtons, printable, require, rounded
 from elastocal.model.chain import Chain
 from elastocal.planning.execution import Execution
-from elastocal.text import newtons, printable, rounded
 from elastocal.units import Array
 
 # Text and numbers as robot controllers read them.

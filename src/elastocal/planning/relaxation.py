@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from elastocal.errors import InsufficientDataError
+from elastocal.messages import InsufficientDataError
 from elastocal.planning.criteria import (
     DeterminantCriterion,
     ScenarioCriterion,

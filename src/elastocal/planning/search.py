@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from elastocal import __version__
-from elastocal.errors import InsufficientDataError, require
 from elastocal.files import atomic_write, open_input
+from elastocal.messages import InsufficientDataError, require
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.symbolic import configuration_rows
 from elastocal.planning.candidates import CHUNK, JointSpace, draw, points

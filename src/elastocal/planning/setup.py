@@ -10,9 +10,9 @@ from functools import cached_property
 import numpy as np
 from scipy import optimize
 
-from elastocal.errors import InsufficientDataError, wish
 from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
+from elastocal.messages import InsufficientDataError, length, listed, wish
 from elastocal.model.chain import joint_index
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -32,7 +32,6 @@ from elastocal.planning.plan import Everywhere, Plan, Scheduled, predicted, rema
 from elastocal.planning.relaxation import DesignProblem, relax
 from elastocal.planning.test_poses import TargetPoses, known_rows
 from elastocal.simulation import expand_plan, simulate
-from elastocal.text import length, listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 WORTH_TELLING = 1e-7  # m

@@ -12,9 +12,17 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.plan_wishes import TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, require, wish
 from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
+from elastocal.messages import (
+    InputError,
+    InsufficientDataError,
+    listed,
+    quoted,
+    require,
+    rounded,
+    wish,
+)
 from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import (
     LIMIT_SLACK,
@@ -34,7 +42,6 @@ from elastocal.planning.candidates import sobol
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
-from elastocal.text import listed, quoted, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 # Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.

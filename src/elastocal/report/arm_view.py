@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell, HalfSpace, Solid
-from elastocal.errors import ElastocalError, require
 from elastocal.files import atomic_write
 from elastocal.measurements import numbered
+from elastocal.messages import ElastocalError, load_text, printable, require
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -26,7 +26,6 @@ from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks as say
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
-from elastocal.text import load_text, printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from importlib import resources
 from typing import TYPE_CHECKING, Any, Literal
 
 from elastocal.measurements import in_file_units
+from elastocal.messages import counted as counted
+from elastocal.messages import length, newtons, printable, rounded, significant, together
+from elastocal.messages import p_value as p_value
+from elastocal.messages import size_of as size_of
 from elastocal.model.manipulator import Model
-from elastocal.text import counted as counted
-from elastocal.text import length, newtons, printable, rounded, significant, together
-from elastocal.text import p_value as p_value
-from elastocal.text import size_of as size_of
 from elastocal.units import Array, display
 
 if TYPE_CHECKING:

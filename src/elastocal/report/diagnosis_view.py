@@ -20,9 +20,9 @@ from elastocal.diagnosis.diagnosis import (
     NoiseFloor,
 )
 from elastocal.measurements import by_rows
+from elastocal.messages import printable, some
 from elastocal.report import blocks as say
 from elastocal.report.figures import Residuals, effects_over_joints, unknown_curves, waterfall
-from elastocal.text import printable, some
 
 MOST_CANDIDATES = 8
 MOST_TESTS = 12

@@ -20,16 +20,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from elastocal.errors import ElastocalError
 from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import groupings
 from elastocal.identification.weighted_problem import least_norm
+from elastocal.messages import ElastocalError, printable
 from elastocal.model.effects.base import index
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.report import blocks as say
-from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:

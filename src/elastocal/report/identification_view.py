@@ -9,18 +9,17 @@ from functools import cache
 
 import numpy as np
 
-from elastocal.errors import option
 from elastocal.identification import findings
 from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.identification.sentences import next_steps
+from elastocal.messages import listed, option, printable, some
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import judgement_view as words
 from elastocal.report.figures import Residuals, uncertainty_map, waterfall
-from elastocal.text import listed, printable, some
 from elastocal.units import Array
 
 Truth = dict[str, float]

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from elastocal.errors import option
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.findings import only_placed, shape_of
 from elastocal.identification.knowledge import ActiveConstraint
@@ -17,9 +16,9 @@ from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import warning_sentences
+from elastocal.messages import gathered, listed, option, printable, rounded, some
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
-from elastocal.text import gathered, listed, printable, rounded, some
 
 
 def judgement(result: Calibration) -> say.ShownVerdict:

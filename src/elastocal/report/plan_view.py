@@ -7,14 +7,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from elastocal.errors import option
+from elastocal.messages import listed, option, printable, rounded, some
 from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name
 from elastocal.report import blocks as say
 from elastocal.report.figures import NO_ENDS, plan_curve, rows_of_dots
-from elastocal.text import listed, printable, rounded, some
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses

@@ -31,13 +31,21 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal import __version__
-from elastocal.errors import InputError, check_known, option, require
 from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
+from elastocal.messages import (
+    InputError,
+    cell_meaning,
+    check_known,
+    listed,
+    option,
+    printable,
+    quoted,
+    require,
+)
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.report import blocks as say
 from elastocal.screen import safe_console, shown
-from elastocal.text import cell_meaning, listed, printable, quoted
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,17 +13,16 @@ from xml.sax.saxutils import escape
 import numpy as np
 
 from elastocal import __version__
-from elastocal.errors import InputError
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.measurements import in_file_units, joint_columns, numbered
+from elastocal.messages import InputError, listed, load_text, printable, some
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
 from elastocal.report import identification_view as fitted
 from elastocal.report.figures import NO_ENDS, rows_of_dots
 from elastocal.report.judgement_view import judgement, method_and_weights
-from elastocal.text import listed, load_text, printable, some
 from elastocal.units import Array
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from planning.feasibility.small_cells import at
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Solid
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning.bodies import mesh_hull, support, touches
 
 CUBE = """v 0 0 0

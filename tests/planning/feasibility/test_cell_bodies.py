@@ -8,7 +8,7 @@ from planning.feasibility.small_cells import KR270_CHAIN, cell, sphere
 
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.work_cell import CarriedBody, Workspace
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.model.urdf import read_urdf
 from elastocal.planning.bodies import WORLD, cell_bodies, hull
 

@@ -19,7 +19,7 @@ from planning.feasibility.small_cells import (
 
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.work_cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning.feasibility import POSE_SLACK, Feasibility
 
 RADII = (0.28, 0.2, 0.18, 0.15, 0.15, 0.11)

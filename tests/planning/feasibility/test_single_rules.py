@@ -26,7 +26,7 @@ from support.design_cells import plan_cell
 
 from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
 from elastocal.cell.work_cell import HalfSpace, HangingLoad, Visibility, Workspace
-from elastocal.errors import InputError
+from elastocal.messages import InputError
 from elastocal.planning.collision import Kinematics, StaticTorque
 from elastocal.planning.feasibility import Feasibility
 

@@ -11,8 +11,8 @@ from support.discs import Discs
 
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
-from elastocal.errors import InputError
 from elastocal.identification.noise_structure import course_waves
+from elastocal.messages import InputError
 from elastocal.planning import execution as drift_module
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.execution import DRIFT, Alias, schedule, turns

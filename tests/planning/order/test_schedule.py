@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.discs import Discs, best_time
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.messages import InputError, InsufficientDataError
 from elastocal.planning.execution import schedule
 from elastocal.planning.moves import Unreachable
 

@@ -12,7 +12,7 @@ from support.cells import kr270_cell, kr270_chain, random_poses
 from support.discs import Discs
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.errors import ElastocalError, InputError
+from elastocal.messages import ElastocalError, InputError
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.planning.execution import schedule
 from elastocal.planning.programs import (

@@ -11,12 +11,11 @@ from typing import Any, ClassVar, Literal, get_args
 import casadi as ca
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, require
+from elastocal.messages import InputError, listed, require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, joint_index
 from elastocal.plugin_loader import check_registered
-from elastocal.text import listed
 from elastocal.units import Array
 
 Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]

@@ -14,7 +14,7 @@ from pathlib import Path
 import casadi as ca
 
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.errors import InputError, check_known, require
+from elastocal.messages import InputError, check_known, require
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
 from elastocal.model.effects import compliances, gears, loads, placements, smooth

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import require
+from elastocal.messages import require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain, extent

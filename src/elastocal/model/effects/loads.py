@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import require
+from elastocal.messages import require, rounded
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain, finite_ranges
@@ -26,7 +26,6 @@ from elastocal.model.effects.base import (
 )
 from elastocal.model.effects.placements import SHORTEST, transverse_axes
 from elastocal.model.evaluate import BatchFunction
-from elastocal.text import rounded
 from elastocal.units import Array
 
 
