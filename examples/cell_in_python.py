@@ -9,7 +9,7 @@ from importlib.resources import files
 import numpy as np
 
 import elastocal as ec
-from elastocal.cell.arm_description import ModelSpec, Nominal, PolarNoise
+from elastocal.cell_tables import ModelSpec, Nominal, PolarNoise
 
 cell = ec.Cell(
     name="KR 270 beside the press",

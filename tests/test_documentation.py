@@ -8,7 +8,7 @@ import pytest
 import typer
 from support.robots import KR270
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.cli.main import app
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model

@@ -18,7 +18,7 @@ from support.design_commands import elastocal as command
 
 import elastocal as ec
 from elastocal import plugins
-from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell_tables import DesignSpec
 from elastocal.demo.example import LOAD_N, run_demo
 from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.identification.options import Options

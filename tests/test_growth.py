@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.compensation.compensate import read_targets
 from elastocal.files import read_json
 from elastocal.importing.assemble import import_files

@@ -55,7 +55,7 @@ def uses() -> dict[str, set[str]]:
 
 
 def _room(name: str) -> str:
-    return "front door" if name == "__init__" else name
+    return {"__init__": "front door", "cell_tables": "cell"}.get(name, name)
 
 
 def _below(room: str, uses: dict[str, set[str]]) -> set[str]:

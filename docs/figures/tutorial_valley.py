@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from style import ROOT, Colours, draw, plt
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.simulation import expand_plan, simulate, values_from

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.config import keys_of, tables_in
 
 HEAD = """# Keys of the cell file

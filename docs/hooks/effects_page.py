@@ -7,7 +7,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.demo import example
 from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain

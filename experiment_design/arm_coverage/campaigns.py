@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.identification.solve import reduce
 from elastocal.measurements import Measurements, with_moves
 from elastocal.model.chain import joint_limits

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from draw import World
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, project
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams

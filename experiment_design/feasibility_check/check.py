@@ -19,7 +19,7 @@ from joblib import Parallel, delayed
 from mujoco_cell import MujocoCell
 from scipy.stats import qmc
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import load_chain
 from elastocal.planning.collision import END

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.work_cell import Cell, Solid
+from elastocal.cell import Cell, Solid
 from elastocal.model.chain import Chain
 from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base
 

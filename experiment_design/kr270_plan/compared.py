@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from joblib import Parallel, delayed
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.demo.example import published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.demo.example import LOAD_N, REPEATS, published_compliances, reading_sigma
 from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model

@@ -17,9 +17,17 @@ from pathlib import Path
 import numpy as np
 
 import elastocal as ec
-from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.cell.plan_wishes import DesignSpec, TargetPose
-from elastocal.cell.work_cell import Cell, Workspace
+from elastocal.cell import Cell, Workspace
+from elastocal.cell_tables import (
+    CartesianNoise,
+    DesignSpec,
+    ModelSpec,
+    Nominal,
+    Robot,
+    TargetPose,
+    Tool,
+    Tracker,
+)
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
 from elastocal.planning.choices import single_ways

@@ -15,7 +15,8 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.arm_description import (
+from elastocal.cell import Cell
+from elastocal.cell_tables import (
     CartesianNoise,
     EffectChoice,
     ModelSpec,
@@ -23,7 +24,6 @@ from elastocal.cell.arm_description import (
     Tool,
     Tracker,
 )
-from elastocal.cell.work_cell import Cell
 from elastocal.identification.identify import identify
 from elastocal.identification.residuals import rms_3d
 from elastocal.measurements import Measurements

@@ -16,8 +16,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from elastocal.cell.arm_description import Robot, Tool, Tracker
-    from elastocal.cell.work_cell import Cell, Workspace, read_cell
+    from elastocal.cell import Cell, Workspace, read_cell
+    from elastocal.cell_tables import Robot, Tool, Tracker
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis
@@ -45,8 +45,8 @@ __version__ = "0.1.0"
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
-    "cell.arm_description": "Robot Tool Tracker",
-    "cell.work_cell": "Cell Workspace read_cell",
+    "cell_tables": "Robot Tool Tracker",
+    "cell": "Cell Workspace read_cell",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.changes": "Comparison compare",

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from elastocal import plugin_loader
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
 from elastocal.messages import InputError

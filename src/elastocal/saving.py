@@ -23,7 +23,7 @@ from elastocal.model.manipulator import Model
 from elastocal.tables import PARQUET, Labels, csv_text
 
 if TYPE_CHECKING:
-    from elastocal.cell.work_cell import Cell
+    from elastocal.cell import Cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
@@ -96,7 +96,7 @@ def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
 
     Raises InputError where the cell was built in Python or changed after it was read.
     """
-    from elastocal.cell.work_cell import read_cell
+    from elastocal.cell import read_cell
     from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.model.chain import numbered
 

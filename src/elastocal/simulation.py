@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
 from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, wish
 from elastocal.model.arm import Parameter

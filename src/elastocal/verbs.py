@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from pandas import DataFrame
 
-    from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
-    from elastocal.cell.work_cell import Cell
+    from elastocal.cell import Cell
+    from elastocal.cell_tables import Freedom, Motion, TargetBox, TargetPath, TargetPose
     from elastocal.compensation.compensate import Compensation, Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
@@ -39,8 +39,8 @@ else:
     globals().update(later(
         "numpy.typing ArrayLike",
         "pandas DataFrame",
-        "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
-        "elastocal.cell.work_cell Cell",
+        "elastocal.cell_tables Freedom Motion TargetBox TargetPath TargetPose",
+        "elastocal.cell Cell",
         "elastocal.compensation.compensate Compensation Targets",
         "elastocal.diagnosis.diagnosis Diagnosis",
         "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
@@ -229,7 +229,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     """[design] of the cell with what is asked for, checked by it, in its place."""
     import numpy as np
 
-    from elastocal.cell import plan_wishes as wish
+    from elastocal import cell_tables as wish
     from elastocal.planning.criteria import criterion_named
 
     def test_poses(given: Any) -> tuple[TargetPose, ...]:

@@ -13,26 +13,7 @@ from fuzz.mutations import ON_TEXT
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.cell.arm_description import (
-    CartesianNoise,
-    EffectChoice,
-    ModelSpec,
-    Nominal,
-    PolarNoise,
-    Robot,
-    Tool,
-    Tracker,
-    Unsteadiness,
-)
-from elastocal.cell.plan_wishes import (
-    DesignSpec,
-    Freedom,
-    Motion,
-    TargetBox,
-    TargetPath,
-    TargetPose,
-)
-from elastocal.cell.work_cell import (
+from elastocal.cell import (
     Acceptance,
     CarriedBody,
     Cell,
@@ -43,6 +24,23 @@ from elastocal.cell.work_cell import (
     Visibility,
     Workspace,
     read_cell,
+)
+from elastocal.cell_tables import (
+    CartesianNoise,
+    DesignSpec,
+    EffectChoice,
+    Freedom,
+    ModelSpec,
+    Motion,
+    Nominal,
+    PolarNoise,
+    Robot,
+    TargetBox,
+    TargetPath,
+    TargetPose,
+    Tool,
+    Tracker,
+    Unsteadiness,
 )
 from elastocal.messages import InputError
 

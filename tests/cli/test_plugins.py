@@ -22,7 +22,7 @@ from typer.testing import Result
 
 import elastocal as ec
 from elastocal import plugin_loader
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.messages import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model

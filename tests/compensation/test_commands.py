@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, SLANTED, kr270_cell, kr270_chain, table_of
 
 import elastocal as ec
-from elastocal.cell.arm_description import Nominal
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Nominal
 from elastocal.compensation.compensate import (
     Compensation,
     compensate,

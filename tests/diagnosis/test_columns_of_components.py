@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
-from elastocal.cell.arm_description import EffectChoice, Nominal
+from elastocal.cell_tables import EffectChoice, Nominal
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, compute_columns
 from elastocal.identification.start import as_placed

@@ -23,7 +23,7 @@ from support.registered import forgotten, write_example
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.cell.arm_description import CartesianNoise
+from elastocal.cell_tables import CartesianNoise
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.verdict import confirm, unheard_of
 from elastocal.model.effects.catalogue import CATALOGUE

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from support.diagnoses import ECCENTRICITY, JUMP
 from support.robots import KR270
 
-from elastocal.cell.arm_description import EffectChoice
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
+from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model

@@ -13,7 +13,7 @@ import pytest
 from support.cells import DOWN, kr270_chain, table_of
 from support.diagnosis_data import FITTED, Fault, cell, measured
 
-from elastocal.cell.work_cell import Workspace
+from elastocal.cell import Workspace
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.diagnosis import Candidate, EffectAt, NoiseFloor
 from elastocal.diagnosis.extra_poses import plan_extra

@@ -10,7 +10,7 @@ from scipy import optimize, stats
 from support.diagnosis_data import campaign
 from support.noisy_data import dense_noise, random_data, used_rows
 
-from elastocal.cell.arm_description import Unsteadiness
+from elastocal.cell_tables import Unsteadiness
 from elastocal.diagnosis import baseline
 from elastocal.diagnosis.baseline import Blocks, NoiseValues, NoisyData, fit_baseline, project
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of

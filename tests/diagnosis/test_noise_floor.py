@@ -11,7 +11,7 @@ from support.diagnosis_data import FITTED, REPEATABILITY, SIGMA, cell, measured
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.cell.arm_description import Unsteadiness
+from elastocal.cell_tables import Unsteadiness
 from elastocal.model.manipulator import Model
 from elastocal.report.diagnosis_view import noise_floor_lines
 

@@ -12,7 +12,7 @@ from support.diagnosis_data import Fault, campaign, cell, measured, plan
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.diagnosis.baseline import thinned
 from elastocal.messages import InsufficientDataError
 from elastocal.model.manipulator import Model

@@ -11,7 +11,7 @@ from support.diagnosis_data import SIGMA, campaign, cell, measured
 
 import elastocal as ec
 from elastocal import Measurements
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.model.manipulator import Model
 
 RIGID = ("base_frame", "joint_offset", "marker_position")

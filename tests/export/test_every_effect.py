@@ -12,7 +12,7 @@ from support.cells import COMPENSATOR, SLANTED, kr270_cell
 from support.exports import write_result
 from support.robots import KR270
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.export.export import Wish, export
 from elastocal.export.exportable import Conditions, cost_of, evaluate_pieces, keep
 from elastocal.model.arm import Arm, Spring

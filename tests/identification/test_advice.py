@@ -18,7 +18,7 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.start import check_limits
 from elastocal.messages import InputError, InsufficientDataError

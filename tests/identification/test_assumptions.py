@@ -10,7 +10,7 @@ import pytest
 from support.calibration import SPRINGS, cell_of, measured, random_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker, Unsteadiness
+from elastocal.cell_tables import CartesianNoise, Nominal, Tracker, Unsteadiness
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options

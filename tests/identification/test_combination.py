@@ -8,7 +8,7 @@ import pytest
 from support.calibration import GEOMETRY, campaign, cell_of, combination_truth, measured, table_at
 from support.cells import kr270_chain, random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.cell_tables import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
 from elastocal.messages import json_text
 from elastocal.model.manipulator import Model

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.calibration import GEOMETRY, campaign
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell_tables import CartesianNoise, Tracker
 from elastocal.diagnosis import diagnosis as diagnosis_result
 from elastocal.identification import findings as module
 from elastocal.identification.findings import judged

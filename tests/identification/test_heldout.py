@@ -6,7 +6,7 @@ from scipy import sparse
 from support.calibration import cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.residuals import held_out_residual, predicts_better
 from elastocal.identification.weighted_problem import Weights

@@ -22,7 +22,7 @@ from support.calibration import (
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 from support.robots import packaged_urdf
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
+from elastocal.cell_tables import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
 from elastocal.identification.mistakes import nominal_fit
 from elastocal.identification.solve import reduce

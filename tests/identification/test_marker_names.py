@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import elastocal as ec
-from elastocal.cell.arm_description import CartesianNoise, ModelSpec
+from elastocal.cell_tables import CartesianNoise, ModelSpec
 from elastocal.identification.mistakes import exchanged
 
 DEMO = Path(ec.__file__).parent / "demo"

@@ -16,7 +16,7 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell_tables import CartesianNoise, Tracker
 from elastocal.identification import published
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import lack_of_fit

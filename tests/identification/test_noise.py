@@ -7,7 +7,7 @@ import pytest
 from scipy import linalg
 from support.calibration import table_at
 
-from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell_tables import CartesianNoise, PolarNoise, Tracker
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.messages import InputError
 from elastocal.model.observations import observe

@@ -9,7 +9,7 @@ import pytest
 from support.calibration import GEOMETRY, campaign, cell_of, measured, planar_chain, table_at
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell_tables import CartesianNoise, Tracker
 from elastocal.identification.identify import identify
 from elastocal.identification.prediction import NewPoses
 from elastocal.identification.residuals import rms_3d

@@ -6,7 +6,7 @@ from scipy import linalg
 from support.calibration import GEOMETRY, campaign, cell_of, planar_chain, random_chain, table_at
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.solve import reduce
 from elastocal.model.effects.gears import JointOffset

@@ -7,7 +7,7 @@ import numpy as np
 from support.calibration import PLACED, cell_of, random_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
+from elastocal.cell_tables import CartesianNoise, Tracker, Unsteadiness
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED

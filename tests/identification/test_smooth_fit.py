@@ -10,7 +10,7 @@ from support.cells import kr270_cell, kr270_chain, random_poses, random_table
 from support.stick import model as of_stick
 from support.stick import stick
 
-from elastocal.cell.arm_description import Nominal, Tool
+from elastocal.cell_tables import Nominal, Tool
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 import elastocal as ec
-from elastocal.cell.arm_description import CartesianNoise, ModelSpec
-from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell_tables import CartesianNoise, DesignSpec, ModelSpec
 
 DEMO = Path(ec.__file__).parent / "demo"
 MARKERS = {"M1": [0.25, 0.0, 0.05], "M2": [-0.12, 0.22, 0.10]}

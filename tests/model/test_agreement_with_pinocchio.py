@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from support.cells import kr270_cell, random_poses
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 
-from elastocal.cell.arm_description import Nominal
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Nominal
 from elastocal.model.chain import Chain
 from elastocal.model.rigid import nominal_flanges, nominal_frames
 from elastocal.model.urdf import read_urdf

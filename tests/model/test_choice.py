@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_table
 from support.registered import forgotten, write_example
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.messages import InputError
 from elastocal.model.arm import Arm
 from elastocal.model.effects.base import DrivenEffect

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_table
 from support.robots import random_chain_urdf
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.measurements import Measurements, with_moves
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model

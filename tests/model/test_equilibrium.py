@@ -24,7 +24,7 @@ from support.cells import (
 )
 from support.robots import KR270
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.messages import ElastocalError
 from elastocal.model.manipulator import Model
 from elastocal.units import Array

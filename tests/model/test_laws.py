@@ -10,7 +10,7 @@ import pytest
 from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 from support.stick import model, positions, rows, stick
 
-from elastocal.cell.arm_description import Nominal
+from elastocal.cell_tables import Nominal
 from elastocal.measurements import read_measurements, with_moves
 from elastocal.messages import InputError
 from elastocal.model.effects.catalogue import CATALOGUE

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from support.mjcf_text import ARM, LOADABLE, write_arm
 
-from elastocal.cell.arm_description import Robot
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell import Cell, read_cell
+from elastocal.cell_tables import Robot
 from elastocal.messages import InputError
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm, read_mjcf

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from support.cells import kr270_cell, kr270_chain, random_poses, random_table
 from support.stick import model, positions, rows, stick
 
-from elastocal.cell.arm_description import Nominal
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Nominal
 from elastocal.model.arm import Arm
 from elastocal.model.chain import Chain
 from elastocal.model.effects.loads import STANDARD_GRAVITY, GravitySag, LinkWeights

@@ -23,7 +23,7 @@ from support.design_commands import (
 )
 
 import elastocal as ec
-from elastocal.cell.work_cell import HalfSpace, Workspace
+from elastocal.cell import HalfSpace, Workspace
 from elastocal.messages import InputError
 from elastocal.planning.feasibility import NEARBY
 from elastocal.planning.plan import Plan

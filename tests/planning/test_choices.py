@@ -13,9 +13,8 @@ from support.design_cells import plan_cell
 from support.design_commands import DEFLECTION, design, write_cell
 
 import elastocal as ec
-from elastocal.cell.arm_description import PolarNoise
-from elastocal.cell.plan_wishes import Freedom, Motion, TargetPose
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Freedom, Motion, PolarNoise, TargetPose
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
 from elastocal.planning import choices

@@ -15,8 +15,8 @@ from support.calibration import placement
 from support.cells import DOWN, kr270_chain
 from support.design_cells import any_cell, plan_cell, scara, value_of
 
-from elastocal.cell.plan_wishes import Motion
-from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell_tables import Motion
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.planning import design as design_module
 from elastocal.planning.design import DesignOptions, design

@@ -14,8 +14,8 @@ from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import AXIS, as_table, plan_cell, setup_of, value_of
 
 import elastocal as ec
-from elastocal.cell.arm_description import PolarNoise, Tool, Tracker, Unsteadiness
-from elastocal.cell.work_cell import Cell, Visibility, Workspace
+from elastocal.cell import Cell, Visibility, Workspace
+from elastocal.cell_tables import PolarNoise, Tool, Tracker, Unsteadiness
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model

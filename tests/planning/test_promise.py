@@ -13,8 +13,8 @@ from scipy import stats
 from support.cells import DOWN, kr270_chain
 from support.design_cells import as_table, plan_cell
 
-from elastocal.cell.arm_description import PolarNoise
-from elastocal.cell.work_cell import Cell, Workspace
+from elastocal.cell import Cell, Workspace
+from elastocal.cell_tables import PolarNoise
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements

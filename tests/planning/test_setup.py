@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import FULL, any_cell, as_table, plan_cell, scara, setup_of, value_of
 
-from elastocal.cell.arm_description import Nominal, PolarNoise
-from elastocal.cell.plan_wishes import TargetPose
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Nominal, PolarNoise, TargetPose
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.options import Options

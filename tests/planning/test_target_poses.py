@@ -15,9 +15,16 @@ from support.calibration import placement
 from support.cells import DOWN, kr270_cell, kr270_chain, nominal_flanges, random_poses
 from support.design_cells import plan_cell, scara, setup_of
 
-from elastocal.cell.arm_description import Nominal, Tool
-from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
-from elastocal.cell.work_cell import Cell, Solid, Workspace
+from elastocal.cell import Cell, Solid, Workspace
+from elastocal.cell_tables import (
+    DesignSpec,
+    Motion,
+    Nominal,
+    TargetBox,
+    TargetPath,
+    TargetPose,
+    Tool,
+)
 from elastocal.messages import InputError
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.candidates import joint_space

@@ -12,9 +12,8 @@ from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, r
 from support.cells import table_of as rows_with_markers
 from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, value_of
 
-from elastocal.cell.arm_description import Nominal
-from elastocal.cell.plan_wishes import TargetPose
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Nominal, TargetPose
 from elastocal.messages import InsufficientDataError
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import Chain

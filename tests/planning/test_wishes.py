@@ -13,8 +13,8 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import plan_cell, setup_of
 
 import elastocal as ec
-from elastocal.cell.plan_wishes import Motion, TargetPose
-from elastocal.cell.work_cell import Solid, Workspace
+from elastocal.cell import Solid, Workspace
+from elastocal.cell_tables import Motion, TargetPose
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_of
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
-from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell_tables import CartesianNoise, DesignSpec, Tracker
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Method, Options
 from elastocal.identification.result import Calibration

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from support.pages import Page
 
-from elastocal.cell.work_cell import CertificateEntries
+from elastocal.cell import CertificateEntries
 from elastocal.messages import InputError
 from elastocal.report.smaller_views import Certified, pose_repeatability
 

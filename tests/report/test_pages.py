@@ -18,7 +18,7 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, HOSTILE, VERDICTS
 from support.pages import Page
 
-from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.messages import InputError
 from elastocal.model.chain import joint_limits

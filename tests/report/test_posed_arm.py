@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, random_poses
 from support.robots import packaged_urdf
 
-from elastocal.cell.arm_description import Nominal, Robot, Tracker
-from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
+from elastocal.cell import HalfSpace, Solid, Workspace
+from elastocal.cell_tables import Nominal, Robot, Tracker
 from elastocal.model.manipulator import load_chain
 from elastocal.report.arm_view import (
     in_script,

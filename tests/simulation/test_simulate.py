@@ -8,14 +8,14 @@ from scipy import stats
 from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import (
+from elastocal.cell_tables import (
     CartesianNoise,
+    DesignSpec,
     Nominal,
     PolarNoise,
     Tracker,
     Unsteadiness,
 )
-from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import position_covariance

@@ -24,8 +24,8 @@ from suites import named, tasks
 from world_files import write_table, write_world
 
 import elastocal as ec
-from elastocal.cell.arm_description import EffectChoice
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
+from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model

@@ -16,7 +16,7 @@ sys.path.insert(0, str(FOLDER))
 import scenarios
 from support.study_scripts import study_of
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options

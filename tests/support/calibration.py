@@ -11,8 +11,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from support.cells import choices, random_poses, table_at
 
-from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from support.robots import KR270
 
-from elastocal.cell.arm_description import EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import Chain
 from elastocal.model.rigid import nominal_flanges

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from support.calibration import cell_of, placement, random_chain
 from support.cells import kr270_cell, kr270_chain
 
-from elastocal.cell.arm_description import CartesianNoise, Tool, Tracker
-from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import CartesianNoise, DesignSpec, Tool, Tracker
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.manipulator import Model

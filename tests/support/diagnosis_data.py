@@ -23,8 +23,8 @@ from support.robots import KR270
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.export.export import Exported, Wish, export
 from elastocal.export.exportable import Conditions, random_table
 from elastocal.model.arm import Parameter

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from support.cells import choices, table_of
 
-from elastocal.cell.arm_description import ModelSpec, Nominal, Robot, Tool, Tracker
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.manipulator import Model

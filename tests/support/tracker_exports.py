@@ -9,7 +9,7 @@ import numpy as np
 from support.cells import random_poses, table_of
 from support.robots import KR270
 
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.importing.assemble import Imported, import_files
 from elastocal.importing.mapping_file import read_mapping
 from elastocal.model.manipulator import Model

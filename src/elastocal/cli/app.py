@@ -48,7 +48,7 @@ from elastocal.screen import complain, interrupts, progress_line, safe_console, 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from elastocal.cell.work_cell import Cell
+    from elastocal.cell import Cell
 
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 

@@ -32,7 +32,7 @@ from elastocal.screen import interrupts, say
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from elastocal.cell.work_cell import Cell
+    from elastocal.cell import Cell
     from elastocal.importing.assemble import Imported
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.plan import Plan
@@ -60,7 +60,7 @@ def init(
         ur_model: Of a calibration.conf: the robot, as UR10e.
         force: Write over a file.
     """
-    from elastocal.cell.work_cell import read_cell
+    from elastocal.cell import read_cell
     from elastocal.importing.first_cell import init as write
     from elastocal.importing.first_cell import notes_of
     from elastocal.model.manipulator import load_chain
@@ -384,7 +384,7 @@ def import_(
         length_unit: Unit of lengths where a file does not say: mm, m, um, in.
         angle_unit: Unit of angles where a file does not say: deg, rad, gon.
     """
-    from elastocal.cell.work_cell import read_cell
+    from elastocal.cell import read_cell
     from elastocal.files import atomic_write
     from elastocal.importing.assemble import import_files
     from elastocal.importing.exports import likely_presets

@@ -88,7 +88,7 @@ def identify(
 
 def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float]:
     """NAME=UM as limits in m, NAME one of `names`, by default of all."""
-    from elastocal.cell.work_cell import Acceptance
+    from elastocal.cell import Acceptance
 
     names = names or tuple(vars(Acceptance()))
     takes = f"NAME=UM, NAME one of {listed(names)} and UM a positive number in µm"

@@ -44,7 +44,7 @@ def run_demo(
     gets 1/√2 of it.  Raises InputError where the folder cannot be written, or holds files of the
     same names that are not the example's.
     """
-    from elastocal.cell.work_cell import read_cell
+    from elastocal.cell import read_cell
     from elastocal.identification.identify import identify
     from elastocal.model.manipulator import Model
     from elastocal.simulation import expand_plan, simulate, values_from

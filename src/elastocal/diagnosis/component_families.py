@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logit, logsumexp, ndtri
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.diagnosis.baseline import NoiseValues, log_prior, project
 from elastocal.diagnosis.components import ALONE, Component, Family, FittedSum, presence_cost
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, wrenches

@@ -13,7 +13,7 @@ import numpy as np
 import tomli_w
 from scipy.special import expit
 
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.config import read_toml
 from elastocal.diagnosis.baseline import NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer

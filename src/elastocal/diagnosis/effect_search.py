@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import expit, log_ndtr, logsumexp, ndtr
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.diagnosis.baseline import (
     SHARED,
     Baseline,

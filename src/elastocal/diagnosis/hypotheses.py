@@ -13,8 +13,8 @@ import numpy as np
 import scipy  # whose `optimize` loads where it is used
 from scipy.special import logsumexp
 
-from elastocal.cell.arm_description import EffectChoice
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
 from elastocal.measurements import Measurements, by_rows, in_any_order

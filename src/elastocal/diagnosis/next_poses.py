@@ -17,8 +17,8 @@ from typing import Any, Literal
 import numpy as np
 
 from elastocal.above import Result, checked_arguments
-from elastocal.cell.plan_wishes import TEST_POSE
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import TEST_POSE
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
 from elastocal.diagnosis.extra_poses import load_forces

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from elastocal.above import checked_arguments
-from elastocal.cell.arm_description import Convention, Robot
+from elastocal.cell_tables import Convention, Robot
 from elastocal.export import exportable, robot_files
 from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together

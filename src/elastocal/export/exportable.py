@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
-from elastocal.cell.arm_description import EffectChoice, Tool
+from elastocal.cell_tables import EffectChoice, Tool
 from elastocal.files import read_text
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError, InsufficientDataError, option, require

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.arm_description import Robot
+from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
 from elastocal.files import read_bytes
 from elastocal.messages import ElastocalError, InputError, listed, option, require

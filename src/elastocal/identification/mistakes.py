@@ -17,8 +17,8 @@ import numpy as np
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.arm_description import ModelSpec, Tool
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import ModelSpec, Tool
 from elastocal.identification.outliers import FALSE_ALARM, named_runs
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
 from elastocal.measurements import Measurements

@@ -16,7 +16,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy import sparse, special
 
-from elastocal.cell.arm_description import Unsteadiness
+from elastocal.cell_tables import Unsteadiness
 from elastocal.measurements import Measurements, numbered, visits
 from elastocal.messages import InputError, did_you_mean, option, quoted, require
 from elastocal.model.effects.base import JointMotion

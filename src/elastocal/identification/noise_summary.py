@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.identification.noise_choice import (
     NoiseFit,
     NoiseTest,

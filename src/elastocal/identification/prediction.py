@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from elastocal.above import ByValue
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d

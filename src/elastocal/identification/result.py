@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from elastocal.above import VIEWS, WORDS, DataFrame, Result, checked_arguments
-from elastocal.cell.arm_description import Unsteadiness
+from elastocal.cell_tables import Unsteadiness
 from elastocal.identification import scrutiny
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint

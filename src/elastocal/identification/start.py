@@ -10,7 +10,7 @@ import scipy  # whose `optimize` loads where it is used: it takes as long as a s
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.measurements import Measurements, numbered, visits
 from elastocal.messages import (
     InputError,

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
-from elastocal.cell.arm_description import Tracker
+from elastocal.cell_tables import Tracker
 from elastocal.messages import InputError, length, option
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import (

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing import joining
 from elastocal.importing.exports import FORCES, Records, joint_stems, read_records

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from elastocal.above import checked_arguments
-from elastocal.cell.arm_description import SOURCES, Convention, Robot
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell import Cell, read_cell
+from elastocal.cell_tables import SOURCES, Convention, Robot
 from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
 from elastocal.messages import InputError, option
 from elastocal.model import rigid

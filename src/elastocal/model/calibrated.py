@@ -15,7 +15,7 @@ from pydantic import PlainValidator
 from pydantic_core import PydanticCustomError
 
 from elastocal.above import Saved, checked_arguments
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.config import Many, Table, checked, is_number, key, keyed, record
 from elastocal.files import read_json
 from elastocal.measurements import Measurements

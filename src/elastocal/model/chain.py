@@ -11,7 +11,7 @@ from typing import Literal, TypeVar
 
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.messages import InputError, did_you_mean, listed, printable, require, rounded, wish
 from elastocal.units import Array, IntArray
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.cell.arm_description import Convention
+from elastocal.cell_tables import Convention
 from elastocal.files import read_text
 from elastocal.messages import (
     InputError,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.above import ByValue, DataFrame, checked_arguments
-from elastocal.cell.arm_description import EffectChoice, ModelSpec
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import EffectChoice, ModelSpec
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
 from elastocal.messages import InputError, listed, option, require

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell_tables import CartesianNoise, PolarNoise, Tracker
 from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.messages import InputError, require
 from elastocal.units import Array, IntArray

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.measurements import Measurements
 from elastocal.messages import require
 from elastocal.model import rigid

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.files import check_regular
 from elastocal.messages import InputError, check_known, require, said_of
 from elastocal.model.chain import Chain

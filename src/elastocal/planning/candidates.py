@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.messages import (
     InputError,

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.messages import InsufficientDataError, require, rounded, wish
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model

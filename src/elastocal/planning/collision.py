@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.work_cell import Cell, HalfSpace, HangingLoad, Solid
+from elastocal.cell import Cell, HalfSpace, HangingLoad, Solid
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 from elastocal.model.effects.loads import GravityCompensator

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from elastocal.cell.plan_wishes import TEST_POSE
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import TEST_POSE
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.options import Options

@@ -13,9 +13,8 @@ from itertools import pairwise
 import numpy as np
 from scipy import linalg
 
-from elastocal.cell.arm_description import Unsteadiness
-from elastocal.cell.plan_wishes import Motion
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import Motion, Unsteadiness
 from elastocal.identification.noise_structure import course_waves
 from elastocal.messages import require, wish
 from elastocal.planning.feasibility import Feasibility

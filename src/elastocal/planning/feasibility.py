@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.messages import InputError, rounded
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.planning.bodies import RULES, Body, Pair, cell_bodies, cell_pairs

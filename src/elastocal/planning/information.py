@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse
 
-from elastocal.cell.arm_description import CartesianNoise
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import CartesianNoise
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.noise_structure import (

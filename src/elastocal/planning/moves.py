@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
-from elastocal.cell.plan_wishes import Motion
+from elastocal.cell_tables import Motion
 from elastocal.messages import InputError, InsufficientDataError, some
 from elastocal.model.chain import Chain, told
 from elastocal.planning.feasibility import Feasibility

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.above import Result
-from elastocal.cell.plan_wishes import TEST_POSE
+from elastocal.cell_tables import TEST_POSE
 from elastocal.files import atomic_write
 from elastocal.measurements import (
     DEFAULT_MARKER,

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.arm_description import EffectChoice
-from elastocal.cell.plan_wishes import TargetBox, TargetPath, TargetPose
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
+from elastocal.cell_tables import EffectChoice, TargetBox, TargetPath, TargetPose
 from elastocal.identification.prediction import NewPoses
 from elastocal.measurements import NUMBERED, Measurements, columns_of, families, rotation_column
 from elastocal.messages import (

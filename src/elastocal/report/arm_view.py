@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.work_cell import Cell, HalfSpace, Solid
+from elastocal.cell import Cell, HalfSpace, Solid
 from elastocal.files import atomic_write
 from elastocal.measurements import numbered
 from elastocal.messages import ElastocalError, load_text, printable, require

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from support.robots import KR270, random_chain_urdf
 
-from elastocal.cell.arm_description import Robot, Tool, Tracker
-from elastocal.cell.work_cell import Cell, Solid, Workspace
+from elastocal.cell import Cell, Solid, Workspace
+from elastocal.cell_tables import Robot, Tool, Tracker
 from elastocal.model.chain import Chain, Joint
 from elastocal.model.urdf import read_urdf
 from elastocal.planning.feasibility import Feasibility, PoseFeasibility

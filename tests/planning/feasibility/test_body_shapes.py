@@ -5,7 +5,7 @@ import pytest
 from planning.feasibility.small_cells import at
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.work_cell import Solid
+from elastocal.cell import Solid
 from elastocal.messages import InputError
 from elastocal.planning.bodies import mesh_hull, support, touches
 

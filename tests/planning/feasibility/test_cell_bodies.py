@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from planning.feasibility.small_cells import KR270_CHAIN, cell, sphere
 
-from elastocal.cell.arm_description import Robot
-from elastocal.cell.work_cell import CarriedBody, Workspace
+from elastocal.cell import CarriedBody, Workspace
+from elastocal.cell_tables import Robot
 from elastocal.messages import InputError
 from elastocal.model.urdf import read_urdf
 from elastocal.planning.bodies import WORLD, cell_bodies, hull

@@ -22,8 +22,8 @@ from planning.feasibility.small_cells import (
 )
 from planning.feasibility.test_margins_of_pairs import kr270_cell
 
-from elastocal.cell.arm_description import Tool
-from elastocal.cell.work_cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell_tables import Tool
 from elastocal.planning.bodies import Body, coal_shape
 from elastocal.planning.collision import Collisions, MotionBound
 from elastocal.planning.feasibility import Feasibility

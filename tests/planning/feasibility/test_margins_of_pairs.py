@@ -17,8 +17,8 @@ from planning.feasibility.small_cells import (
     sphere,
 )
 
-from elastocal.cell.arm_description import Tool
-from elastocal.cell.work_cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell_tables import Tool
 from elastocal.messages import InputError
 from elastocal.planning.feasibility import POSE_SLACK, Feasibility
 

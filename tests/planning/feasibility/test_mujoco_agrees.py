@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from planning.feasibility.small_cells import CHECK, DOWN, NOTHING
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell import read_cell
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import load_chain
 from elastocal.planning.collision import END, Collisions

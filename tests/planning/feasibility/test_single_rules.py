@@ -24,8 +24,8 @@ from planning.feasibility.small_cells import (
 from planning.feasibility.test_margins_of_pairs import kr270_cell
 from support.design_cells import plan_cell
 
-from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
-from elastocal.cell.work_cell import HalfSpace, HangingLoad, Visibility, Workspace
+from elastocal.cell import HalfSpace, HangingLoad, Visibility, Workspace
+from elastocal.cell_tables import EffectChoice, Tool, Tracker
 from elastocal.messages import InputError
 from elastocal.planning.collision import Kinematics, StaticTorque
 from elastocal.planning.feasibility import Feasibility

@@ -9,8 +9,7 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import plan_cell, setup_of, value_of
 from support.discs import Discs
 
-from elastocal.cell.arm_description import Unsteadiness
-from elastocal.cell.plan_wishes import Motion
+from elastocal.cell_tables import Motion, Unsteadiness
 from elastocal.identification.noise_structure import course_waves
 from elastocal.messages import InputError
 from elastocal.planning import execution as drift_module

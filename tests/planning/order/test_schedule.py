@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support.discs import Discs, best_time
 
-from elastocal.cell.plan_wishes import Motion
+from elastocal.cell_tables import Motion
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.planning.execution import schedule
 from elastocal.planning.moves import Unreachable

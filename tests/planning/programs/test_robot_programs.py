@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.cells import kr270_cell, kr270_chain, random_poses
 from support.discs import Discs
 
-from elastocal.cell.plan_wishes import Motion
+from elastocal.cell_tables import Motion
 from elastocal.messages import ElastocalError, InputError
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.planning.execution import schedule

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from support.calibration import cell_of, planar_chain
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
+from elastocal.cell import HalfSpace, Solid, Workspace
+from elastocal.cell_tables import CartesianNoise, DesignSpec, Nominal, Tracker
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, ScenarioCriterion

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, get_args
 
 import casadi as ca
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.messages import InputError, listed, require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting

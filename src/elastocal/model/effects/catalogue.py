@@ -13,7 +13,7 @@ from pathlib import Path
 
 import casadi as ca
 
-from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.cell import Cell, read_cell
 from elastocal.messages import InputError, check_known, require
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain

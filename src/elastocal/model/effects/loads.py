@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.messages import require, rounded
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting

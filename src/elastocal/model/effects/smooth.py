@@ -36,7 +36,7 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
+from elastocal.cell import Cell
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (

@@ -1,4 +1,8 @@
-"""The work cell: everything known about arm, tool, tracker and model before measuring."""
+"""The work cell: what the user has (robot, tool, tracker, model, workspace) and asks of a plan.
+
+A cell is read from a TOML file, `Cell.read("cell.toml")`, or built in Python from the same classes
+in SI units.  Either way it is checked once and then frozen.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
-from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell_tables import DesignSpec, ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.config import (
     TUPLE,
     AnyFloat,
@@ -231,7 +234,7 @@ class Workspace:
     side of z = 0 of the base; None: where neither obstacles nor half-spaces are stated.
 
     Examples:
-        >>> from elastocal.cell.work_cell import HalfSpace
+        >>> from elastocal.cell import HalfSpace
         >>> floor = HalfSpace(name="floor", point=[0, 0, 0], normal=[0, 0, 1])
         >>> ec.Workspace(keep_out=[floor], clearance=0.05).clearance
         0.05
@@ -410,7 +413,7 @@ class Cell:
     `path`: the file that it was read from.
 
     Examples:
-        >>> from elastocal.cell.arm_description import ModelSpec
+        >>> from elastocal.cell_tables import ModelSpec
         >>> cell = ec.Cell(
         ...     name="our arm",
         ...     robot=ec.Robot.from_urdf("kr270_2.urdf", flange="flange"),
