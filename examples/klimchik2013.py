@@ -10,8 +10,8 @@ from importlib.resources import files
 import numpy as np
 
 import elastocal as ec
-from elastocal.demo.example import LOAD_N, published_compliances, reading_sigma
 from elastocal.identification.published import eq14, eq14_weights, group_sigma, ols, wls
+from elastocal.simulation import LOAD_N, published_compliances, reading_sigma
 
 # The model: deflections Δp_i = h(q_i, f_i; X) of the markers under 265 kg, X the compliances.
 folder = files("elastocal.demo")

@@ -19,13 +19,13 @@ from support.design_commands import elastocal as command
 import elastocal as ec
 from elastocal import plugins
 from elastocal.cell_tables import DesignSpec
-from elastocal.demo.example import LOAD_N, run_demo
 from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.identification.options import Options
 from elastocal.messages import options_as_flags
 from elastocal.planning.design import DesignOptions
 from elastocal.report.renderers import FRAMES
 from elastocal.saving import WRITERS
+from elastocal.simulation import LOAD_N, run_demo
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)

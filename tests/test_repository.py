@@ -24,7 +24,6 @@ LAYERS = (
     {"planning", "diagnosis", "compensation", "export", "importing"},
     {"saving", "verbs"},
     {"report", "plugins"},
-    {"demo"},
     {"cli", "__main__"},
 )
 

@@ -5,16 +5,15 @@ from __future__ import annotations
 import inspect
 import re
 from dataclasses import replace
-from pathlib import Path
 
 from elastocal.cell import Cell, read_cell
-from elastocal.demo import example
 from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import load_chain
 from elastocal.report.blocks import display
+from elastocal.simulation import DEMO
 
 STAGES = {
     "transmission": "Transmission: what the gears make of the commanded joints",
@@ -56,7 +55,7 @@ correct the arm; they are shown here with two lines, or a field over one joint's
 
 def page() -> str:
     """The page, a section for each stage of the chain and in it each effect of the catalogue."""
-    base = read_cell(Path(example.__file__).parent / "cell.toml")
+    base = read_cell(DEMO / "cell.toml")
     chain = load_chain(base)
     parts = [HEAD, _overview()]
     for stage, title in STAGES.items():

@@ -12,7 +12,6 @@ import numpy as np
 from joblib import Parallel, delayed
 
 from elastocal.cell import read_cell
-from elastocal.demo.example import published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements, read_measurements
@@ -25,7 +24,7 @@ from elastocal.planning.plan import Plan
 from elastocal.planning.search import Checkpoint
 from elastocal.planning.setup import set_up
 from elastocal.planning.test_poses import test_poses
-from elastocal.simulation import simulate, values_from
+from elastocal.simulation import published_compliances, simulate, values_from
 
 HERE = Path(__file__).parent
 DEMO = Path(str(files("elastocal.demo")))

@@ -9,11 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.cell import read_cell
-from elastocal.demo.example import LOAD_N, REPEATS, published_compliances, reading_sigma
 from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.simulation import expand_plan, simulate, values_from
+from elastocal.simulation import (
+    LOAD_N,
+    REPEATS,
+    expand_plan,
+    published_compliances,
+    reading_sigma,
+    simulate,
+    values_from,
+)
 
 DEMO = Path(str(files("elastocal.demo")))
 

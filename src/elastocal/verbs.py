@@ -693,8 +693,9 @@ def effects(cell: Any = None) -> DataFrame:
     import pandas as pd
 
     from elastocal.model.manipulator import effect_entries
+    from elastocal.simulation import DEMO
 
-    given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
+    given = DEMO / "cell.toml" if cell is None else cell
     return pd.DataFrame(effect_entries(_checked_cell(getattr(given, "cell", given), "cell")))
 
 

@@ -8,9 +8,9 @@ import pytest
 from golden.door import curved
 from support.design_commands import elastocal
 
-from elastocal.demo.example import run_demo
 from elastocal.diagnosis.next_poses import verdict_of
 from elastocal.planning.plan import Gain
+from elastocal.simulation import run_demo
 
 INPUTS = Path(__file__).parents[1] / "golden" / "inputs" / "campaign"
 FEW = ["--candidates", "60", "-q"]

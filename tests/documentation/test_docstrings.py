@@ -11,7 +11,7 @@ from support.registered import forgotten
 
 import elastocal as ec
 from elastocal.above import Result, Saved
-from elastocal.demo.example import run_demo
+from elastocal.simulation import run_demo
 
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 FUNCTIONS = [name for name in ec.__all__ if not inspect.isclass(getattr(ec, name))]

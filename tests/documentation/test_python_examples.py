@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import elastocal as ec
-from elastocal.demo.example import run_demo
+from elastocal.simulation import run_demo
 
 DOCS = Path(__file__).parents[2] / "docs"
 # In the order in which they build on each other; design and diagnosis have tests of their own.

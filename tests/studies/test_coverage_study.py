@@ -17,12 +17,11 @@ import scenarios
 from support.study_scripts import study_of
 
 from elastocal.cell import read_cell
-from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
-from elastocal.simulation import expand_plan, simulate, values_from
+from elastocal.simulation import LOAD_N, expand_plan, published_compliances, simulate, values_from
 
 study = study_of(FOLDER)
 NAMES = {s.key: s for s in scenarios.SCENARIOS}

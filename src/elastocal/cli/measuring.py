@@ -95,11 +95,11 @@ def effects(cell: Annotated[Path | None, typer.Argument()] = None, *, run: Run) 
     Args:
         cell: Cell file (TOML); default: the KR 270 of the demo.
     """
-    from elastocal.demo import example
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.model.manipulator import effect_entries
+    from elastocal.simulation import DEMO
 
-    known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
+    known = cell_of(cell or DEMO / "cell.toml", run.plugins)
     entries = effect_entries(known)
     run.answer(
         lambda: {"schema": "elastocal/effects/1", "effects": entries},

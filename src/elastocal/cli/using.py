@@ -554,9 +554,9 @@ def demo(folder: Output = Path("demo_out"), seed: Seed = 2013, *, run: Run) -> N
     Args:
         folder: Folder for the example's files, data, result and report.
     """
-    from elastocal.demo.example import run_demo
     from elastocal.files import together
     from elastocal.report.renderers import print_report, write_page
+    from elastocal.simulation import run_demo
 
     result, report = folder / "result.json", folder / "report.html"
     with run.progress() as progress:

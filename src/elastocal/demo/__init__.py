@@ -1,1 +1,1 @@
-"""The worked example of Klimchik et al. 2013: its files, and `example`, which runs it."""
+"""The files of the worked example, which `elastocal.simulation.run_demo` runs."""
