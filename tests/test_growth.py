@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from elastocal.cell import read_cell
-from elastocal.compensation.compensate import read_targets
+from elastocal.compensation import read_targets
 from elastocal.files import read_json
 from elastocal.importing.assemble import import_files
 from elastocal.importing.mapping_file import read_mapping

@@ -21,7 +21,7 @@ SOURCE = ROOT / "src" / "elastocal"
 LAYERS = (
     {"model"},
     {"simulation", "identification"},
-    {"planning", "diagnosis", "compensation", "export", "importing"},
+    {"planning", "diagnosis", "compensation", "correction_table", "export", "importing"},
     {"saving", "verbs"},
     {"report", "plugins"},
     {"cli", "__main__"},
@@ -159,8 +159,7 @@ def imports() -> dict[str, set[str]]:
 
 
 def unit(module: str) -> str:
-    first = module.partition(".")[0]
-    return "planning" if first == "design" else first
+    return module.partition(".")[0]
 
 
 def rank(module: str) -> int:

@@ -31,6 +31,9 @@ ROOMS = {
     "measurements": (5.25, 1, 1.0, "the table of\nreadings"),
 }
 MISSION = ("model", "engine", "identification", "planning", "diagnosis")
+PARTS = {
+    "__init__": "front door", "cell_tables": "cell", "correction_table": "compensation",
+}  # fmt: skip
 COMMON = "config · files · messages · screen · tables · units"
 HEIGHT, STEP = 0.72, 1.14
 
@@ -55,7 +58,7 @@ def uses() -> dict[str, set[str]]:
 
 
 def _room(name: str) -> str:
-    return {"__init__": "front door", "cell_tables": "cell"}.get(name, name)
+    return PARTS.get(name, name)
 
 
 def _below(room: str, uses: dict[str, set[str]]) -> set[str]:

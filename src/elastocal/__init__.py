@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from elastocal.cell import Cell, Workspace, read_cell
     from elastocal.cell_tables import Robot, Tool, Tracker
-    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation import Compensation
     from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.diagnosis.next_poses import next_poses
@@ -47,7 +47,7 @@ __version__ = "0.1.0"
 ROOMS = {
     "cell_tables": "Robot Tool Tracker",
     "cell": "Cell Workspace read_cell",
-    "compensation.compensate": "Compensation",
+    "compensation": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.changes": "Comparison compare",
     "diagnosis.next_poses": "next_poses",

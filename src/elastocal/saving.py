@@ -24,7 +24,7 @@ from elastocal.tables import PARQUET, Labels, csv_text
 
 if TYPE_CHECKING:
     from elastocal.cell import Cell
-    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
@@ -121,7 +121,7 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
     Raises InsufficientDataError where targets are not reached, unless `partial`: their rows are
     then left empty.
     """
-    from elastocal.compensation.compensate import check_reached, commands_csv
+    from elastocal.compensation import check_reached, commands_csv
 
     if not partial:
         check_reached(found)

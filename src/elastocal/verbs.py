@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from elastocal.cell import Cell
     from elastocal.cell_tables import Freedom, Motion, TargetBox, TargetPath, TargetPose
-    from elastocal.compensation.compensate import Compensation, Targets
+    from elastocal.compensation import Compensation, Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, IntervalKind, Method
@@ -41,7 +41,7 @@ else:
         "pandas DataFrame",
         "elastocal.cell_tables Freedom Motion TargetBox TargetPath TargetPose",
         "elastocal.cell Cell",
-        "elastocal.compensation.compensate Compensation Targets",
+        "elastocal.compensation Compensation Targets",
         "elastocal.diagnosis.diagnosis Diagnosis",
         "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
         "elastocal.identification.options FaultyReadings IntervalKind Method",
@@ -614,7 +614,7 @@ def compensate(
     """
     import numpy as np
 
-    from elastocal.compensation.compensate import compensate as run
+    from elastocal.compensation import compensate as run
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import given_arm, tool_point
 
@@ -637,7 +637,7 @@ def compensate(
 
 
 def check_frame(frame: str) -> None:
-    from elastocal.compensation.compensate import FRAMES
+    from elastocal.compensation import FRAMES
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
     require(frame in FRAMES, told)
@@ -649,7 +649,7 @@ def _targets(
 ) -> Targets:  # fmt: skip
     import numpy as np
 
-    from elastocal.compensation.compensate import Targets, read_targets, targets_at
+    from elastocal.compensation import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
         return targets

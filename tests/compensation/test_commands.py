@@ -13,14 +13,14 @@ from support.cells import COMPENSATOR, COMPLIANCE, DOWN, SLANTED, kr270_cell, kr
 import elastocal as ec
 from elastocal.cell import Cell
 from elastocal.cell_tables import Nominal
-from elastocal.compensation.compensate import (
+from elastocal.compensation import (
     Compensation,
     compensate,
     nominal_path,
     read_targets,
     targets_at,
 )
-from elastocal.compensation.correction_table import EXACT, CorrectionGrid, correction_table
+from elastocal.correction_table import EXACT, CorrectionGrid, correction_table
 from elastocal.messages import InputError
 from elastocal.model.calibrated import CalibratedArm, ShownPoses, tool_point
 from elastocal.model.chain import Chain, joint_limits

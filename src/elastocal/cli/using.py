@@ -264,8 +264,8 @@ def compensate(
         box (X0,Y0,Z0,X1,Y1,Z1): Grid over this box in mm in the base frame, not over the joints.
         rotation (RX,RY,RZ): Rotation vector of the tool in --box, in degrees.
     """
-    from elastocal.compensation import compensate as single
-    from elastocal.compensation import correction_table as grids
+    from elastocal import compensation as single
+    from elastocal import correction_table as grids
     from elastocal.files import atomic_write
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated, tool_point

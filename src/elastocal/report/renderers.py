@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from rich.console import RenderableType
 
-    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
@@ -540,7 +540,7 @@ def _commands(c: Compensation) -> pd.DataFrame:
     """One row per target: the columns of the commands file, NaN where a target is not reached."""
     import pandas as pd
 
-    from elastocal.compensation.compensate import commands_csv
+    from elastocal.compensation import commands_csv
 
     text = StringIO(commands_csv(c))
     frame = pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])

@@ -26,7 +26,7 @@ from elastocal.report.judgement_view import judgement, method_and_weights
 from elastocal.units import Array
 
 if TYPE_CHECKING:
-    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation import Compensation
     from elastocal.diagnosis.changes import Comparison
     from elastocal.export.export import Exported
     from elastocal.importing.assemble import Imported
@@ -143,7 +143,7 @@ def _moves(c: Comparison) -> say.Figure:
 
 
 def commands_blocks(c: Compensation) -> Iterator[say.Block]:
-    from elastocal.compensation.compensate import summary
+    from elastocal.compensation import summary
 
     table, kinds = c.targets.table, c.chain.kinds
     names = [table.configuration_labels[k] for k in table.configuration]

@@ -1,1 +1,0 @@
-"""Commands that put the real tool where the nominal arm was told to go."""
