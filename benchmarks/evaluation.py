@@ -26,7 +26,7 @@ from bench_arms import kr270, poses, truth
 from bench_tools import goal, race, table
 from numpy.typing import NDArray
 
-from elastocal.model.arm import row_inputs
+from elastocal.model.effects.base import row_inputs
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 

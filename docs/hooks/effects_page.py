@@ -7,9 +7,8 @@ import re
 from dataclasses import replace
 
 from elastocal.cell import Cell, read_cell
-from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Effect
+from elastocal.model.effects.base import Effect, ParameterSpec, Setting
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import load_chain
 from elastocal.report.blocks import display

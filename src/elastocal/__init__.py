@@ -32,9 +32,8 @@ if TYPE_CHECKING:
         InsufficientDataError,
         UnknownNameError,
     )
-    from elastocal.model.arm import Parameter
     from elastocal.model.calibrated import CalibratedArm, read_calibrated
-    from elastocal.model.effects.base import Effect
+    from elastocal.model.effects.base import Effect, Parameter
     from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
@@ -45,20 +44,19 @@ __version__ = "0.1.0"
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
-    "cell_tables": "Robot Tool Tracker",
     "cell": "Cell Workspace read_cell",
+    "cell_tables": "Robot Tool Tracker",
     "compensation": "Compensation",
-    "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.changes": "Comparison compare",
+    "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.next_poses": "next_poses",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
     "importing.first_cell": "init",
     "measurements": "Measurements table",
     "messages": "ElastocalError InputError InsufficientDataError UnknownNameError",
-    "model.arm": "Parameter",
     "model.calibrated": "CalibratedArm read_calibrated",
-    "model.effects.base": "Effect",
+    "model.effects.base": "Effect Parameter",
     "model.manipulator": "Model",
     "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",

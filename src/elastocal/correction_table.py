@@ -14,7 +14,6 @@ from elastocal import compensation as single
 from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import listed, option, require, rounded
-from elastocal.model.arm import COLUMNS
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -25,6 +24,7 @@ from elastocal.model.calibrated import (
     unstated_needs,
 )
 from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.effects.base import COLUMNS
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.rigid import Reaching, nominal_flanges
 from elastocal.units import Array, BoolArray

@@ -27,10 +27,10 @@ from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
 from elastocal.messages import InputError
 from elastocal.model import rigid
-from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
 from elastocal.model.effects import catalogue
 from elastocal.model.effects.base import (
+    Arm,
     BaseMotion,
     DrivenEffect,
     Effect,
@@ -38,6 +38,9 @@ from elastocal.model.effects.base import (
     LinkFrame,
     LinkLength,
     MarkerMotion,
+    ParameterSpec,
+    Setting,
+    Spring,
     Symbols,
     index,
     joints,
@@ -45,7 +48,7 @@ from elastocal.model.effects.base import (
     motion_unit,
     turning_joints,
 )
-from elastocal.model.effects.compliances import LoadedEffect, TorqueEffect, add_deflection
+from elastocal.model.effects.statics import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.planning import criteria
 from elastocal.planning.criteria import (
     CriterionInputs,

@@ -19,10 +19,9 @@ from elastocal.cell import Cell
 from elastocal.files import atomic_write
 from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
 from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, wish
-from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Conditions, random_table
-from elastocal.model.effects.base import index
-from elastocal.model.effects.compliances import (
+from elastocal.model.effects.base import Parameter, index
+from elastocal.model.effects.statics import (
     RATED_WIND_UP,
     JointCompliance,
     rated_torque,

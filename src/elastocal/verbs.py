@@ -357,7 +357,7 @@ def simulated(
 
     from elastocal.identification.start import check_limits
     from elastocal.measurements import Measurements
-    from elastocal.model.arm import given_force
+    from elastocal.model.effects.base import given_force
     from elastocal.simulation import NOMINAL, draw_errors, expand_plan, values_from
     from elastocal.simulation import simulate as run
 
@@ -615,8 +615,8 @@ def compensate(
     import numpy as np
 
     from elastocal.compensation import compensate as run
-    from elastocal.model.arm import given_force
     from elastocal.model.calibrated import given_arm, tool_point
+    from elastocal.model.effects.base import given_force
 
     arm = given_arm("arm", arm)
     force = given_force(load)

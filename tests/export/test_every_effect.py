@@ -15,8 +15,8 @@ from support.robots import KR270
 from elastocal.cell_tables import Nominal
 from elastocal.export.export import Wish, export
 from elastocal.export.exportable import Conditions, cost_of, evaluate_pieces, keep
-from elastocal.model.arm import Arm, Spring
 from elastocal.model.calibrated import CalibratedArm, read_calibrated
+from elastocal.model.effects.base import Arm, Spring
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.urdf import read_urdf

@@ -12,7 +12,7 @@ from support.exports import LOAD, SPRINGS, exported, flanges_in_base, poses_of, 
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
 from elastocal.export.robot_files import MujocoRest
-from elastocal.model.arm import Parameter
+from elastocal.model.effects.base import Parameter
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -14,8 +14,7 @@ from support.registered import forgotten, write_example
 
 from elastocal.cell_tables import Nominal
 from elastocal.messages import InputError
-from elastocal.model.arm import Arm
-from elastocal.model.effects.base import DrivenEffect
+from elastocal.model.effects.base import Arm, DrivenEffect
 from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins

@@ -14,7 +14,7 @@ from elastocal.cell_tables import Nominal
 from elastocal.measurements import read_measurements, with_moves
 from elastocal.messages import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.effects.compliances import rated_torque, torque_scale, weight_torque
+from elastocal.model.effects.statics import rated_torque, torque_scale, weight_torque
 from elastocal.model.manipulator import Model
 
 BETA = 1e-3

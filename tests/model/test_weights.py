@@ -14,9 +14,9 @@ from support.stick import model, positions, rows, stick
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import Nominal
-from elastocal.model.arm import Arm
 from elastocal.model.chain import Chain
-from elastocal.model.effects.loads import STANDARD_GRAVITY, GravitySag, LinkWeights
+from elastocal.model.effects.base import Arm
+from elastocal.model.effects.statics import STANDARD_GRAVITY, GravitySag, LinkWeights
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 

@@ -15,8 +15,8 @@ from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_ch
 from elastocal.cell import Cell
 from elastocal.cell_tables import Nominal, TargetPose
 from elastocal.messages import InsufficientDataError
-from elastocal.model.arm import Parameter
 from elastocal.model.chain import Chain
+from elastocal.model.effects.base import Parameter
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.test_poses import TargetPoses, prediction_rows

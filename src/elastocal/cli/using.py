@@ -267,8 +267,8 @@ def compensate(
     from elastocal import compensation as single
     from elastocal import correction_table as grids
     from elastocal.files import atomic_write
-    from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated, tool_point
+    from elastocal.model.effects.base import given_force
     from elastocal.report.renderers import print_blocks
     from elastocal.report.smaller_views import compensation_blocks
 

@@ -43,7 +43,6 @@ from elastocal.identification.residuals import holm
 from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN
 from elastocal.messages import InsufficientDataError, listed, option, require, size_of
-from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -54,6 +53,7 @@ from elastocal.model.calibrated import (
     random_table,
     unstated_needs,
 )
+from elastocal.model.effects.base import given_force
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import smooth_groups
 from elastocal.units import Array, BoolArray, IntArray

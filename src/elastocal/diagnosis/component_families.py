@@ -32,7 +32,6 @@ from elastocal.diagnosis.hypotheses import (
 from elastocal.identification.start import as_placed
 from elastocal.measurements import first_of_visit, with_moves
 from elastocal.model.effects.base import Effect, JointMotion, Stage, index, turning_joints
-from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.gears import BY_ORDER, MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import (
     ApproachResponse,
@@ -44,6 +43,7 @@ from elastocal.model.effects.smooth import (
     TorqueResponse,
     Waves,
 )
+from elastocal.model.effects.statics import LoadedEffect
 from elastocal.units import Array, BoolArray, IntArray
 
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.

@@ -54,8 +54,8 @@ from elastocal.engine import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
-from elastocal.model.effects.loads import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve, ResidualField
+from elastocal.model.effects.statics import GravitySag, LinkWeights
 from elastocal.units import Array, Progress
 
 # Nats by which a sum must be more probable than what the forward search found; and those that its

@@ -30,11 +30,10 @@ from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated
 from elastocal.identification.start import as_placed
 from elastocal.measurements import Measurements, first_of_visit, numbered
 from elastocal.messages import InsufficientDataError
-from elastocal.model.arm import Setting, usual_sizes
-from elastocal.model.effects.base import Stage
+from elastocal.model.effects.base import Setting, Stage, usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.effects.loads import PayloadError
 from elastocal.model.effects.placements import BaseFrame
+from elastocal.model.effects.statics import PayloadError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray, IntArray

@@ -18,9 +18,9 @@ from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
 from elastocal.measurements import Measurements, by_rows, in_any_order
-from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
+    Arm,
     BaseMotion,
     DrivenEffect,
     Effect,
@@ -29,14 +29,17 @@ from elastocal.model.effects.base import (
     LinkFrame,
     LinkLength,
     MarkerMotion,
+    ParameterSpec,
+    Setting,
     Stage,
     index,
+    row_inputs,
 )
 from elastocal.model.effects.catalogue import CATALOGUE, set_constants
-from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import BY_ORDER, Backlash, GearSpectrum, Hysteresis
 from elastocal.model.effects.placements import ThermalExpansion
 from elastocal.model.effects.smooth import JointCurve
+from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import ONCE, BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, rows_needed, subset

@@ -35,9 +35,9 @@ from elastocal.messages import (
     rounded,
 )
 from elastocal.model import dh
-from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain, Joint, joint_index
+from elastocal.model.effects.base import given_force
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm

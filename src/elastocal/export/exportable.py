@@ -18,7 +18,6 @@ from elastocal.files import read_text
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError, InsufficientDataError, option, require
 from elastocal.model import rigid
-from elastocal.model.arm import Spring, row_inputs
 from elastocal.model.calibrated import (
     RECORDED,
     CalibratedArm,
@@ -30,11 +29,11 @@ from elastocal.model.calibrated import (
     unstated_needs,
 )
 from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_limits
-from elastocal.model.effects.base import Format
+from elastocal.model.effects.base import Format, Spring, row_inputs
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
-from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry
+from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.urdf import urdf_file

@@ -22,19 +22,18 @@ from elastocal.identification.solve import Solution, far_off
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
 from elastocal.measurements import Measurements, numbered
 from elastocal.messages import EXACT, counted, listed, option, rounded
-from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import MOSTLY, mostly_prior
-from elastocal.model.effects.base import index
+from elastocal.model.effects.base import Parameter, index
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.compliances import (
+from elastocal.model.effects.gears import JointOffset
+from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
+from elastocal.model.effects.statics import (
     RATED_WIND_UP,
     JointCompliance,
     rated_torque,
     usual_over_stated_mass,
     weight_torque,
 )
-from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.

@@ -75,8 +75,8 @@ from elastocal.identification.start import (
 from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.messages import ElastocalError, option, said_of
-from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Scatter, ShownPoses
+from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.manipulator import Model

@@ -33,9 +33,9 @@ from elastocal.identification.solve import Solution, deviates, reduce
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.messages import EXACT, ElastocalError
-from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVisits, OpenParameters
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
+from elastocal.model.effects.base import Parameter
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, BoolArray, IntArray, microns

@@ -34,7 +34,6 @@ from elastocal.identification.prediction import (
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.measurements import Measurements
 from elastocal.messages import ElastocalError, UnknownNameError, length, plain, rounded
-from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -45,6 +44,7 @@ from elastocal.model.calibrated import (
     nominal_flange_rows,
     tool_point,
 )
+from elastocal.model.effects.base import given_force
 from elastocal.model.observations import COMPONENTS, observe
 from elastocal.units import Array, microns
 

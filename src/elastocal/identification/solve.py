@@ -25,7 +25,7 @@ from elastocal.identification.start import nothing_shown
 from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
 from elastocal.measurements import numbered
 from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
-from elastocal.model.arm import Parameter
+from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations

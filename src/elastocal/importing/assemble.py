@@ -29,7 +29,7 @@ from elastocal.importing.mapping_file import LoadStatesTable, MappingTable, Sour
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.messages import InputError, did_you_mean, length, listed, quoted, rounded
 from elastocal.model.chain import beyond_limits
-from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
 from elastocal.units import Array, IntArray

@@ -23,10 +23,13 @@ from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
-from elastocal.model.effects.compliances import JointCompliance, usual_over_stated_mass
 from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.loads import feels_weight
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
+from elastocal.model.effects.statics import (
+    JointCompliance,
+    feels_weight,
+    usual_over_stated_mass,
+)
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load

@@ -21,10 +21,10 @@ from elastocal.files import read_json
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, rounded
 from elastocal.model import rigid
-from elastocal.model.arm import row_inputs
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.effects.base import row_inputs
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
-from elastocal.model.effects.loads import LinkGravity
+from elastocal.model.effects.statics import LinkGravity
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.model.symbolic import Total

@@ -18,9 +18,16 @@ from elastocal.cell_tables import EffectChoice, ModelSpec
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
 from elastocal.messages import InputError, listed, option, require
-from elastocal.model.arm import Parameter, given_force, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
-from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
+from elastocal.model.effects.base import (
+    Effect,
+    JointMotion,
+    Parameter,
+    SmoothFunction,
+    given_force,
+    index,
+    row_inputs,
+)
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.effects.placements import DistanceSensor
 from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks

@@ -31,7 +31,7 @@ from elastocal.files import check_size
 from elastocal.messages import InputError, listed, printable, quoted, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, JointKind, LinkMass, check_angles
-from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.urdf import MAX_BYTES, FileJoint, Tag, Tree, XmlFile
 from elastocal.units import Array, pose_at
 

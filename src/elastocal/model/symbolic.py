@@ -13,9 +13,8 @@ from elastocal.cell import Cell
 from elastocal.measurements import Measurements
 from elastocal.messages import require
 from elastocal.model import rigid
-from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
-from elastocal.model.effects.base import Effect
+from elastocal.model.effects.base import Arm, Effect, Parameter, row_inputs
 from elastocal.model.effects.catalogue import choose_effects, set_constants, sized_parameters
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.observations import observe

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell import Cell, HalfSpace, HangingLoad, Solid
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
-from elastocal.model.effects.loads import GravityCompensator
+from elastocal.model.effects.statics import GravityCompensator
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.planning.bodies import (

@@ -22,7 +22,6 @@ from elastocal.messages import (
     rounded,
     wish,
 )
-from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import (
     LIMIT_SLACK,
     Chain,
@@ -32,6 +31,7 @@ from elastocal.model.chain import (
     joint_limits,
     told,
 )
+from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import choose_effects
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model

@@ -15,8 +15,8 @@ from elastocal.identification.result import LOPSIDED, Calibration, Combination, 
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.identification.sentences import next_steps
 from elastocal.messages import listed, option, printable, some
-from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
+from elastocal.model.effects.base import Parameter
 from elastocal.report import blocks as say
 from elastocal.report import judgement_view as words
 from elastocal.report.figures import Residuals, uncertainty_map, waterfall

@@ -15,25 +15,23 @@ import casadi as ca
 
 from elastocal.cell import Cell, read_cell
 from elastocal.messages import InputError, check_known, require
-from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.effects import compliances, gears, loads, placements, smooth
-from elastocal.model.effects.base import Effect, check
+from elastocal.model.effects import gears, placements, smooth, statics
+from elastocal.model.effects.base import Effect, ParameterSpec, check
 from elastocal.plugin_loader import load_installed, load_plugins, same_class
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
-    placements.BaseFrame(), gears.JointOffset(), gears.EncoderScale(),
-    gears.GearEccentricity(), gears.GearSecondHarmonic(), gears.GearRipple(),
-    gears.GearSpectrum(), smooth.JointCurve(), gears.WristCoupling(), placements.JointDrift(),
-    placements.EncoderJump(), gears.MoveLag(), gears.MoveHysteresis(), loads.GravitySag(),
-    compliances.TorqueCoupling(), placements.LinkGeometry(), compliances.TorqueTilt(),
-    placements.ThermalExpansion(), compliances.JointCompliance(),
-    compliances.JointHardening(), gears.Backlash(), gears.Hysteresis(),
-    smooth.TorqueResponse(), smooth.ApproachResponse(), compliances.OffAxisCompliance(),
-    compliances.LinkBending(), compliances.BaseCompliance(), smooth.LoadResponse(),
-    loads.GravityCompensator(), loads.LinkGravity(), loads.LinkMassError(),
-    loads.LinkWeights(), loads.Payload(), loads.PayloadError(), placements.MarkerPosition(),
+    placements.BaseFrame(), gears.JointOffset(), gears.EncoderScale(), gears.GearEccentricity(),
+    gears.GearSecondHarmonic(), gears.GearRipple(), gears.GearSpectrum(), smooth.JointCurve(),
+    gears.WristCoupling(), placements.JointDrift(), placements.EncoderJump(), gears.MoveLag(),
+    gears.MoveHysteresis(), statics.GravitySag(), statics.TorqueCoupling(),
+    placements.LinkGeometry(), statics.TorqueTilt(), placements.ThermalExpansion(),
+    statics.JointCompliance(), statics.JointHardening(), gears.Backlash(), gears.Hysteresis(),
+    smooth.TorqueResponse(), smooth.ApproachResponse(), statics.OffAxisCompliance(),
+    statics.LinkBending(), statics.BaseCompliance(), smooth.LoadResponse(),
+    statics.GravityCompensator(), statics.LinkGravity(), statics.LinkMassError(),
+    statics.LinkWeights(), statics.Payload(), statics.PayloadError(), placements.MarkerPosition(),
     placements.MarkerSlip(), smooth.ResidualField(), smooth.ResidualStep(),
     placements.MarkerOrientation(), placements.BaseDrift(), placements.FrameJump(),
     placements.DistanceSensor(), placements.TrackerDistortion(),

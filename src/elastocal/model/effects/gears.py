@@ -8,19 +8,21 @@ import casadi as ca
 
 from elastocal.cell import Cell
 from elastocal.messages import require
-from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     MOTION,
     OFFSET,
+    Arm,
     DrivenEffect,
     Effect,
     JointMotion,
+    ParameterSpec,
+    Setting,
     Symbols,
     index,
     joints,
 )
-from elastocal.model.effects.compliances import (
+from elastocal.model.effects.statics import (
     TorqueEffect,
     add_deflection,
     rated_torque,

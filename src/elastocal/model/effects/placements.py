@@ -10,7 +10,6 @@ import numpy as np
 
 from elastocal.cell import Cell
 from elastocal.model import rigid
-from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     LINK,
@@ -18,6 +17,7 @@ from elastocal.model.effects.base import (
     MOTION,
     MOVE,
     STATION,
+    Arm,
     BaseMotion,
     DrivenEffect,
     Effect,
@@ -25,6 +25,8 @@ from elastocal.model.effects.base import (
     LinkFrame,
     LinkLength,
     MarkerMotion,
+    ParameterSpec,
+    Setting,
     Symbols,
     links,
 )

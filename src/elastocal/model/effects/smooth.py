@@ -37,26 +37,29 @@ import casadi as ca
 import numpy as np
 
 from elastocal.cell import Cell
-from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     FULL_TURN,
+    Arm,
     BaseMotion,
     DrivenEffect,
     Entry,
     JointMotion,
     LinkFrame,
     MarkerMotion,
+    ParameterSpec,
+    Setting,
     SmoothFunction,
+    Spring,
     Symbols,
     index,
     joints,
     links,
     turning_joints,
 )
-from elastocal.model.effects.compliances import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.model.effects.gears import BY_ORDER, came_from
 from elastocal.model.effects.placements import JUMP_TIME, KEYS, Jump
+from elastocal.model.effects.statics import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
 
