@@ -11,8 +11,7 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import plan_cell, setup_of
 
 from elastocal.planning.candidates import joint_space
-from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import Unreachable
+from elastocal.planning.feasibility import Feasibility, Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.search import EFFORTS, Checkpoint, Search, Searches, ordered
 from elastocal.planning.setup import FeasiblePool

@@ -28,8 +28,7 @@ from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.observations import observe
 from elastocal.planning.candidates import draw
 from elastocal.planning.execution import nearest_first
-from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import travel_times
+from elastocal.planning.feasibility import Feasibility, travel_times
 from elastocal.simulation import simulate
 from elastocal.units import Array, BoolArray, Progress
 

@@ -28,9 +28,8 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import at_stops, nearest_first
-from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.feasibility import Feasibility, travel_times
 from elastocal.planning.information import Known, PoseInformation, plan_forces
-from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Plan, TimedSize
 from elastocal.planning.relaxation import Relaxed, exact_plan, prospects
 from elastocal.planning.setup import FeasiblePool, Setup, set_up

@@ -17,9 +17,8 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import Motion, Unsteadiness
 from elastocal.identification.noise_structure import course_waves
 from elastocal.messages import require, wish
-from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.feasibility import Feasibility, Moves
 from elastocal.planning.information import PoseInformation
-from elastocal.planning.moves import Moves
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 

@@ -31,8 +31,7 @@ from elastocal.model.symbolic import configuration_rows
 from elastocal.planning.candidates import CHUNK, JointSpace, draw, points
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
-from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import Roadmap, Unreachable, travel_times
+from elastocal.planning.feasibility import Feasibility, Roadmap, Unreachable, travel_times
 from elastocal.planning.plan import Certificate
 from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, prospects
 from elastocal.planning.setup import FeasiblePool, Setup

@@ -11,7 +11,7 @@ from support.discs import Discs, best_time
 from elastocal.cell_tables import Motion
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.planning.execution import schedule
-from elastocal.planning.moves import Unreachable
+from elastocal.planning.feasibility import Unreachable
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
 LIMITS = (np.full(2, -3.0), np.full(2, 3.0))
