@@ -30,11 +30,10 @@ from elastocal.cell_tables import (
 )
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
-from elastocal.planning.choices import single_ways
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, plan_forces
 from elastocal.planning.relaxation import relax
-from elastocal.planning.setup import set_up
+from elastocal.planning.setup import set_up, single_ways
 from elastocal.planning.test_poses import test_poses
 
 HERE = Path(__file__).parent

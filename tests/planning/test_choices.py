@@ -17,11 +17,11 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import Freedom, Motion, PolarNoise, TargetPose
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
-from elastocal.planning import choices
+from elastocal.planning import setup
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.choices import Choice, _minutes, _sizes, at_stops
 from elastocal.planning.information import Known
 from elastocal.planning.plan import TimedSize
+from elastocal.planning.setup import Choice, _minutes, _sizes, at_stops
 
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
 MOTION = Motion(speed=np.ones(6), dwell=10.0, reading=2.0, load_change=120.0, extra_time=0.0)
@@ -32,8 +32,8 @@ FEW = {"loads": DOWN[None], "test_poses": ONE, "candidates": 60}
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     few = {"STARTS": 1, "COMPARED": 60, "ROUNDS": 3, "REPEATS": (1, 6)}
     for name, value in few.items():
-        monkeypatch.setattr(choices, name, value)
-    monkeypatch.setattr(choices.Choice.draw, "__defaults__", (150,))
+        monkeypatch.setattr(setup, name, value)
+    monkeypatch.setattr(setup.Choice.draw, "__defaults__", (150,))
 
 
 def choice_of(cell: Cell) -> Choice:

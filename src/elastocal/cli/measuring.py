@@ -290,7 +290,7 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     this arm, which is told before the work and not after it."""
     from elastocal.model.chain import joint_limits
     from elastocal.model.manipulator import load_chain
-    from elastocal.planning.programs import LANGUAGES, check_six_axes, robot_program
+    from elastocal.saving import LANGUAGES, check_six_axes, robot_program
 
     written, chain = dict[Path, str](), load_chain(cell)
     for path in paths:

@@ -44,7 +44,6 @@ from elastocal.planning.candidates import (
     poses_of,
     shares_of,
 )
-from elastocal.planning.choices import Choice, applied, chosen_states, within
 from elastocal.planning.criteria import CRITERIA, criterion_named
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import (
@@ -77,7 +76,18 @@ from elastocal.planning.search import (
     State,
     ordered,
 )
-from elastocal.planning.setup import OPEN, FeasiblePool, Setup, promised, set_up, share_within
+from elastocal.planning.setup import (
+    OPEN,
+    Choice,
+    FeasiblePool,
+    Setup,
+    applied,
+    chosen_states,
+    promised,
+    set_up,
+    share_within,
+    within,
+)
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.units import Array, BoolArray, IntArray, Progress
 

@@ -1,23 +1,40 @@
-"""What a design knows before it chooses: parameters, criterion, earlier information."""
+"""What is settled before poses are chosen: parameters, criterion and earlier information, and what
+can be chosen besides poses: places of markers, load point and tracker, which loads, and how many
+poses and readings within a time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize
+from scipy.optimize import brentq, minimize
 
+from elastocal.cell import Cell
 from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
-from elastocal.messages import InsufficientDataError, length, listed, wish
+from elastocal.messages import InsufficientDataError, length, listed, require, rounded, wish
 from elastocal.model.chain import joint_index
+from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.criteria import CriterionInputs, ScenarioCriterion, criterion_named, root
-from elastocal.planning.execution import Execution
+from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
+from elastocal.planning.criteria import (
+    CRITERIA,
+    CriterionInputs,
+    ScenarioCriterion,
+    criterion_named,
+    root,
+)
+from elastocal.planning.execution import Execution, at_stops, nearest_first
+from elastocal.planning.feasibility import Feasibility, travel_times
 from elastocal.planning.information import (
     Estimable,
     Known,
@@ -26,10 +43,22 @@ from elastocal.planning.information import (
     estimable,
     evenly,
     marker_sigmas,
+    plan_forces,
     whitened,
 )
-from elastocal.planning.plan import Everywhere, Plan, Scheduled, predicted, remaining_rms
-from elastocal.planning.relaxation import DesignProblem, relax
+from elastocal.planning.plan import (
+    LOAD_POINT,
+    TRACKER,
+    Chosen,
+    Everywhere,
+    LoadStates,
+    Plan,
+    Scheduled,
+    TimedSize,
+    predicted,
+    remaining_rms,
+)
+from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, prospects, relax
 from elastocal.planning.test_poses import TargetPoses, known_rows
 from elastocal.simulation import expand_plan, simulate
 from elastocal.units import Array, BoolArray, IntArray, Progress
@@ -220,7 +249,7 @@ def _aimed(
 MOST = 0.9  # share at most
 CLOSE = 0.05  # of the price under the limit: a better share would not be noticed
 LOOSE = 1e-3  # gap of the relaxations
-SOME = 4000  # candidates
+ENOUGH = 4000  # candidates
 
 
 def share_within(
@@ -232,7 +261,7 @@ def share_within(
         return 0.0
     progress(f"weight of the joint ranges, at most {100 * cap:g} % worse at the test poses")
     # As many as tell the share: it hangs on where poses are, not on each of them.
-    each = max(SOME // len(shares), 20 * int(shares.max()))
+    each = max(ENOUGH // len(shares), 20 * int(shares.max()))
     pool = pool.take(evenly(pool.group, each))
     problem = replace(setup, share=0.0).problem(pool, shares)
     own, T = problem.criterion, problem.balancing()
@@ -249,7 +278,7 @@ def share_within(
     most = MOST / (1 - MOST)
     if over(most) <= 0:
         return MOST
-    u = optimize.brentq(over, 0.0, most)
+    u = brentq(over, 0.0, most)
     return float(u / (1 + u))
 
 
@@ -300,3 +329,425 @@ def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, kno
         R = root(A, targets.weight)
         errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
     return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
+
+
+# What can be chosen besides poses.
+#
+# The relaxed optimum Φ*(z) = min_w Φ(Σ w_i A_i(z)) over weights w is what the best plan at places z
+# can reach at most.  It is made small over w and z in turn: at weights w the places by L-BFGS-B
+# (Byrd, Lu, Nocedal & Zhu 1995) within their boxes, at places z the weights by the certified
+# relaxation, on candidates that the cell's rules allow there.  Both steps lower the same Φ, and
+# where neither does ∂Φ*/∂z = ∂Φ/∂z|_w (envelope theorem) vanishes or points out of the boxes.
+
+STARTS = 8  # places drawn in the boxes, besides those that the cell states
+SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
+ROUNDS = 8  # of weights and places in turn, at most
+GAIN = 3e-3  # relative, of Φ, below which a round is the last one
+STEP = 1e-6  # of a box, for differences of B, which has twelve digits
+DIGITS = 6  # of a place in m: more cannot be built
+USED = 1e-4  # of the largest weight: candidates that count while places move
+MOST_CHOICES = 100  # of loads
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Places that may move: `names` (k,), their `lower` and `upper` corners (k, 3) m."""
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, cell: Cell) -> Boxes:
+        freedom = cell.design.choose
+        assert freedom is not None
+        every = freedom.markers | {LOAD_POINT: freedom.load_point, TRACKER: freedom.tracker}
+        boxes = {name: box for name, box in every.items() if box is not None}
+        corners = np.array(list(boxes.values())).reshape(-1, 2, 3)
+        return cls(tuple(boxes), corners[:, 0], corners[:, 1])
+
+    def places(self, cell: Cell) -> Array:
+        known = cell.tool.markers | {
+            LOAD_POINT: cell.tool.load_point,
+            TRACKER: cell.tracker.position,
+        }
+        return np.array([known[name] for name in self.names]).reshape(-1, 3)
+
+    def at(self, unit: Array) -> Array:
+        """Places (k, 3) of a point (3 k,) of the unit cube."""
+        return self.lower + unit.reshape(-1, 3) * (self.upper - self.lower)
+
+    def unit(self, places: Array) -> Array:
+        """The point of the unit cube whose places are nearest; 0.5 where a box has no width."""
+        width = self.upper - self.lower
+        part = (places - self.lower) / np.where(width > 0, width, 1.0)
+        return np.clip(np.where(width > 0, part, 0.5), 0.0, 1.0).ravel()
+
+    def placed(self, cell: Cell, places: Array) -> Cell:
+        at = dict(zip(self.names, np.round(places, DIGITS), strict=True))
+        point = at.pop(LOAD_POINT, cell.tool.load_point)
+        tracker = replace(cell.tracker, position=at.pop(TRACKER, cell.tracker.position))
+        tool = replace(cell.tool, load_point=point, markers=cell.tool.markers | at)
+        return replace(cell, tool=tool, tracker=tracker)
+
+
+class RelaxedPoint(NamedTuple):
+    cell: Cell
+    setup: Setup
+    pool: FeasiblePool
+    relaxed: Relaxed
+    share: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """`work` is the model of the cell as it stands, whose test poses `targets` (and `region`) are
+    what every choice is judged by."""
+
+    work: Model
+    targets: TargetPoses
+    region: TargetPoses | None
+    known: Known
+    seed: int
+    progress: Progress
+
+    def best(self) -> Chosen:
+        cell = self.work.cell
+        where, freedom = cell.source, cell.design.choose
+        named = wish("choose", f"{where}: [design.choose]")
+        assert freedom is not None
+        require(
+            CRITERIA[cell.design.criterion].certifiable,
+            f"{named} compares relaxed optima, which criterion "
+            f"{cell.design.criterion} has none of; choose another criterion",
+        )
+        require(
+            self.known.done is None,
+            f"{named} moves what measurements were made with; leave it out where "
+            "a plan adds to some",
+        )
+        boxes = Boxes.of(cell)
+        loads = self._loads(freedom.loads)
+        found = self._placed(boxes, loads) if boxes.names else loads
+        if found is None:
+            raise InsufficientDataError(
+                f"{where}: no choice within [design.choose] gives a plan; widen the boxes"
+            )
+        self.progress("comparing what was chosen with the cell as it stands")
+        before, after = (self.relaxed(c, COMPARED) for c in (cell, found.cell))
+        if after is None or (
+            freedom.loads is None
+            and before is not None
+            and before.relaxed.value <= after.relaxed.value
+        ):
+            found, after = found._replace(cell=cell), before
+        assert after is not None
+        criterion = after.setup.criterion
+        places = np.stack([boxes.places(cell), boxes.places(found.cell)], axis=1)
+        return Chosen(
+            places=dict(zip(boxes.names, places, strict=True)),
+            loads=None if freedom.loads is None else found.cell.design.loads,
+            before=None if before is None else criterion.figure(before.relaxed.value),
+            after=criterion.figure(after.relaxed.value), unit=criterion.unit,
+            share=(None if before is None else before.share, after.share),
+            candidates=len(after.pool),
+        )  # fmt: skip
+
+    def _loads(self, most: int | None) -> RelaxedPoint | None:
+        cell, given = self.work.cell, self.work.cell.design.loads
+        if most is None or given is None:
+            return self.relaxed(cell)
+        heavy = np.flatnonzero(given.any(axis=1))
+        sets = list(combinations(heavy, min(most, len(heavy))))
+        require(
+            len(sets) <= MOST_CHOICES,
+            f"{cell.source}: {len(sets)} choices of {most} of {len(heavy)} loads; state "
+            f"fewer loads, up to {MOST_CHOICES} choices of them",
+        )
+        hung = ([i for i in range(len(given)) if i in k or i not in heavy] for k in sets)
+        return self._least("loads,", [_with_loads(cell, given[some]) for some in hung])
+
+    def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
+        cell = self.work.cell if begun is None else begun.cell
+        draws = sobol(3 * len(boxes.names), np.random.default_rng(self.seed)).random(STARTS)
+        starts = [boxes.unit(boxes.places(cell)), *draws]
+        best = self._least("places, start", [boxes.placed(cell, boxes.at(s)) for s in starts])
+        for k in range(ROUNDS):
+            if best is None:
+                break
+            unit, there = boxes.unit(boxes.places(best.cell)), self._moved(boxes, best)
+            self.progress(f"choosing places, round {k + 1}")
+            # All the way, or a part of it where the rules leave too little there.
+            way = (self.relaxed(boxes.placed(cell, boxes.at(unit + part * (there - unit))))
+                   for part in (1.0, 0.5, 0.25))  # fmt: skip
+            better = next(
+                (p for p in way if p is not None and p.relaxed.value < best.relaxed.value), None
+            )
+            if better is None:
+                break
+            gain, best = 1 - better.relaxed.value / best.relaxed.value, better
+            if gain < GAIN:
+                break
+        return best
+
+    def _least(self, what: str, cells: list[Cell]) -> RelaxedPoint | None:
+        points = []
+        for k, cell in enumerate(cells):
+            self.progress(f"choosing {what} {k + 1} of {len(cells)}")
+            points.append(self.relaxed(cell))
+        found = (point for point in points if point is not None)
+        return min(found, key=lambda point: point.relaxed.value, default=None)
+
+    def _moved(self, boxes: Boxes, point: RelaxedPoint) -> Array:
+        """The point (3 k,) of the unit cube that lowers Φ most at the weights of `point`."""
+        setup, pool, w = point.setup, point.pool, point.relaxed.weights
+        used = np.flatnonzero(w > USED * w.max())
+        there = _mobile(boxes, point.cell, setup.information)
+
+        def value(unit: Array) -> float:
+            B = there(boxes.at(unit)).blocks(pool.q[used], pool.readings[used])
+            M = setup.gathered(B * np.sqrt(w[used])[:, None, None])
+            return float(np.log(setup.criterion.of_information(M)))
+
+        unit = boxes.unit(boxes.places(point.cell))
+        limits = [(0.0, 1.0)] * len(unit)
+        how = {"maxiter": 20, "eps": STEP, "ftol": 1e-4}
+        return np.asarray(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
+
+    def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
+        rules = Feasibility(cell, self.work.chain)
+        return draw(rules, plan_forces(cell), candidates, self.seed)
+
+    def relaxed(
+        self, cell: Cell, drawn: Candidates | int = SEARCHED, read: BoolArray | None = None
+    ) -> RelaxedPoint | None:
+        """The relaxed optimum of a cell on candidates drawn, or so many, `read` in load states
+        (K, L) that were chosen before; None where it leaves something open."""
+        chain, shares = self.work.chain, shares_of(cell)
+        try:
+            rules = Feasibility(cell, chain)
+            drawn = self.draw(cell, drawn) if isinstance(drawn, int) else drawn
+            model = Model.assembled(chain, replace(cell, model=self.work.cell.model))
+            setup = set_up(
+                model, drawn.q, int(shares.sum()), self.targets, self.known, self.region,
+                rules.seen, self.work,
+            )  # fmt: skip
+            if read is not None:
+                setup = replace(setup, ways=cell.design.repeats * read)
+            else:
+                setup, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
+            pool, tried = setup.pool(drawn.q, drawn.group), drawn.counts
+            relaxed = prospects(setup.problem(pool, shares).balanced(), GAIN / 10)
+        except InsufficientDataError:
+            return None
+        return RelaxedPoint(cell, setup, pool, relaxed, tried.feasible / tried.tried)
+
+
+def _mobile(
+    boxes: Boxes, cell: Cell, information: PoseInformation
+) -> Callable[[Array], PoseInformation]:
+    """Information as at `cell`, of the same readings, with everything at other places (k, 3).
+
+    One model serves them all: places on the tool are its parameters.
+    """
+    base, on_tool = boxes.places(cell), [n != TRACKER for n in boxes.names]
+    motions: list[tuple[Entry, str]] = [
+        (LoadPointMotion(), LoadPointMotion.at)
+        if name == LOAD_POINT
+        else (MarkerMotion(), f"marker:{name}")
+        for name, own in zip(boxes.names, on_tool, strict=True)
+        if own
+    ]
+    mobile = Model.assembled(information.model.chain, cell, motions)
+
+    def there(places: Array) -> PoseInformation:
+        model = copy(mobile)
+        model.cell = boxes.placed(cell, places)  # of which the noise asks the tracker
+        x = np.concatenate([information.x, (places - base)[on_tool].ravel()])
+        return replace(information, model=model, x=x)
+
+    return there
+
+
+def applied(chosen: Chosen, cell: Cell) -> Cell:
+    cell = Boxes.of(cell).placed(cell, np.array([after for _, after in chosen.places.values()]))
+    return cell if chosen.loads is None else _with_loads(cell, chosen.loads)
+
+
+def _with_loads(cell: Cell, loads: Array) -> Cell:
+    return replace(cell, design=replace(cell.design, loads=loads))
+
+
+REPEATS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
+WORSE = 2  # numbers of repeats in a row that are worse than fewer: more are not tried
+TRIES = 3  # plans whose moves took longer than was thought
+
+
+def within(choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes: float) -> Plan:
+    asked = minutes
+    for left in reversed(range(TRIES)):
+        sizes, best = _sizes(choice, cell, asked)
+        plan = plan_of(best.cell)
+        took = plan.execution.total / 60
+        if took <= minutes or not left:
+            break
+        asked *= minutes / took
+    more = (f"the plan takes {took:.0f} minutes, as its moves are longer than was thought",)
+    warnings = plan.warnings + (more if took > minutes else ())
+    return replace(plan, timed=sizes, warnings=warnings)
+
+
+class _Fit(NamedTuple):
+    """A plan that fits a time: how many parameters it determines, its Φ, what it is, the cell that
+    asks for its stops, and in which states (K, L) candidates are read."""
+
+    kept: int
+    value: float
+    size: TimedSize
+    cell: Cell
+    read: BoolArray
+
+
+def _sizes(choice: Choice, cell: Cell, minutes: float) -> tuple[tuple[TimedSize, ...], _Fit]:
+    spec, drawn, found = cell.design, choice.draw(cell), list[_Fit]()
+    # Where a reading takes no time nothing says how many of them there may be.
+    for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):
+        choice.progress(f"within {rounded(minutes, 4)} minutes: {repeats} readings each")
+        read = found[-1].read if found else None
+        with suppress(InsufficientDataError):
+            found += _fitting(choice, cell, minutes, drawn, repeats, read)
+        values = [fit.value for fit in found]
+        if len(found) > WORSE and min(values[-WORSE:]) > min(values):
+            break
+    if not found:
+        raise InsufficientDataError(
+            f"{cell.source}: no plan that determines the parameters takes "
+            f"{rounded(minutes, 4)} minutes or less; allow more time, or lower dwell_s, reading_s "
+            "and load_change_s of [design.motion] where they are too high"
+        )
+    # A plan that holds more parameters errs less in the others, but not in all.
+    best = min(found, key=lambda fit: (-fit.kept, fit.value))
+    return tuple(fit.size for fit in found if fit.kept == best.kept), best
+
+
+def _fitting(
+    choice: Choice, cell: Cell, minutes: float, drawn: Candidates, repeats: int,
+    read: BoolArray | None,
+) -> list[_Fit]:  # fmt: skip
+    """A plan of as many poses as fit, candidates being `read` in load states that were chosen
+    before; empty or an error where there is none."""
+    # What poses read twice would take, more poses may have.
+    motion = replace(cell.design.motion, extra_time=cell.design.motion.longer)
+    spec = replace(cell.design, per_level=(), repeats=repeats, minutes=None, motion=motion)
+
+    def sized(poses: int) -> Cell:
+        return replace(cell, design=replace(spec, poses=poses))
+
+    everything = np.ones((len(drawn.q), len(plan_forces(cell))), dtype=np.int64)
+    poses = bisect_left(
+        range(1, len(drawn.q) + 1), True,
+        key=lambda n: _minutes(sized(n), drawn.q[:n], everything[:n]) > minutes,
+    )  # fmt: skip
+    point = choice.relaxed(sized(poses), drawn, read) if poses else None
+    if point is None:
+        return []
+    problem = point.setup.problem(point.pool, shares_of(point.cell))
+    problem.check_enough()
+    chosen, phi = exact_plan(problem.balanced(), point.relaxed)
+    took = _minutes(point.cell, point.pool.q[chosen], point.pool.readings[chosen])
+    # Where a load is not hung there is time for more; Φ goes about as one over their number.
+    more = max(int(poses * minutes / took), 1) / poses
+    value = point.setup.criterion.figure(phi / more)
+    size = TimedSize(round(len(chosen) * more), repeats, took * more, value)
+    whole, read = sized(round(poses * more)), point.setup.ways > 0
+    return [_Fit(len(problem.prior), phi / more, size, whole, read)]
+
+
+def _minutes(cell: Cell, q: Array, readings: IntArray) -> float:
+    """About how long the poses q (N, n) take, each read in the load states that have `readings`
+    (N, L), on a short way without obstacles."""
+    motion, read = at_stops(cell), readings > 0
+    heavy = int((np.any(plan_forces(cell) != 0, axis=1) & read.any(axis=0)).sum())
+    changes = (motion.load_changes or heavy + 1) if heavy else 0
+    home = q[:1] if motion.home is None else motion.home[None]
+    waiting = read.sum() * motion.dwell * (2 if motion.both_directions else 1)
+    travel = 0.0
+    for visited, states in zip(*np.unique(read.T, axis=0, return_counts=True), strict=True):
+        cost = travel_times(np.vstack([home, q[visited]]), motion.speed)
+        ring = [0, *nearest_first(cost), 0]
+        travel += states * cost[ring[:-1], ring[1:]].sum()
+    total = waiting + travel + changes * motion.load_change
+    return float(total * (1 + motion.longer) / 60)
+
+
+# In which load states each pose is read: in all of them, or each where it tells most.
+#
+# With a pose read in one load state as a candidate, the relaxation weighs poses and load states
+# together: it has as many stops as the poses have in all load states, shared out anew.  Each load
+# takes changes by hand, each of which is worth Δ/a stops (Δ s of a change, a s of a stop): with Φ
+# of order 1/stops, a choice of loads that saves c changes of n stops is as good, in the same time,
+# as Φ n / (n + c Δ/a).  Loads that are used least are left out one by one, the best choice is kept.
+
+# Of Φ, 1 % of an error, by which a choice must be better: the same poses in all load states are
+# simpler to measure, and a noise that is stated is not known to that.
+SIMPLER = 0.02
+SOME = 1000  # poses that the choice is made on
+
+
+def single_ways(information: PoseInformation) -> IntArray:
+    """The ways (K, L) to read a pose in one load state: of deflections in one and unloaded."""
+    ways = information.everything * np.eye(len(information.forces), dtype=np.int64)
+    if information.model.cell.model.observe == "deflection":
+        ways[1:, 0] = ways[0, 0]
+        ways = ways[1:]
+    return ways
+
+
+def chosen_states(
+    setup: Setup, q: Array, group: IntArray, shares: IntArray, progress: Progress
+) -> tuple[Setup, LoadStates | None]:
+    """With the ways (K, L) in which candidates q (N, n) are best read, and why, where the cell asks
+    for a choice of them."""
+    information, cell = setup.information, setup.information.model.cell
+    if cell.design.load_states != "chosen":
+        return setup, None
+    require(
+        not cell.noise.configuration or cell.model.observe == "deflection",
+        f"{cell.source}: [noise] configuration_um says that a pose's readings share an "
+        'error in all load states, which only load_states = "all" counts with; drop one of them',
+    )
+    ways = single_ways(information)
+    if len(ways) == 1:
+        one = "a deflection takes its reading without load and that under the only one"
+        alone = "there is one load state"
+        return setup, LoadStates("all", one if ways.sum() > 1 else alone)
+    progress("load states of the poses")
+    few = np.arange(0, len(q), max(len(q) // SOME, 1))
+
+    def relaxed(ways: IntArray) -> tuple[float, Array]:
+        own = replace(setup, ways=ways)
+        problem = own.problem(own.pool(q[few], group[few]), shares).balanced()
+        weights = prospects(problem, GAIN / 3).weights
+        value = float(problem.criterion.of_information(problem.at(weights)))
+        return value, weights.reshape(len(ways), -1).sum(axis=1)
+
+    motion, loaded = at_stops(cell), (information.forces != 0).any(axis=1)
+    crossed, _ = relaxed(information.everything)
+    stops = float(shares.sum() * len(loaded))
+    # Nothing but travel may take time; that is not told here.
+    worth = motion.load_change / max(motion.dwell * (2 if motion.both_directions else 1), 1.0)
+    kept, best, least = np.arange(len(ways)), ways, np.inf
+    while True:
+        value, weight = relaxed(ways[kept])
+        heavy = (ways[kept] > 0)[:, loaded].any(axis=1)
+        saved = (loaded.sum() - heavy.sum()) * worth
+        if value * stops / (stops + saved) < least:
+            best, least = ways[kept], value * stops / (stops + saved)
+        if heavy.sum() < 2:
+            break
+        kept = np.delete(kept, np.flatnonzero(heavy)[np.argmin(weight[heavy])])
+    figures = setup.criterion.figure(crossed), setup.criterion.figure(least)
+    if least > (1 - SIMPLER) * crossed:
+        why = "choosing them for each pose would hardly lower the error"
+        return setup, LoadStates("all", why, *figures)
+    return replace(setup, ways=best), LoadStates("chosen", "", *figures)

@@ -15,7 +15,7 @@ from elastocal.cell_tables import Motion
 from elastocal.messages import ElastocalError, InputError
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.planning.execution import schedule
-from elastocal.planning.programs import (
+from elastocal.saving import (
     RESERVED,
     check_program,
     program_name,
