@@ -8,8 +8,8 @@ import pytest
 import typer
 from support.robots import KR270
 
+from elastocal.__main__ import commands
 from elastocal.cell import read_cell
-from elastocal.cli.main import app
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 
@@ -59,7 +59,7 @@ def test_links_between_pages_lead_somewhere():
             assert where.exists() or where in GENERATED, f"{page.name} links to {target}"
 
 
-COMMANDS = typer.main.get_command(app).commands
+COMMANDS = typer.main.get_command(commands()).commands
 
 
 def commands_shown(page: Path) -> list[list[str]]:

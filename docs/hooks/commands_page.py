@@ -22,9 +22,9 @@ def page() -> str:
     """The page, a section for each verb."""
     import typer
 
-    from elastocal.cli.main import app
+    from elastocal.__main__ import commands
 
-    group = typer.main.get_command(app)
+    group = typer.main.get_command(commands())
     parts = [HEAD, "## Options of every verb\n", _options(group), ""]
     for name, command in sorted(group.commands.items()):  # type: ignore[attr-defined]
         parts += [f"## {name}\n", inspect.cleandoc(_text(command)), ""]

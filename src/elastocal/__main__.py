@@ -1,8 +1,22 @@
 """The `elastocal` command, and python -m elastocal."""
 
+from __future__ import annotations
+
 import sys
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typer import Typer
 
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
+
+
+def commands() -> Typer:
+    """The command line, with all commands: importing one registers it."""
+    from elastocal.cli import measuring, using  # noqa: F401
+    from elastocal.cli.app import app
+
+    return app
 
 
 def main() -> None:
@@ -12,9 +26,10 @@ def main() -> None:
 
         with noting_interrupts() as noted:
             try:
-                from elastocal.cli.main import main as run
+                commands()
+                from elastocal.cli.app import run_app
 
-                run()
+                run_app()
             except Exception:
                 # A library that is being loaded may turn an interrupt into an error of its own.
                 if noted:

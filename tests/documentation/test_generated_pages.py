@@ -9,7 +9,7 @@ import measured_page
 import pytest
 import typer
 
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.planning.criteria import CRITERIA
@@ -45,7 +45,7 @@ def test_every_criterion_says_what_it_is_and_whether_it_has_a_bound(name):
 
 def test_every_verb_and_option_is_on_the_page():
     page = commands_page.page()
-    for name, command in typer.main.get_command(app).commands.items():
+    for name, command in typer.main.get_command(commands()).commands.items():
         part = page.split(f"\n## {name}\n", 1)[1].split("\n## ", 1)[0]
         for parameter in command.params:
             shown = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name

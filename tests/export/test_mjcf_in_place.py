@@ -7,7 +7,7 @@ from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_r
 from support.mjcf_text import ARM, LOADABLE, write_arm
 from typer.testing import CliRunner
 
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 from elastocal.export.exportable import evaluate_pieces, keep
 from elastocal.model.calibrated import Conditions
 from elastocal.model.mjcf import MjcfArm
@@ -93,7 +93,7 @@ def test_a_file_written_elsewhere_finds_its_meshes_from_there(places, tmp_path):
     cell, result = write_result(model, 'mjcf = "arm.xml"\nbase = "foot"', GEOMETRY)
     for folder in (model, out):
         words = ["export", cell, result, "-o", folder / "new.xml", "--poses", "5", "-q"]
-        done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "300"})
+        done = CliRunner().invoke(commands(), [*map(str, words)], env={"COLUMNS": "300"})
         assert done.exit_code == 0 and "named relative to the file" in done.output, done.output
         assert mujoco.MjModel.from_xml_path(str(folder / "new.xml")).nmesh == 1
     assert str(tmp_path) not in (out / "new.xml").read_text()

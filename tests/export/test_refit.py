@@ -16,7 +16,7 @@ from support.urdf_text import arm as urdf_arm
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 from elastocal.export.exportable import read_joint_correction
 from elastocal.export.robot_files import MujocoRest
 
@@ -47,7 +47,7 @@ HIGH = np.array([1.5, -0.4, 2.0, 2.0, 1.5, 2.0])
 
 
 def run(*words: object) -> str:
-    done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "400"})
+    done = CliRunner().invoke(commands(), [*map(str, words)], env={"COLUMNS": "400"})
     assert done.exit_code == 0, done.output
     return done.output
 
@@ -161,7 +161,7 @@ def test_what_a_format_cannot_take_is_refused(folder, out, option, told):
         result.write_text(json.dumps(content))
     more = [folder / "c.csv"] if option == "--joint-correction" else []
     words = ["export", cell, result, "-o", folder / out, option, *more]
-    done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "400"})
+    done = CliRunner().invoke(commands(), [*map(str, words)], env={"COLUMNS": "400"})
     assert done.exit_code == 2 and told in done.output
     assert not (folder / out).exists() and not (folder / "c.csv").exists()
 

@@ -13,9 +13,9 @@ from golden import runner
 from golden.door import equal_noise
 from golden.goldens import ARM, CAMPAIGN, GOLDENS
 
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 
-VERBS = tuple(typer.main.get_command(app).commands)
+VERBS = tuple(typer.main.get_command(commands()).commands)
 IGNORED = shutil.ignore_patterns("__pycache__")
 # The options that name a file to write.
 WRITES = ("-o", "--report", "--certificate", "--residuals", "--truth", "--plan", "--cell-out",

@@ -96,12 +96,12 @@ def states(folder: Path) -> dict[str, bytes]:
 
 
 def run_command(line: str) -> dict[str, Any]:
-    from elastocal.cli.main import app
+    from elastocal.__main__ import commands
 
     words = shlex.split(line)
     environment = {"COLUMNS": "100", "NO_COLOR": "1"}
     with mock.patch.object(sys, "argv", ["elastocal", *words]):  # which some results state
-        done = CliRunner().invoke(app, words, env=environment, catch_exceptions=False)
+        done = CliRunner().invoke(commands(), words, env=environment, catch_exceptions=False)
     found: dict[str, Any] = {"command": line, "exit": done.exit_code}
     if "--json" in words and done.exit_code == 0:
         found["json"] = kept(json.loads(done.stdout))

@@ -16,7 +16,7 @@ from support.tracker_exports import (
 )
 from typer.testing import CliRunner
 
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 from elastocal.importing.exports import likely_presets
 from elastocal.messages import InputError
 
@@ -104,7 +104,7 @@ def test_the_preview_shown_is_what_is_printed(tmp_path, monkeypatch):
     (tmp_path / "poses.dat").write_text(krl(degrees), encoding="utf-8")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
-    result = CliRunner().invoke(app, command.split()[1:], catch_exceptions=False)
+    result = CliRunner().invoke(commands(), command.split()[1:], catch_exceptions=False)
     assert result.exit_code == 0
     printed = [" ".join(line.split()) for line in result.stdout.splitlines()]
     for line in (" ".join(line.split()) for line in shown.splitlines()):

@@ -10,11 +10,11 @@ import pytest
 from support.tracker_exports import MARKERS, kr270_readings
 from typer.testing import CliRunner, Result
 
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 
 
 def run(*words: object) -> Result:
-    return CliRunner().invoke(app, ["import", *map(str, words)], env={"COLUMNS": "300"})
+    return CliRunner().invoke(commands(), ["import", *map(str, words)], env={"COLUMNS": "300"})
 
 
 def wide(path: Path, degrees: np.ndarray, points: np.ndarray, head: str, unit: str = "_mm") -> Path:

@@ -10,12 +10,12 @@ from typing import Any
 from support.robots import KR270
 from typer.testing import CliRunner, Result
 
-from elastocal.cli.main import app
+from elastocal.__main__ import commands
 
 # The command in a process: a child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from elastocal.cli.main import main; main()"
+    "from elastocal.__main__ import main; main()"
 )
 TEST_POSES = """
 [[design.test_pose]]
@@ -68,7 +68,7 @@ def write_cell(folder: Path, text: str = DEFLECTION) -> Path:
 def elastocal(*arguments: object, **environment: str) -> Result:
     """A command in this process; whatever is not a clean exit is an error of ours."""
     words = [str(a) for a in arguments]
-    return CliRunner().invoke(app, words, env=environment, catch_exceptions=False)
+    return CliRunner().invoke(commands(), words, env=environment, catch_exceptions=False)
 
 
 def design(cell: Path, *extra: object, output: str = "plan.csv", quiet: bool = True) -> Result:

@@ -13,7 +13,9 @@ what stands for a value, as in "set_ (KEY=VALUE): Option of the study".
 from __future__ import annotations
 
 import functools
+import gc
 import inspect
+import logging
 import os
 import re
 import shlex
@@ -28,9 +30,19 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_args
 
+# Many small matrices: a second thread of the linear algebra library only waits for the first.
+# It must be said before numpy is loaded, and the user's own setting wins.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# No plug-in of pydantic has to do with a cell file; looking for them reads what is installed.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
+
+# Figures are drawn into files; what a window would take does not concern them.
+os.environ["MPLBACKEND"] = "agg"
+
 import typer
 from typer.core import TyperGroup
 
+from elastocal import __version__
 from elastocal.above import LARGEST_SEED, kinds_of
 from elastocal.files import check_output, together
 from elastocal.messages import (
@@ -43,7 +55,15 @@ from elastocal.messages import (
     options_as_flags,
     require,
 )
-from elastocal.screen import complain, interrupts, progress_line, safe_console, say
+from elastocal.screen import (
+    close_streams,
+    complain,
+    interrupts,
+    prepare_streams,
+    progress_line,
+    safe_console,
+    say,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,6 +73,9 @@ if TYPE_CHECKING:
 # Heavy imports (casadi, pin, pandas) stand inside the commands: --help must not wait for them.
 
 HELP = ["-h", "--help"]
+# New containers between two searches for garbage in cycles.  Python's own 700 has every import and
+# every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
+COLLECT_AFTER = 200_000
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
 READ = (
@@ -117,6 +140,47 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": HELP, "max_content_width": 100},
 )
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        say(f"elastocal {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
+    ] = False,
+    backend: Annotated[
+        str | None, typer.Option(help="What evaluates the model: auto or numpy; default: auto.")
+    ] = None,
+) -> None:
+    """Calibrate industrial robot arms and explain what is left over."""
+    from elastocal.model.evaluate import VARIABLE, checked, chosen_backend
+
+    # By the environment, so that processes which a command starts choose the same.
+    if backend is not None:
+        os.environ[VARIABLE] = checked(backend.strip() or "auto", "--backend")
+    chosen_backend()
+    if os.environ.get("ELASTOCAL_CACHE"):
+        complain("ELASTOCAL_CACHE is no longer read, as nothing is kept between runs; unset it")
+
+
+def run_app() -> None:
+    gc.set_threshold(COLLECT_AFTER)
+    # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    prepare_streams()
+    try:
+        # The same name however it is called: completion scripts are made of it.
+        app(prog_name="elastocal")
+    finally:
+        close_streams()
+        # Python ends by looking for garbage once more, which takes 0.17 s, as long as fitting a
+        # small table does.
+        gc.freeze()
 
 
 def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool = False) -> int:
