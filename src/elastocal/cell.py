@@ -48,9 +48,8 @@ from elastocal.config import (
     record,
     stated,
 )
-from elastocal.files import check_exists
+from elastocal.files import check_exists, is_plugin_file
 from elastocal.messages import check_known, is_label, listed, quoted, require, wish
-from elastocal.plugin_loader import is_plugin_file
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]

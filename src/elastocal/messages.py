@@ -390,10 +390,10 @@ def _of_plugin(error: Exception, what: str) -> str:
     import sys
     import traceback
 
-    loader: Any = sys.modules.get("elastocal.plugin_loader")
+    loader: Any = sys.modules.get("elastocal.files")
     if loader is None:
         return ""
-    ran = {str(path) for path in loader._files}
+    ran = {str(path) for path in loader.RAN}
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         file, mine = frame.f_code.co_filename, frame.f_locals.values()
         kinds = [v if isinstance(v, type) else type(v) for v in mine]

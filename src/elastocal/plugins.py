@@ -21,7 +21,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from elastocal import plugin_loader
+from elastocal import files
 from elastocal.cell import Cell
 from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
@@ -69,7 +69,7 @@ __all__ = [
 # What the relaxation needs of a criterion, it states itself, as a function of the covariance.
 Term, TraceTerm, SpectralTerm = ScenarioCriterion, TraceCriterion, SpectralCriterion
 
-load_plugins = plugin_loader.load_plugins
+load_plugins = files.load_plugins
 
 E = TypeVar("E", bound=Effect)
 N = TypeVar("N", bound=NoiseModel)
@@ -178,7 +178,7 @@ def _registered(register: Callable[[T], Any], what: T) -> T:
     """What was registered, so that a criterion's class can be decorated."""
     try:
         register(what)
-        plugin_loader.REGISTERED.add(what if isinstance(what, type) else type(what))
+        files.REGISTERED.add(what if isinstance(what, type) else type(what))
         return what
     except InputError as error:
         caller = sys._getframe(2)

@@ -21,7 +21,7 @@ from support.robots import KR270
 from typer.testing import Result
 
 import elastocal as ec
-from elastocal import plugin_loader
+from elastocal import files
 from elastocal.cell import read_cell
 from elastocal.messages import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -216,7 +216,7 @@ def strange(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pa
     cell.write_text(CELL.replace("three_lobes.py", "helper.py"), encoding="utf-8")
     helper.touch()
     assert run("identify", cell, "data.csv", "-o", "a.json", "-q").exit_code == 0
-    plugin_loader._files.clear()
+    files.RAN.clear()
     Path("targets.csv").write_text("x_mm,y_mm,z_mm\n2000,0,1500\n")
     helper.write_text(STRANGE, encoding="utf-8")
     return tmp_path
@@ -254,18 +254,18 @@ def test_who_allows_it(module: str, strange: Path, monkeypatch: pytest.MonkeyPat
     (strange / "helper.py").rename(strange / f"{module.removesuffix('.py')}.py")
     monkeypatch.syspath_prepend(str(strange))
     for trusted in ("", "0", "no", str(strange / "within"), "."):
-        monkeypatch.setenv(plugin_loader.TRUSTED, trusted)
+        monkeypatch.setenv(files.TRUSTED, trusted)
         for asked in (cell, read_cell(cell)):
             with pytest.raises(InputError, match=rf"{module.removesuffix('.py')}.*plugins=True"):
                 Model(asked)
     assert not ran.exists()
     for trusted in ("1", str(strange), f"/nowhere:{strange.parent}", ""):
-        monkeypatch.setenv(plugin_loader.TRUSTED, trusted)
+        monkeypatch.setenv(files.TRUSTED, trusted)
         Model(cell, plugins=not trusted)
         ran.unlink()
         Model(cell)  # what has run is not asked for again
         assert not ran.exists()
-        plugin_loader._files.clear()
+        files.RAN.clear()
         sys.modules.pop("strange_helper", None)
 
 

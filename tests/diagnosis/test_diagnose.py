@@ -26,9 +26,9 @@ from elastocal import Diagnosis
 from elastocal.cell_tables import CartesianNoise
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.verdict import confirm, unheard_of
+from elastocal.files import load_plugins
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
-from elastocal.plugin_loader import load_plugins
 
 # Effects that others imitate in any poses, and those others.
 IMITATED = {

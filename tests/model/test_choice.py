@@ -13,11 +13,11 @@ from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_t
 from support.registered import forgotten, write_example
 
 from elastocal.cell_tables import Nominal
+from elastocal.files import load_plugins
 from elastocal.messages import InputError
 from elastocal.model.effects.base import Arm, DrivenEffect
 from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.manipulator import Model
-from elastocal.plugin_loader import load_plugins
 
 
 def model_of(*effects: str, **model) -> Model:

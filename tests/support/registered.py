@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from elastocal import plugin_loader
+from elastocal import files
 from elastocal.identification import noise_structure as structure
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.planning.criteria import CRITERIA
@@ -40,7 +40,7 @@ def write_example(folder: Path, file: str) -> Path:
 @contextmanager
 def forgotten() -> Iterator[None]:
     """Catalogue, noise models, criteria and files that were run are afterwards as before."""
-    registries = (CATALOGUE, structure.STRUCTURES, CRITERIA, plugin_loader._files)
+    registries = (CATALOGUE, structure.STRUCTURES, CRITERIA, files.RAN)
     before = [dict(each) for each in registries]
     try:
         yield

@@ -44,7 +44,7 @@ from typer.core import TyperGroup
 
 from elastocal import __version__
 from elastocal.above import LARGEST_SEED, kinds_of
-from elastocal.files import check_output, together
+from elastocal.files import check_output, is_plugin_file, together
 from elastocal.messages import (
     TRACEBACK,
     ElastocalError,
@@ -219,8 +219,6 @@ def repeated() -> str:
 
 def files_of(cell: Cell) -> list[Path]:
     """Files that the cell names and its model or a plan depends on."""
-    from elastocal.plugin_loader import is_plugin_file
-
     robot, targets = cell.robot, cell.design.test_path
     solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
     path = None if targets is None else targets.file

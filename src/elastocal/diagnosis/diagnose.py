@@ -52,7 +52,7 @@ from elastocal.diagnosis.verdict import (
     unheard_of,
     warnings,
 )
-from elastocal.files import atomic_writer
+from elastocal.files import atomic_writer, is_plugin_file
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
@@ -68,7 +68,6 @@ from elastocal.messages import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
-from elastocal.plugin_loader import is_plugin_file
 from elastocal.units import BoolArray, Progress
 
 # Keys of the cell file, in whatever table, whose texts are paths.

@@ -17,12 +17,12 @@ import numpy as np
 from scipy import sparse, special
 
 from elastocal.cell_tables import Unsteadiness
+from elastocal.files import check_registered, same_class
 from elastocal.measurements import Measurements, numbered, visits
 from elastocal.messages import InputError, did_you_mean, option, quoted, require
 from elastocal.model.effects.base import JointMotion
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.plugin_loader import check_registered, same_class
 from elastocal.units import Array, BoolArray, IntArray
 
 # The visits behind each reading: what a joint that settles elsewhere there, or a base that has

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from elastocal.above import ByValue, DataFrame, checked_arguments
 from elastocal.cell import Cell
 from elastocal.cell_tables import EffectChoice, ModelSpec
+from elastocal.files import Carried
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
 from elastocal.messages import InputError, listed, option, require
@@ -33,7 +34,6 @@ from elastocal.model.effects.placements import DistanceSensor
 from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
-from elastocal.plugin_loader import Carried
 from elastocal.units import Array, IntArray
 
 

@@ -21,8 +21,8 @@ from typing import ClassVar, Literal, Self, TypeVar
 import numpy as np
 
 from elastocal.cell_tables import TEST_POSE
+from elastocal.files import same_class
 from elastocal.messages import InputError, check_known, is_label, listed, quoted, require
-from elastocal.plugin_loader import same_class
 from elastocal.units import Array, BoolArray, IntArray
 
 Need = Literal["test_poses", "combination"]

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell import Cell
+from elastocal.files import check_registered
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
 from elastocal.messages import InputError, listed, option, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, joint_index
-from elastocal.plugin_loader import check_registered
 from elastocal.units import Array
 
 

@@ -14,11 +14,11 @@ from pathlib import Path
 import casadi as ca
 
 from elastocal.cell import Cell, read_cell
+from elastocal.files import load_installed, load_plugins, same_class
 from elastocal.messages import InputError, check_known, require
 from elastocal.model.chain import Chain
 from elastocal.model.effects import gears, placements, smooth, statics
 from elastocal.model.effects.base import Effect, ParameterSpec, check
-from elastocal.plugin_loader import load_installed, load_plugins, same_class
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
