@@ -16,7 +16,7 @@ from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum,
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import Item
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.model.effects.gears import EncoderScale
+from elastocal.model.effects.geometry import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
 Array = np.ndarray

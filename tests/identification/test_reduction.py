@@ -9,7 +9,7 @@ from support.cells import random_poses
 from elastocal.cell_tables import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.solve import reduce
-from elastocal.model.effects.gears import JointOffset
+from elastocal.model.effects.geometry import JointOffset
 from elastocal.model.manipulator import Model
 
 DOWN = ((0.0, 0.0, -300.0),)

@@ -41,7 +41,7 @@ from elastocal.diagnosis.noise_floor import (
 )
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.model.effects.base import Stage, index
-from elastocal.model.effects.gears import GearSpectrum
+from elastocal.model.effects.geometry import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
 

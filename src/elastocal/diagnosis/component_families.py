@@ -32,7 +32,7 @@ from elastocal.diagnosis.hypotheses import (
 from elastocal.identification.start import as_placed
 from elastocal.measurements import first_of_visit, with_moves
 from elastocal.model.effects.base import Effect, JointMotion, Stage, index, turning_joints
-from elastocal.model.effects.gears import BY_ORDER, MOST_LINES, GearRipple, GearSpectrum
+from elastocal.model.effects.geometry import BY_ORDER, MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import (
     ApproachResponse,
     JointCurve,

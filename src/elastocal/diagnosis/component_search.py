@@ -53,7 +53,7 @@ from elastocal.diagnosis.noise_floor import scatter_beyond
 from elastocal.engine import ROUNDING, Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.effects.gears import GearRipple, GearSpectrum
+from elastocal.model.effects.geometry import GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.effects.statics import GravitySag, LinkWeights
 from elastocal.units import Array, Progress

@@ -32,7 +32,7 @@ from elastocal.measurements import Measurements, first_of_visit, numbered
 from elastocal.messages import InsufficientDataError
 from elastocal.model.effects.base import Setting, Stage, usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.effects.placements import BaseFrame
+from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.effects.statics import PayloadError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset

@@ -30,7 +30,7 @@ from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
 from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.catalogue import SOMETHING
-from elastocal.model.effects.gears import Backlash
+from elastocal.model.effects.geometry import Backlash
 from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, IntArray

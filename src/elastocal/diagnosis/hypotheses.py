@@ -36,8 +36,13 @@ from elastocal.model.effects.base import (
     row_inputs,
 )
 from elastocal.model.effects.catalogue import CATALOGUE, set_constants
-from elastocal.model.effects.gears import BY_ORDER, Backlash, GearSpectrum, Hysteresis
-from elastocal.model.effects.placements import ThermalExpansion
+from elastocal.model.effects.geometry import (
+    BY_ORDER,
+    Backlash,
+    GearSpectrum,
+    Hysteresis,
+    ThermalExpansion,
+)
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import ONCE, BatchFunction

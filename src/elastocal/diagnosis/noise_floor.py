@@ -37,7 +37,7 @@ from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.outliers import settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
 from elastocal.messages import ElastocalError
-from elastocal.model.effects.placements import BaseFrame
+from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.observations import pure_error
 from elastocal.units import Array, BoolArray, IntArray
 

@@ -39,7 +39,7 @@ from elastocal.identification import noise_summary
 from elastocal.identification.solve import FAR, far_off
 from elastocal.messages import listed, rounded
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.gears import Backlash
+from elastocal.model.effects.geometry import Backlash
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray

@@ -37,8 +37,7 @@ from elastocal.messages import (
 from elastocal.model import dh
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain, Joint, joint_index
-from elastocal.model.effects.base import given_force
-from elastocal.model.effects.placements import transverse_axes
+from elastocal.model.effects.base import given_force, transverse_axes
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges

@@ -31,8 +31,7 @@ from elastocal.model.calibrated import (
 from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_limits
 from elastocal.model.effects.base import Format, Spring, row_inputs
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
-from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry
+from elastocal.model.effects.geometry import JointOffset, LinkGeometry
 from elastocal.model.effects.statics import JointCompliance
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model

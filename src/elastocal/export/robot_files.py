@@ -21,8 +21,7 @@ from elastocal.export.exportable import ExportNumbers
 from elastocal.files import read_bytes
 from elastocal.messages import ElastocalError, InputError, listed, option, require
 from elastocal.model.chain import Joint, LinkMass
-from elastocal.model.effects.base import Spring
-from elastocal.model.effects.placements import transverse_axes
+from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.model.mjcf import (
     SPRING,

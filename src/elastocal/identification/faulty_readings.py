@@ -25,7 +25,7 @@ from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.messages import length
-from elastocal.model.effects.placements import MarkerPosition
+from elastocal.model.effects.geometry import MarkerPosition
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.

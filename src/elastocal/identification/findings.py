@@ -25,8 +25,12 @@ from elastocal.messages import EXACT, counted, listed, option, rounded
 from elastocal.model.calibrated import MOSTLY, mostly_prior
 from elastocal.model.effects.base import Parameter, index
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry, MarkerOrientation, TrackerDistortion
+from elastocal.model.effects.geometry import (
+    JointOffset,
+    LinkGeometry,
+    MarkerOrientation,
+    TrackerDistortion,
+)
 from elastocal.model.effects.statics import (
     RATED_WIND_UP,
     JointCompliance,

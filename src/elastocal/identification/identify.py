@@ -78,7 +78,7 @@ from elastocal.messages import ElastocalError, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.gears import BY_ORDER
+from elastocal.model.effects.geometry import BY_ORDER
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, subset
 from elastocal.units import Array, BoolArray, Progress

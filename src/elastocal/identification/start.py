@@ -23,7 +23,7 @@ from elastocal.messages import (
 )
 from elastocal.model.chain import beyond_limits
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.placements import BaseFrame, MarkerPosition
+from elastocal.model.effects.geometry import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray

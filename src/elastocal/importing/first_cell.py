@@ -23,8 +23,7 @@ from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
-from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
+from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometry, MarkerPosition
 from elastocal.model.effects.statics import (
     JointCompliance,
     feels_weight,

@@ -30,7 +30,7 @@ from elastocal.model.effects.base import (
     row_inputs,
 )
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
-from elastocal.model.effects.placements import DistanceSensor
+from elastocal.model.effects.geometry import DistanceSensor
 from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm

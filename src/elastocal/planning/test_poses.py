@@ -33,7 +33,7 @@ from elastocal.model.chain import (
 )
 from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import choose_effects
-from elastocal.model.effects.placements import MarkerPosition
+from elastocal.model.effects.geometry import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.planning.bodies import data_base

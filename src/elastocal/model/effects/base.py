@@ -555,6 +555,20 @@ def links(chain: Chain) -> tuple[str, ...]:
 index = joint_index
 
 
+SHORTEST = 1e-6  # m; a shorter link has neither a length to grow nor a direction of its own
+
+
+def transverse_axes(axis: Array) -> tuple[Array, Array]:
+    """Two unit axes x, y with x × y = axis; the frame's own x and y where the axis is z.
+
+    x is the coordinate axis farthest from the joint axis that comes first, made orthogonal.
+    """
+    start = np.eye(3)[int(np.argmin(np.abs(axis).round(9)))]
+    x = start - axis * (axis @ start)
+    x /= np.linalg.norm(x)
+    return x, np.cross(axis, x)
+
+
 # Effects that the table drives: small motions, and where along the chain they enter.
 
 

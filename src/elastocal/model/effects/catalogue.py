@@ -17,24 +17,24 @@ from elastocal.cell import Cell, read_cell
 from elastocal.files import load_installed, load_plugins, same_class
 from elastocal.messages import InputError, check_known, require
 from elastocal.model.chain import Chain
-from elastocal.model.effects import gears, placements, smooth, statics
+from elastocal.model.effects import geometry, smooth, statics
 from elastocal.model.effects.base import Effect, ParameterSpec, check
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {effect.name: effect for effect in (
-    placements.BaseFrame(), gears.JointOffset(), gears.EncoderScale(), gears.GearEccentricity(),
-    gears.GearSecondHarmonic(), gears.GearRipple(), gears.GearSpectrum(), smooth.JointCurve(),
-    gears.WristCoupling(), placements.JointDrift(), placements.EncoderJump(), gears.MoveLag(),
-    gears.MoveHysteresis(), statics.GravitySag(), statics.TorqueCoupling(),
-    placements.LinkGeometry(), statics.TorqueTilt(), placements.ThermalExpansion(),
-    statics.JointCompliance(), statics.JointHardening(), gears.Backlash(), gears.Hysteresis(),
-    smooth.TorqueResponse(), smooth.ApproachResponse(), statics.OffAxisCompliance(),
-    statics.LinkBending(), statics.BaseCompliance(), smooth.LoadResponse(),
-    statics.GravityCompensator(), statics.LinkGravity(), statics.LinkMassError(),
-    statics.LinkWeights(), statics.Payload(), statics.PayloadError(), placements.MarkerPosition(),
-    placements.MarkerSlip(), smooth.ResidualField(), smooth.ResidualStep(),
-    placements.MarkerOrientation(), placements.BaseDrift(), placements.FrameJump(),
-    placements.DistanceSensor(), placements.TrackerDistortion(),
+    geometry.BaseFrame(), geometry.JointOffset(), geometry.EncoderScale(),
+    geometry.GearEccentricity(), geometry.GearSecondHarmonic(), geometry.GearRipple(),
+    geometry.GearSpectrum(), smooth.JointCurve(), geometry.WristCoupling(), geometry.JointDrift(),
+    geometry.EncoderJump(), geometry.MoveLag(), geometry.MoveHysteresis(), statics.GravitySag(),
+    statics.TorqueCoupling(), geometry.LinkGeometry(), statics.TorqueTilt(),
+    geometry.ThermalExpansion(), statics.JointCompliance(), statics.JointHardening(),
+    geometry.Backlash(), geometry.Hysteresis(), smooth.TorqueResponse(), smooth.ApproachResponse(),
+    statics.OffAxisCompliance(), statics.LinkBending(), statics.BaseCompliance(),
+    smooth.LoadResponse(), statics.GravityCompensator(), statics.LinkGravity(),
+    statics.LinkMassError(), statics.LinkWeights(), statics.Payload(), statics.PayloadError(),
+    geometry.MarkerPosition(), geometry.MarkerSlip(), smooth.ResidualField(), smooth.ResidualStep(),
+    geometry.MarkerOrientation(), geometry.BaseDrift(), geometry.FrameJump(),
+    geometry.DistanceSensor(), geometry.TrackerDistortion(),
 )}  # fmt: skip
 BUILT_IN = frozenset(CATALOGUE)
 # Probability that an effect is missing; in equal shares it is each of them, at each of its places.

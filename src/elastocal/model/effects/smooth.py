@@ -57,8 +57,7 @@ from elastocal.model.effects.base import (
     links,
     turning_joints,
 )
-from elastocal.model.effects.gears import BY_ORDER, came_from
-from elastocal.model.effects.placements import JUMP_TIME, KEYS, Jump
+from elastocal.model.effects.geometry import BY_ORDER, JUMP_TIME, KEYS, Jump, came_from
 from elastocal.model.effects.statics import LoadedEffect, TorqueEffect, add_deflection
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array

@@ -15,6 +15,7 @@ from elastocal.messages import require, rounded
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, extent, finite_ranges
 from elastocal.model.effects.base import (
+    SHORTEST,
     STIFFNESS,
     Arm,
     DrivenEffect,
@@ -29,9 +30,9 @@ from elastocal.model.effects.base import (
     joints,
     links,
     motion_unit,
+    transverse_axes,
     turning_joints,
 )
-from elastocal.model.effects.placements import SHORTEST, transverse_axes
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
 
