@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell, Solid
 from elastocal.model.chain import Chain
-from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base
+from elastocal.planning.collision import HANGING, WORLD, Body, Pair, data_base
 
 AWAY = (0.0, 0.0, 1e4)
 SEEN, UNSEEN = 0, 1  # geom groups: what hides a marker, and what does not

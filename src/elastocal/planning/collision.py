@@ -1,36 +1,436 @@
-"""Collision, sight and load of whole batches of poses, and moves certified free of collision."""
+"""The bodies of a cell: arm, tool, load, obstacles, what carries them, what must keep apart; their
+collision and sight in whole batches of poses, and moves certified free of collision."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, lru_cache
+from itertools import combinations, product
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import null_space
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell import Cell, HalfSpace, HangingLoad, Solid
+from elastocal.cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.files import check_regular
+from elastocal.messages import InputError, check_known, require, said_of
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
-from elastocal.model.effects.statics import GravityCompensator
 from elastocal.model.evaluate import BatchFunction
-from elastocal.model.symbolic import SymbolicArm
-from elastocal.planning.bodies import (
-    HANGING,
-    WORLD,
-    Body,
-    Pair,
-    coal_shape,
-    data_base,
-    hull,
-    rotation_to,
-    touches,
-)
 from elastocal.units import Array, BoolArray, pose_at
+
+# What a solid is to geometry: its hull, its support function and its coal shape.
+
+MESH_BYTES = 100_000_000
+CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+
+
+def hull(solid: Solid, boxed: bool = False) -> tuple[Array, float]:
+    """Points (k, 3) in the carrier's frame and a radius: the solid is their convex hull grown by
+    the radius; a cylinder lies inside, and a mesh that is `boxed`, so that k ≤ 8, in the box around
+    it along its own axes."""
+    if solid.shape == "mesh":
+        points, radius = mesh_hull(solid)[0], 0.0
+        if boxed:
+            low, high = points.min(axis=0), points.max(axis=0)
+            points = (low + high) / 2 + CORNERS * (high - low)
+    elif solid.shape == "box":
+        points, radius = CORNERS * solid.size, 0.0
+    elif solid.shape == "sphere":
+        points, radius = np.zeros((1, 3)), float(solid.size[0])
+    else:
+        half = np.array([0.0, 0.0, solid.size[1] / 2])
+        points, radius = np.stack([-half, half]), float(solid.size[0])
+    return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], radius
+
+
+def support(solid: Solid, direction: Array) -> float:
+    """max d·x over the solid, for a unit direction d (3,) in the carrier's frame, in m; exact."""
+    points, radius = hull(solid)
+    if solid.shape == "cylinder":
+        along = float(solid.placement[:3, 2] @ direction)
+        radius *= float(np.sqrt(max(1.0 - along**2, 0.0)))
+    return float((points @ direction).max()) + radius
+
+
+def touches(solid: Solid, point: Array, within: float) -> bool:
+    """True where the solid is at most `within` m from a point (3,) in the carrier's frame."""
+    import coal
+
+    there = coal.Transform3s(np.eye(3), np.array(point, dtype=float))
+    here = coal.Transform3s(solid.placement[:3, :3].copy(), solid.placement[:3, 3].copy())
+    request, result = coal.CollisionRequest(), coal.CollisionResult()
+    return bool(coal.collide(coal_shape(solid), here, coal.Sphere(within), there, request, result))
+
+
+def capsule_between(name: str, a: Array, b: Array, radius: float) -> Solid:
+    """The capsule with cap centres a and b (3,); a sphere where they coincide."""
+    length = float(np.linalg.norm(b - a))
+    if length < 1e-9:
+        return Solid(name, "sphere", np.array([radius]), pose_at((a + b) / 2))
+    placement = pose_at((a + b) / 2, rotation_to((b - a) / length))
+    return Solid(name, "capsule", np.array([radius, length]), placement)
+
+
+def rotation_to(z: Array) -> Array:
+    """Rotations (..., 3, 3) whose third column is the unit vector z (..., 3)."""
+    z = np.asarray(z, dtype=float)
+    across = np.where(np.abs(z[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    x = np.cross(across, z)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    return np.stack([x, np.cross(z, x), z], axis=-1)
+
+
+def coal_shape(solid: Solid) -> Any:
+    """The coal shape centred at the solid's placement; meshes are their convex hull.
+
+    The hull makes a mesh a solid body: a triangle surface would not see what lies inside it.
+    """
+    import coal
+
+    if solid.shape != "mesh":
+        return getattr(coal, solid.shape.capitalize())(*solid.size.tolist())
+    points, triangles = mesh_hull(solid)
+    corners, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    corners.extend(points)
+    faces.extend(coal.Triangle(*corner) for corner in triangles.tolist())
+    return coal.Convex(corners, faces)
+
+
+def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (k, 3) of the mesh's convex hull in the solid's own frame, and its triangles."""
+    if solid.mesh is None:
+        raise InputError(f"body '{solid.name}' is a mesh, but no file is given for it")
+    return _mesh_hull(solid.mesh, tuple(solid.size.tolist()), solid.name)
+
+
+@lru_cache(maxsize=256)
+def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, NDArray[np.int64]]:
+    import coal
+
+    with said_of(f"mesh of body '{name}'"):
+        check_regular(path, "mesh", MESH_BYTES)
+    try:
+        return outward(np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices()))
+    except QhullError:
+        raise InputError(f"mesh '{path}' of body '{name}' is flat: it encloses no volume") from None
+    except Exception as error:  # assimp's failures surface as several kinds
+        raise InputError(
+            f"mesh '{path}' of body '{name}' cannot be read: {error}; STL, OBJ and DAE can"
+        ) from None
+
+
+def outward(cloud: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (k, 3) of the convex hull of points (n, 3), and its triangles, turned outwards."""
+    found = ConvexHull(cloud)
+    used, index = np.unique(found.simplices, return_inverse=True)
+    points, triangles = cloud[used], index.reshape(found.simplices.shape)
+    # coal wants every normal to point outwards; Qhull's simplices are in no order.
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return points, triangles.astype(np.int64)
+
+
+# What carries a body that no joint moves; i ≥ 0 stands for the frame of joint i.
+
+WORLD = -1  # fixed in the data's frame
+HANGING = -2  # at the load point, axes parallel to the data's frame
+PARENTS = 6  # directories above the URDF in which a ROS package may lie
+
+
+def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
+    """(solid, carrier) of every <collision> element; those on the base in the base's frame.  Joints
+    off the chain stand still at their neutral position, as in the kinematics."""
+    import pinocchio as pin
+
+    path = cell.robot.urdf
+    where = f'{cell.source}: [workspace] geometry = "urdf"'
+    if path is None:
+        raise InputError(f"{where}, but the robot has no URDF; give link_radius_mm instead")
+    folders = [str(folder) for folder in path.resolve().parents[:PARENTS]]
+    try:
+        model = pin.buildModelFromUrdf(str(path))
+        geometry = pin.buildGeomFromUrdf(
+            model, str(path), pin.GeometryType.COLLISION, package_dirs=folders
+        )
+    except Exception as error:  # missing files and unreadable ones alike
+        raise InputError(
+            f"{where}: {path}: {' '.join(str(error).split()).rstrip('.')}; put the mesh files "
+            "where the URDF looks for them (beside it, or in a package directory above it), or "
+            "give link_radius_mm instead"
+        ) from None
+    if not geometry.ngeoms:
+        raise InputError(
+            f"{where}: {path} has no <collision> elements; give link_radius_mm instead"
+        )
+    moving = [joint.name for joint in chain.joints]
+    locked = [model.getJointId(name) for name in list(model.names)[1:] if name not in moving]
+    model, geometry = pin.buildReducedModel(model, geometry, locked, pin.neutral(model))
+    base, T_root_base = cell.robot.base, pin.SE3.Identity()
+    if base is not None:
+        T_root_base = model.frames[model.getFrameId(base, pin.FrameType.BODY)].placement
+    found = []
+    for item in geometry.geometryObjects:
+        on_base = item.parentJoint == 0
+        T = T_root_base.inverse() * item.placement if on_base else item.placement
+        carrier = WORLD if on_base else moving.index(model.names[item.parentJoint])
+        found.append((_solid(item, T.homogeneous, path), carrier))
+    return found
+
+
+def _solid(item: Any, placement: np.ndarray, path: Path) -> Solid:
+    import coal
+
+    shape = item.geometry
+    if isinstance(shape, coal.Box):
+        return Solid(item.name, "box", 2 * np.array(shape.halfSide), placement)
+    if isinstance(shape, coal.Sphere):
+        return Solid(item.name, "sphere", np.array([shape.radius]), placement)
+    if isinstance(shape, coal.Cylinder | coal.Capsule):
+        kind = "cylinder" if isinstance(shape, coal.Cylinder) else "capsule"
+        size = np.array([shape.radius, 2 * shape.halfLength])
+        return Solid(item.name, kind, size, placement)  # type: ignore[arg-type]
+    if not item.meshPath:
+        raise InputError(f"{path}: collision element '{item.name}' is of an unknown shape")
+    scale = np.array(item.meshScale, dtype=float).reshape(3)
+    return Solid(item.name, "mesh", scale, placement, Path(item.meshPath))
+
+
+# All bodies of a cell in one list: arm, tool, hanging load, obstacles, each with its carrier.
+# The arm is rigid here, at its nominal geometry: clearances must cover deflections of a few mm.
+
+Kind = Literal["arm", "carried", "load", "rope", "obstacle"]
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Body:
+    """A solid and what moves it: `carrier` i ≥ 0 the frame of joint i (0-based, after its motion),
+    WORLD or HANGING, in which `solid.placement` is."""
+
+    solid: Solid
+    carrier: int
+    kind: Kind
+
+    @property
+    def name(self) -> str:
+        return self.solid.name
+
+    @property
+    def hangs(self) -> bool:
+        return self.carrier == HANGING
+
+
+def data_base(cell: Cell) -> Array:
+    """T_data_base (4, 4) of the nominal cell."""
+    nominal = cell.model.nominal
+    position = np.zeros(3) if nominal.base_position is None else nominal.base_position
+    return pose_at(position, nominal.base_rotation)
+
+
+def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
+    """Every body of the cell: arm, carried bodies, hanging load and rope, obstacles."""
+    workspace = cell.workspace
+    bodies = (
+        *_arm(cell, chain),
+        *(_carried(body, cell, chain) for body in workspace.bodies),
+        *(() if workspace.load is None else hanging(workspace.load)),
+        *(Body(solid, WORLD, "obstacle") for solid in workspace.obstacles),
+    )
+    names = [body.name for body in bodies]
+    for k, name in enumerate(names):
+        require(
+            name not in names[:k],
+            f"{cell.source}: [workspace] has two bodies named '{name}'; rename one "
+            "(base, link1 … and rope are taken)",
+        )
+    return bodies
+
+
+def _arm(cell: Cell, chain: Chain) -> Iterator[Body]:
+    workspace = cell.workspace
+    where = f"{cell.source}: [workspace]"
+    require(
+        not (workspace.urdf_geometry and workspace.link_radius),
+        f'{where} gives link_radius and geometry = "urdf"; the arm can have only one',
+    )
+    if workspace.urdf_geometry:
+        for solid, carrier in urdf_bodies(cell, chain):
+            placed = _moved(data_base(cell), solid) if carrier == WORLD else solid
+            yield Body(placed, carrier, "arm")
+    elif workspace.link_radius:
+        yield from skeleton(chain, workspace.link_radius, data_base(cell), where)
+
+
+def skeleton(
+    chain: Chain, radius: tuple[float, ...], T_data_base: Array, where: str
+) -> Iterator[Body]:
+    """Capsules along the chain: link i from joint i's origin to joint i+1's at zero offset, the
+    last to the flange, "base" from the base's origin to joint 1; none where a radius is 0."""
+    radius = radius * chain.n_joints if len(radius) == 1 else radius
+    require(
+        len(radius) == chain.n_joints,
+        f"{where} link_radius_mm has {len(radius)} values, but robot '{chain.name}' has "
+        f"{chain.n_joints} links; give one for each, or one for all",
+    )
+    ends = [T[:3, 3] for T in chain.link_ends]
+    foot, first = T_data_base[:3, 3], (T_data_base @ chain.joints[0].placement)[:3, 3]
+    if radius[0] > 0 and np.linalg.norm(first - foot) > 0:
+        yield Body(capsule_between("base", foot, first, radius[0]), WORLD, "arm")
+    for i, (end, r) in enumerate(zip(ends, radius, strict=True)):
+        if r > 0:
+            yield Body(capsule_between(f"link{i + 1}", np.zeros(3), end, r), i, "arm")
+
+
+def _carried(body: CarriedBody, cell: Cell, chain: Chain) -> Body:
+    places = {"base": (WORLD, data_base(cell))}
+    places |= {f"link{i + 1}": (i, np.eye(4)) for i in range(chain.n_joints)}
+    places["flange"] = chain.n_joints - 1, chain.flange_placement
+    told = f"{cell.source}: [workspace] body '{body.solid.name}' is on '{body.on}'"
+    check_known(body.on, places, told, "valid:")
+    carrier, T = places[body.on]
+    return Body(_moved(T, body.solid), carrier, "carried")
+
+
+def hanging(load: HangingLoad) -> Iterator[Body]:
+    """The rope, straight down from the load point, and the load, its top at the rope's end; they do
+    not turn with the flange."""
+    if load.rope > 0:
+        foot = np.array([0.0, 0.0, -load.rope])
+        yield Body(capsule_between("rope", np.zeros(3), foot, load.rope_radius), HANGING, "rope")
+    lowered = pose_at([0.0, 0.0, -load.rope - support(load.solid, UP)])
+    yield Body(_moved(lowered, load.solid), HANGING, "load")
+
+
+def _moved(T: Array, solid: Solid) -> Solid:
+    return replace(solid, placement=T @ solid.placement)
+
+
+# Which bodies must keep apart, and how far: the pairs that collision checks look at.
+
+Rule = Literal["mounting_plane", "keep_out", "load_height", "obstacle", "self_collision"]
+RULES: tuple[Rule, ...] = get_args(Rule)
+FLOOR = "min_height"  # name of the half-space under the hanging load
+TOUCH = 1e-6  # m: a body this near to the load point holds the rope
+STANDING = 0.01  # m of joint 2 above z = 0 from which the base's frame is taken to be its foot
+THIN = 1e-3  # m: radius of links and tool points of which the cell states no bodies
+
+
+@dataclass(frozen=True)
+class Pair:
+    """`body` must stay `margin` m away from `other`, or the pose breaks `rule`."""
+
+    body: Body
+    other: Body | HalfSpace
+    margin: float
+    rule: Rule
+
+    @property
+    def hangs(self) -> bool:
+        return self.body.hangs or (isinstance(self.other, Body) and self.other.hangs)
+
+    @property
+    def names(self) -> tuple[str, str]:
+        return self.body.name, self.other.name
+
+
+def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair, ...]:
+    """Every moving body against every obstacle (`clearance`) and every half-space (no margin),
+    links and tool against the mounting plane, and the arm's bodies, carried bodies, rope and load
+    among themselves (`self_clearance`), except bodies of the same carrier, neighbouring links,
+    links that joints hold together whatever the pose, the rope with what holds it, and
+    `ignored_pairs`."""
+    workspace = cell.workspace
+    valid = [body.name for body in bodies] + [space.name for space in workspace.keep_out]
+    for name in sum(workspace.ignored_pairs, ()):
+        told = f"{cell.source}: [workspace] ignored_pairs names '{name}', but the cell has no such"
+        check_known(name, valid, f"{told} body", "valid:")
+    ignored = {frozenset(pair) for pair in workspace.ignored_pairs}
+    moving = [body for body in bodies if body.carrier != WORLD]
+    own = [body for body in bodies if body.kind != "obstacle"]
+    obstacles = [body for body in bodies if body.kind == "obstacle"]
+    pairs = [Pair(body, space, 0.0, "keep_out") for body in moving for space in workspace.keep_out]
+    plane = mounting_plane(cell, chain)
+    if plane is not None:
+        drawn = [*moving, *_outline(cell, chain, bodies)]
+        # What joint 1 turns stays at its height.
+        standing = [body for body in drawn if body.carrier > 0]
+        pairs += [Pair(body, plane, 0.0, "mounting_plane") for body in standing]
+    if (load := workspace.load) is not None and load.min_height is not None:
+        floor = HalfSpace(FLOOR, load.min_height * UP, UP)
+        pairs += [Pair(body, floor, 0.0, "load_height") for body in bodies if body.kind == "load"]
+    pairs += [Pair(b, o, workspace.clearance, "obstacle") for b in moving for o in obstacles]
+    if workspace.self_collision:
+        # The rope hangs from the bodies of the last link that contain or touch the load point.
+        last = [body for body in own if body.carrier == chain.n_joints - 1]
+        point = (chain.flange_placement @ [*cell.tool.load_point, 1.0])[:3]
+        holding = {body.name for body in last if touches(body.solid, point, TOUCH)}
+        pairs += [
+            Pair(b, a, workspace.self_clearance, "self_collision")
+            for a, b in combinations(own, 2)
+            if not _joined(a, b, workspace, chain, holding)
+        ]
+    return tuple(pair for pair in pairs if frozenset(pair.names) not in ignored)
+
+
+def mounting_plane(cell: Cell, chain: Chain) -> HalfSpace | None:
+    """The side of z = 0 of the base on which the arm is; None where it does not count.  It is known
+    where joint 1 turns about the base's z and joint 2 lies off the plane."""
+    asked, stated = cell.workspace.mounting_plane, cell.workspace
+    if asked is False or (asked is None and (stated.keep_out or stated.obstacles)):
+        return None
+    first = chain.joints[0]
+    upright = first.kind == "revolute" and abs((first.placement[:3, :3] @ first.axis)[2]) > 1 - 1e-6
+    height = float((first.placement @ chain.link_ends[0])[2, 3])
+    if upright and abs(height) > STANDING:
+        T = data_base(cell)
+        return HalfSpace("mounting plane", T[:3, 3], np.sign(height) * T[:3, 2])
+    if asked:
+        raise InputError(
+            f"{cell.source}: key workspace.mounting_plane is true, but the base's frame "
+            f"of robot '{chain.name}' does not stand on it: joint 1 does not turn about its z, or "
+            "joint 2 lies at z = 0; state the plane as [[workspace.keep_out]]"
+        )
+    return None
+
+
+def _outline(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> Iterator[Body]:
+    """Load point and markers, and the links as thin capsules where they have no bodies."""
+    if not any(body.kind == "arm" for body in bodies):
+        yield from skeleton(chain, (THIN,), data_base(cell), cell.name)
+    tool = {f"marker {name}": p for name, p in cell.tool.markers.items()}
+    for name, point in {"load point": cell.tool.load_point, **tool}.items():
+        placement = chain.flange_placement @ pose_at(point)
+        solid = Solid(name, "sphere", np.array([THIN]), placement)
+        yield Body(solid, chain.n_joints - 1, "carried")
+
+
+def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[str]) -> bool:
+    if a.carrier == b.carrier:
+        return True
+    if a.hangs or b.hangs:
+        hung, other = (a, b) if a.hangs else (b, a)
+        rope = workspace.load.rope if workspace.load is not None else 0.0
+        return other.name in holding and (hung.kind == "rope" or rope == 0)
+    if a.kind != "arm" or b.kind != "arm":
+        return False
+    i, j = sorted((a.carrier, b.carrier))
+    slides = any(chain.joints[k].kind == "prismatic" for k in range(i + 1, j + 1))
+    if j == i + 1 or workspace.urdf_geometry or slides:
+        return j == i + 1
+    # Links of a skeleton whose ends are never further apart than the links between are long are in
+    # contact at every pose, as in a spherical wrist.
+    between = chain.link_ends[i + 1 : j]
+    length = sum(float(np.linalg.norm(T[:3, 3])) for T in between)
+    return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance
+
 
 # Where everything stands in a batch of poses, from the chain's one symbolic description.
 
@@ -89,7 +489,6 @@ class Kinematics:
 # Manocha 2012).  The model is the chain on T_data_base, its universe the data's frame, with one
 # spherical joint more at the load point, which undoes the rotation of the last link.
 
-
 # m: at a margin of 0 coal takes bodies that lie symmetrically in each other for free, as their
 # distance is then 0 but for rounding.
 NOTHING = 1e-9
@@ -139,29 +538,16 @@ class Collisions:
         return found
 
 
-def hits_by_pair(
-    kinematics: Kinematics, pairs: Sequence[Pair], poses: Poses, extra: float = 0.0
-) -> dict[str, BoolArray]:
-    return {
-        " and ".join(pair.names): Collisions(kinematics, [pair]).hits(poses, extra)
-        for pair in pairs
-    }
-
-
 def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
     import pinocchio as pin
 
     model, parent = pin.Model(), 0
-    unaligned = {
-        "revolute": pin.JointModelRevoluteUnaligned,
-        "prismatic": pin.JointModelPrismaticUnaligned,
-    }
     for i, joint in enumerate(kinematics.chain.joints):
         placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
-        moving = unaligned[joint.kind](np.array(joint.axis))
-        parent = model.addJoint(parent, moving, _se3(placement), f"joint{i + 1}")
+        moving = getattr(pin, f"JointModel{joint.kind.capitalize()}Unaligned")(joint.axis.copy())
+        parent = model.addJoint(parent, moving, pin.SE3(np.array(placement)), f"joint{i + 1}")
     load_point = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
-    model.addJoint(parent, pin.JointModelSpherical(), _se3(pose_at(load_point)), "hanging")
+    model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(pose_at(load_point)), "hanging")
     for i in range(free):
         model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
     return model
@@ -182,14 +568,9 @@ def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> An
             shape, placement = coal_shape(item.solid), item.solid.placement
             fixed = {WORLD: 0, HANGING: kinematics.chain.n_joints + 1}
             joint = fixed.get(item.carrier, item.carrier + 1)
-        geometry.addGeometryObject(pin.GeometryObject(item.name, joint, _se3(placement), shape))
+        placed = pin.SE3(np.array(placement))
+        geometry.addGeometryObject(pin.GeometryObject(item.name, joint, placed, shape))
     return geometry
-
-
-def _se3(T: Array) -> Any:
-    import pinocchio as pin
-
-    return pin.SE3(np.array(T[:3, :3]), np.array(T[:3, 3]))
 
 
 # What the tracker sees: range, incidence on the reflector, free line of sight.
@@ -265,33 +646,10 @@ class Sight:
         return self._by_length[k]
 
 
-# Whether the load may hang: rope angle and static joint torques.
-
-
 def rope_angle(poses: Poses, axis: Array) -> Array:
-    """Angle (N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves
-    it."""
+    """Angle (N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves."""
     turned = poses.flange[:, :3, :3] @ (np.asarray(axis) / np.linalg.norm(axis))
     return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
-
-
-class StaticTorque:
-    """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest, V the
-    potential of force, link weights and gravity compensator at the rigid pose and nominal
-    values."""
-
-    def __init__(self, cell: Cell, chain: Chain) -> None:
-        kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
-        model = replace(cell.model, effects=kept, observe="position")
-        tool = replace(cell.tool, markers={"tool": np.zeros(3)})
-        symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
-        arm, nominal = symbolic.arm, ca.DM([p.nominal for p in symbolic.parameters])
-        torque = ca.gradient(arm.potential, arm.q_commanded)
-        torque = ca.substitute(torque, symbolic.p, nominal)
-        self._compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"]], [torque])
-
-    def __call__(self, poses: Poses) -> Array:
-        return self._compiled(poses.q, poses.force)[0][..., 0]
 
 
 # How far a body can move during a part of a joint interpolation, at most.

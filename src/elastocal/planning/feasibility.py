@@ -9,6 +9,7 @@ from functools import cached_property
 from itertools import pairwise, product
 from typing import Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csgraph
@@ -17,16 +18,21 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import Motion
 from elastocal.messages import InputError, InsufficientDataError, rounded, some
 from elastocal.model.chain import Chain, finite_ranges, joint_limits, told
-from elastocal.planning.bodies import RULES, Body, Pair, cell_bodies, cell_pairs
+from elastocal.model.effects.statics import GravityCompensator
+from elastocal.model.evaluate import BatchFunction
+from elastocal.model.symbolic import SymbolicArm
 from elastocal.planning.collision import (
     DOWN,
+    RULES,
+    Body,
     Collisions,
     Kinematics,
+    Pair,
     Paths,
     Poses,
     Sight,
-    StaticTorque,
-    hits_by_pair,
+    cell_bodies,
+    cell_pairs,
     incidence,
     marker_positions,
     rope_angle,
@@ -132,6 +138,15 @@ class Struck(Rule):
 POSE_SLACK = 1e-4  # m
 
 
+def hits_by_pair(
+    kinematics: Kinematics, pairs: Sequence[Pair], poses: Poses, extra: float = 0.0
+) -> dict[str, BoolArray]:
+    return {
+        " and ".join(pair.names): Collisions(kinematics, [pair]).hits(poses, extra)
+        for pair in pairs
+    }
+
+
 class KeepApart(Rule):
     """No pair of bodies nearer than its margin."""
 
@@ -207,6 +222,25 @@ class EnoughMarkers(Rule):
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         return dict(zip(self.markers, ~self.seen(poses).T, strict=True))
+
+
+class StaticTorque:
+    """τ = ∂V/∂q (N, n) in N m (N for a prismatic joint): what the joints bear at rest, V the
+    potential of force, link weights and gravity compensator at the rigid pose and nominal
+    values."""
+
+    def __init__(self, cell: Cell, chain: Chain) -> None:
+        kept = tuple(e for e in cell.model.effects if e.name == GravityCompensator.name)
+        model = replace(cell.model, effects=kept, observe="position")
+        tool = replace(cell.tool, markers={"tool": np.zeros(3)})
+        symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
+        arm, nominal = symbolic.arm, ca.DM([p.nominal for p in symbolic.parameters])
+        torque = ca.gradient(arm.potential, arm.q_commanded)
+        torque = ca.substitute(torque, symbolic.p, nominal)
+        self._compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"]], [torque])
+
+    def __call__(self, poses: Poses) -> Array:
+        return self._compiled(poses.q, poses.force)[0][..., 0]
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,8 @@ from elastocal.model.effects.catalogue import choose_effects
 from elastocal.model.effects.geometry import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import Postures, inverse_kinematics
-from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import sobol
+from elastocal.planning.collision import data_base
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable
 from elastocal.tables import NO_UNIT, Columns, Family, read_table

@@ -21,8 +21,14 @@ from elastocal.messages import ElastocalError, load_text, printable, require
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.planning.bodies import cell_bodies, hull, outward, skeleton, urdf_bodies
-from elastocal.planning.collision import Kinematics
+from elastocal.planning.collision import (
+    Kinematics,
+    cell_bodies,
+    hull,
+    outward,
+    skeleton,
+    urdf_bodies,
+)
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks as say
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from elastocal.messages import listed, option, printable, rounded, some
-from elastocal.planning.bodies import mounting_plane
+from elastocal.planning.collision import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Reason, load_name

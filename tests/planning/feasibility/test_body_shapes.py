@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Solid
 from elastocal.messages import InputError
-from elastocal.planning.bodies import mesh_hull, support, touches
+from elastocal.planning.collision import mesh_hull, support, touches
 
 CUBE = """v 0 0 0
 v 1 0 0

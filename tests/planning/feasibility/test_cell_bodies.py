@@ -10,7 +10,7 @@ from elastocal.cell import CarriedBody, Workspace
 from elastocal.cell_tables import Robot
 from elastocal.messages import InputError
 from elastocal.model.urdf import read_urdf
-from elastocal.planning.bodies import WORLD, cell_bodies, hull
+from elastocal.planning.collision import WORLD, cell_bodies, hull
 
 
 def named(workspace, chain=KR270_CHAIN, **changes):

@@ -24,8 +24,7 @@ from planning.feasibility.test_margins_of_pairs import kr270_cell
 
 from elastocal.cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.cell_tables import Tool
-from elastocal.planning.bodies import Body, coal_shape
-from elastocal.planning.collision import Collisions, MotionBound
+from elastocal.planning.collision import Body, Collisions, MotionBound, coal_shape
 from elastocal.planning.feasibility import Feasibility
 
 BALL = Workspace(bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),), clearance=0.05)

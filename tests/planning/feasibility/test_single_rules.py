@@ -27,8 +27,8 @@ from support.design_cells import plan_cell
 from elastocal.cell import HalfSpace, HangingLoad, Visibility, Workspace
 from elastocal.cell_tables import EffectChoice, Tool, Tracker
 from elastocal.messages import InputError
-from elastocal.planning.collision import Kinematics, StaticTorque
-from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.collision import Kinematics
+from elastocal.planning.feasibility import Feasibility, StaticTorque
 
 EYE = Tracker(position=np.array([3.0, 0.0, 0.0]))
 MARKER = Tool(markers={"M1": np.zeros(3)})
