@@ -23,11 +23,10 @@ from elastocal.messages import InputError, did_you_mean, listed, option, quoted,
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.base import row_inputs
-from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
+from elastocal.model.effects.catalogue import CATALOGUE, Total, cell_of, effect_of
 from elastocal.model.effects.statics import LinkGravity
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model, smooth_groups
-from elastocal.model.symbolic import Total
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"

@@ -29,11 +29,10 @@ from elastocal.model.effects.base import (
     index,
     row_inputs,
 )
-from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
+from elastocal.model.effects.catalogue import CATALOGUE, SymbolicArm, cell_of, effect_of
 from elastocal.model.effects.geometry import DistanceSensor
 from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
-from elastocal.model.symbolic import SymbolicArm
 from elastocal.units import Array, IntArray
 
 

@@ -18,9 +18,9 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import Motion
 from elastocal.messages import InputError, InsufficientDataError, rounded, some
 from elastocal.model.chain import Chain, finite_ranges, joint_limits, told
+from elastocal.model.effects.catalogue import SymbolicArm
 from elastocal.model.effects.statics import GravityCompensator
 from elastocal.model.evaluate import BatchFunction
-from elastocal.model.symbolic import SymbolicArm
 from elastocal.planning.collision import (
     DOWN,
     RULES,

@@ -27,7 +27,7 @@ from elastocal import __version__
 from elastocal.files import atomic_write, open_input
 from elastocal.messages import InsufficientDataError, require
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.model.symbolic import configuration_rows
+from elastocal.model.effects.catalogue import configuration_rows
 from elastocal.planning.candidates import CHUNK, JointSpace, draw, points
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
