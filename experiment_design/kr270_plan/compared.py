@@ -16,14 +16,13 @@ from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import draw, shares_of
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, plan_forces
 from elastocal.planning.plan import Plan
+from elastocal.planning.poses import draw, shares_of, test_poses
 from elastocal.planning.search import Checkpoint
 from elastocal.planning.setup import set_up
-from elastocal.planning.test_poses import test_poses
 from elastocal.simulation import published_compliances, simulate, values_from
 
 HERE = Path(__file__).parent

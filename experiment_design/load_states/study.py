@@ -29,12 +29,11 @@ from elastocal.cell_tables import (
     Tracker,
 )
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import draw
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Known, plan_forces
+from elastocal.planning.poses import draw, test_poses
 from elastocal.planning.relaxation import relax
 from elastocal.planning.setup import set_up, single_ways
-from elastocal.planning.test_poses import test_poses
 
 HERE = Path(__file__).parent
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")

@@ -188,8 +188,8 @@ def design_request(
     """
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.model.manipulator import Model
-    from elastocal.planning.candidates import read_pins, shares_of
     from elastocal.planning.design import DesignOptions
+    from elastocal.planning.poses import read_pins, shares_of
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
     search = {name: asked.pop(name) for name in ("effort", "seed", "jobs") if name in asked}
@@ -498,7 +498,7 @@ def identify(
     options = replace(options, constraints=constraints, prior=prior)
     used = None
     if made.cell.design.states_test_poses:
-        from elastocal.planning.test_poses import test_poses
+        from elastocal.planning.poses import test_poses
 
         used = test_poses(made.cell, made.chain)
     return run(made, table, options, kept_back, tell, used)

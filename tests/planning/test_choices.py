@@ -17,8 +17,8 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import Freedom, Motion, PolarNoise, TargetPose
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
+from elastocal.planning import poses as target_poses
 from elastocal.planning import setup
-from elastocal.planning import test_poses as target_poses
 from elastocal.planning.information import Known
 from elastocal.planning.plan import TimedSize
 from elastocal.planning.setup import Choice, _minutes, _sizes, at_stops

@@ -10,9 +10,9 @@ import pytest
 from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import plan_cell, setup_of
 
-from elastocal.planning.candidates import joint_space
 from elastocal.planning.feasibility import Feasibility, Unreachable
 from elastocal.planning.plan import Certificate
+from elastocal.planning.poses import joint_space
 from elastocal.planning.search import EFFORTS, Checkpoint, Search, Searches, ordered
 from elastocal.planning.setup import FeasiblePool
 

@@ -18,7 +18,7 @@ from elastocal.cell_tables import PolarNoise
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.planning import test_poses as target_poses
+from elastocal.planning import poses as target_poses
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Plan
 from elastocal.simulation import expand_plan, simulate

@@ -22,9 +22,9 @@ from elastocal.messages import InsufficientDataError
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning import test_poses as target_poses
+from elastocal.planning import poses as target_poses
 from elastocal.planning.information import Known, PoseInformation
-from elastocal.planning.test_poses import TargetPoses, prediction_rows
+from elastocal.planning.poses import TargetPoses, prediction_rows
 from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()

@@ -26,9 +26,9 @@ from elastocal.cell_tables import (
     Tool,
 )
 from elastocal.messages import InputError
-from elastocal.planning import test_poses as target_poses
-from elastocal.planning.candidates import joint_space
-from elastocal.planning.test_poses import DEFAULT_COUNT, TargetPoses, check_cell
+from elastocal.planning import poses as target_poses
+from elastocal.planning.design import check_cell
+from elastocal.planning.poses import DEFAULT_COUNT, TargetPoses, joint_space
 
 CHAIN = kr270_chain()
 LOADS = np.array([[0.0, 0, 0], [0, 0, -2600], [0, 900, -2600]])

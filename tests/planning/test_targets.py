@@ -18,8 +18,8 @@ from elastocal.messages import InsufficientDataError
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import Parameter
 from elastocal.model.manipulator import Model
-from elastocal.planning import test_poses as target_poses
-from elastocal.planning.test_poses import TargetPoses, prediction_rows
+from elastocal.planning import poses as target_poses
+from elastocal.planning.poses import TargetPoses, prediction_rows
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

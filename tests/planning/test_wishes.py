@@ -17,14 +17,14 @@ from elastocal.cell import Solid, Workspace
 from elastocal.cell_tables import Motion, TargetPose
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
-from elastocal.planning import test_poses as target_poses
+from elastocal.planning import poses as target_poses
 from elastocal.planning.design import DesignOptions, _Design
 from elastocal.planning.information import Known
 from elastocal.planning.plan import Plan
+from elastocal.planning.poses import ELSEWHERE, everywhere
 from elastocal.planning.relaxation import exact_plan, relax
 from elastocal.planning.search import Checkpoint
 from elastocal.planning.setup import Setup, set_up, share_within
-from elastocal.planning.test_poses import ELSEWHERE, everywhere
 
 CHAIN = kr270_chain()
 Q = random_poses(CHAIN, 60, seed=5)

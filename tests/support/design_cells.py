@@ -17,10 +17,10 @@ from elastocal.cell_tables import CartesianNoise, DesignSpec, Tool, Tracker
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.manipulator import Model
-from elastocal.planning import test_poses as target_poses
+from elastocal.planning import poses as target_poses
 from elastocal.planning.information import Known
+from elastocal.planning.poses import TargetPoses
 from elastocal.planning.setup import Setup, set_up
-from elastocal.planning.test_poses import TargetPoses
 
 AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))
 FULL = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")

@@ -179,7 +179,7 @@ def design(
     """
     from elastocal.files import atomic_write
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.planning.candidates import plan_and_names
+    from elastocal.planning.poses import plan_and_names
     from elastocal.report.arm_view import write_plan_picture
     from elastocal.report.renderers import print_report
     from elastocal.saving import beside, save_plan

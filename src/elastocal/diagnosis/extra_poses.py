@@ -26,9 +26,9 @@ from elastocal.measurements import Measurements, visits, with_moves
 from elastocal.messages import InsufficientDataError, counted, option, rounded
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.observations import observe
-from elastocal.planning.candidates import draw
 from elastocal.planning.execution import nearest_first
 from elastocal.planning.feasibility import Feasibility, travel_times
+from elastocal.planning.poses import draw
 from elastocal.simulation import simulate
 from elastocal.units import Array, BoolArray, Progress
 

@@ -29,11 +29,10 @@ from elastocal.measurements import Measurements
 from elastocal.messages import InsufficientDataError, length, option
 from elastocal.messages import require as check
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import shares_of
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
-from elastocal.planning.test_poses import test_poses
+from elastocal.planning.poses import shares_of, test_poses
 from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.

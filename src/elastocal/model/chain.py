@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sized
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, TypeVar
@@ -133,6 +133,27 @@ def beyond_limits(
     name = f"joint{j + 1} ({chain.joints[j].name})"
     rows = np.flatnonzero(beyond.any(axis=1))
     return rows, j, f"{name} at {at} is beyond its limits, {low} to {high}"
+
+
+def check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -> None:
+    check_numbers(chain, key, q, degrees)
+    if (beyond := beyond_limits(cell, chain, q[None])) is not None:
+        raise InputError(f"{key}: {beyond[2]}; correct the posture or the limits")
+
+
+def check_numbers(chain: Chain, key: str, found: Sized, degrees: bool, one: bool = False) -> None:
+    n, own = chain.n_joints, key.rpartition(": key ")[2]
+    require(
+        len(found) == n or (one and len(found) == 1),
+        f"{key} has {len(found)} numbers, but robot '{chain.name}' has {n} joints; "
+        f"give {n} numbers{' or one for all' if one else ''}",
+    )
+    for k, kind in enumerate(chain.kinds if degrees else ()):
+        require(
+            kind != "prismatic",
+            f"{key} gives degrees, but joint{k + 1} ({chain.joints[k].name}) is prismatic; use "
+            f"{own.replace('deg_per_s', 'si').replace('_deg', '_si')}, in rad and m",
+        )
 
 
 def joint_index(name: str) -> int:

@@ -32,18 +32,18 @@ from elastocal.messages import (
     rounded,
     wish,
 )
+from elastocal.model.chain import (
+    LIMIT_SLACK,
+    Chain,
+    check_numbers,
+    check_posture,
+    joint_index,
+    joint_limits,
+    told,
+)
+from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import (
-    Candidates,
-    Pins,
-    brought,
-    check_available,
-    draw,
-    joint_space,
-    poses_of,
-    shares_of,
-)
 from elastocal.planning.criteria import CRITERIA, criterion_named
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import (
@@ -64,6 +64,19 @@ from elastocal.planning.plan import (
     PlanSize,
     predicted,
     reasons,
+)
+from elastocal.planning.poses import (
+    Candidates,
+    Pins,
+    TargetPoses,
+    brought,
+    check_available,
+    draw,
+    everywhere,
+    joint_space,
+    poses_of,
+    shares_of,
+    test_poses,
 )
 from elastocal.planning.relaxation import DesignProblem, prospects, sized_plans
 from elastocal.planning.search import (
@@ -88,7 +101,6 @@ from elastocal.planning.setup import (
     share_within,
     within,
 )
-from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
@@ -538,3 +550,32 @@ def _check_criterion(model: Model) -> None:
     for name in names:
         told = f"{wish('combination', f'{where}: [design] combination')} names {quoted(name)}"
         check_known(name, model.names, f"{told}, which is no parameter of the model")
+
+
+# Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
+
+
+def check_cell(cell: Cell, chain: Chain) -> None:
+    where, motion = cell.source, cell.design.motion
+    lower, upper = joint_limits(cell, chain)
+    levels = wish("levels", f"{where}: [design.levels]")
+    for joint, values in cell.design.levels.items():
+        i, split = joint_index(joint), cell.model.compliance_levels.get(joint)
+        for value in values:
+            found = f"{levels} has {joint} at {told(chain, i, value)}"
+            require(
+                lower[i] - LIMIT_SLACK <= value <= upper[i] + LIMIT_SLACK,
+                f"{found}, beyond its limits, {told(chain, i, lower[i])} to "
+                f"{told(chain, i, upper[i])}; correct the level or the limits",
+            )
+            require(
+                split is None or min(abs(value - s) for s in split) <= LEVEL_TOLERANCE,
+                f"{found}, which is none of its levels in [model.compliance_levels]; give both "
+                "the same levels",
+            )
+    if motion.speed is not None:
+        key = f"{where}: key design.motion.speed_" + ("deg_per_s" if motion.degrees else "si")
+        check_numbers(chain, key, motion.speed, motion.degrees, one=motion.degrees)
+    if motion.home is not None:
+        key = f"{where}: key design.motion.home_{'deg' if motion.degrees else 'si'}"
+        check_posture(cell, chain, key, motion.home, motion.degrees)

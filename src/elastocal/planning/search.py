@@ -28,11 +28,11 @@ from elastocal.files import atomic_write, open_input
 from elastocal.messages import InsufficientDataError, require
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import configuration_rows
-from elastocal.planning.candidates import CHUNK, JointSpace, draw, points
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility, Roadmap, Unreachable, travel_times
 from elastocal.planning.plan import Certificate
+from elastocal.planning.poses import CHUNK, JointSpace, draw, points
 from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, prospects
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress

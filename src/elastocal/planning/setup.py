@@ -25,7 +25,6 @@ from elastocal.model.chain import joint_index
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.candidates import Candidates, draw, shares_of, sobol
 from elastocal.planning.criteria import (
     CRITERIA,
     CriterionInputs,
@@ -58,8 +57,15 @@ from elastocal.planning.plan import (
     predicted,
     remaining_rms,
 )
+from elastocal.planning.poses import (
+    Candidates,
+    TargetPoses,
+    draw,
+    known_rows,
+    shares_of,
+    sobol,
+)
 from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, prospects, relax
-from elastocal.planning.test_poses import TargetPoses, known_rows
 from elastocal.simulation import expand_plan, simulate
 from elastocal.units import Array, BoolArray, IntArray, Progress
 

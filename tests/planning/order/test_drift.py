@@ -13,10 +13,10 @@ from elastocal.cell_tables import Motion, Unsteadiness
 from elastocal.identification.noise_structure import course_waves
 from elastocal.messages import InputError
 from elastocal.planning import execution as drift_module
-from elastocal.planning import test_poses as target_poses
+from elastocal.planning import poses as target_poses
 from elastocal.planning.execution import DRIFT, Alias, schedule, turns
 from elastocal.planning.plan import Plan
-from elastocal.planning.test_poses import prediction_rows
+from elastocal.planning.poses import prediction_rows
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
 RNG = np.random.default_rng(1)

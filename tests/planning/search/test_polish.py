@@ -14,10 +14,10 @@ from support.calibration import cell_of, planar_chain
 from elastocal.cell import HalfSpace, Solid, Workspace
 from elastocal.cell_tables import CartesianNoise, DesignSpec, Nominal, Tracker
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, ScenarioCriterion
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
+from elastocal.planning.poses import Candidates, JointSpace, draw, joint_space
 from elastocal.planning.relaxation import DesignProblem, relax
 from elastocal.planning.search import JointSearch, Searches, estimate, polish
 from elastocal.planning.setup import FeasiblePool, Setup

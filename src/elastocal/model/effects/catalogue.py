@@ -1,5 +1,5 @@
-"""The catalogue of effects, built in and registered; and the symbolic arm that those of a cell make:
-effects on the chain, expressions, static equilibrium, B of a pose.
+"""The catalogue of effects (built in, registered), and the symbolic arm that a cell's effects make
+of a chain: expressions, static equilibrium, B of a pose.
 
 An effect is known by its name everywhere; what else other modules must know of it they ask it: see
 the traits of `base.Effect`.  A new one is a class in the room of its stage and a line below, or a
