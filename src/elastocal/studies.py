@@ -89,7 +89,7 @@ class StudyFile(Table):
     options: dict[str, Any] = Field({}, description="a table: write [options]")
     columns: Annotated[dict[str, str], Field(min_length=1)] = Field(
         description='the unit of what run() returns, as in rms_um = "µm" ("" for none, or text, '
-        "yes/no, count)",
+        "yes/no, count)"
     )
 
 

@@ -24,11 +24,7 @@ from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometry, MarkerPosition
-from elastocal.model.effects.statics import (
-    JointCompliance,
-    feels_weight,
-    usual_over_stated_mass,
-)
+from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load

@@ -57,14 +57,7 @@ from elastocal.planning.plan import (
     predicted,
     remaining_rms,
 )
-from elastocal.planning.poses import (
-    Candidates,
-    TargetPoses,
-    draw,
-    known_rows,
-    shares_of,
-    sobol,
-)
+from elastocal.planning.poses import Candidates, TargetPoses, draw, known_rows, shares_of, sobol
 from elastocal.planning.relaxation import DesignProblem, Relaxed, exact_plan, prospects, relax
 from elastocal.simulation import expand_plan, simulate
 from elastocal.units import Array, BoolArray, IntArray, Progress

@@ -36,12 +36,7 @@ from elastocal.model.effects.base import (
     joints,
     links,
 )
-from elastocal.model.effects.statics import (
-    TorqueEffect,
-    add_deflection,
-    rated_torque,
-    torque_scale,
-)
+from elastocal.model.effects.statics import TorqueEffect, add_deflection, rated_torque, torque_scale
 
 KEYS = ("x", "y", "z", "rx", "ry", "rz")
 

@@ -13,7 +13,7 @@ import numpy as np
 from elastocal.cell import Cell
 from elastocal.messages import require, rounded
 from elastocal.model import rigid
-from elastocal.model.chain import Chain, extent, finite_ranges
+from elastocal.model.chain import Chain, extent
 from elastocal.model.effects.base import (
     SHORTEST,
     STIFFNESS,
@@ -319,9 +319,7 @@ def levers(chain: Chain, q: ca.SX, j: int) -> ca.SX:
 def _levers_at(chain: Chain, j: int) -> Array:
     """`levers` of joint j in random poses (POSES, functions, 3)."""
     q = ca.SX.sym("q", chain.n_joints)
-    limits = np.array([[joint.lower, joint.upper] for joint in chain.joints]).T
-    low, high = finite_ranges(chain, *limits)
-    at = np.random.default_rng(0).uniform(low, high, (POSES, chain.n_joints))
+    at = rigid.drawn_joints(chain)[2][:POSES]
     return np.asarray(BatchFunction([q], [levers(chain, q, j)])(at)[0])
 
 
