@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.tracker_exports import imported
 
-from elastocal.importing.joining import dwells
+from elastocal.importing.assemble import dwells
 from elastocal.messages import InputError
 
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))

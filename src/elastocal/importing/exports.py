@@ -1,17 +1,15 @@
-"""Exported files of unknown origin: encodings, tables and robot programs in them, and their rows as
-a mapping reads them: numbers in units, texts and times."""
+"""Exported files of unknown origin: encodings, tables and robot programs in them; their rows as a
+mapping reads them, in numbers, texts and times, and what a row stands for."""
 
 from __future__ import annotations
 
 import codecs
 import csv
-import math
 import re
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -20,10 +18,22 @@ import numpy as np
 
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
-from elastocal.importing.mapping_file import ColumnKey, SourceTable, TextSourceKeys, UnitsTable
-from elastocal.messages import ElastocalError, InputError, listed, plain_minus, quoted
-from elastocal.tables import MAX_LINE, NUMBER, THOUSANDS, column, first_bad_cell
-from elastocal.units import FACTORS, Array, IntArray, convert, known_unit, quantities
+from elastocal.importing.mapping_file import (
+    ColumnKey,
+    LoadStatesTable,
+    NamesTable,
+    NumberCells,
+    SourceTable,
+    TextSourceKeys,
+    UnitsTable,
+    compiled,
+    seconds_of,
+    unit_in_comments,
+)
+from elastocal.messages import ElastocalError, InputError, did_you_mean, is_label, listed, quoted
+from elastocal.model.effects.statics import STANDARD_GRAVITY
+from elastocal.tables import MAX_LINE, NUMBER, column
+from elastocal.units import FACTORS, Array, IntArray, convert, quantities
 
 MAX_BYTES = 300_000_000
 SAVE_AS = "set encoding in [source.text], or export as UTF-8"
@@ -36,9 +46,6 @@ SAMPLE = 200  # lines that decide on the delimiter, and in which a header is loo
 SHOWN = 120
 
 Line = tuple[int, list[str]]  # its number and cells
-
-MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
-ISO = "ISO 8601"
 
 
 def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str]:
@@ -80,28 +87,6 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
         with suppress(UnicodeDecodeError):
             return data.decode(codec), name
     return data.decode("latin-1"), "Latin-1"
-
-
-def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:
-    """What the group `unit` of `pattern` finds in the first comment that it matches."""
-    if pattern is None:
-        return None
-    expression = compiled(where, "unit_comment", pattern)
-    if "unit" not in expression.groupindex:
-        raise InputError(
-            f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
-            "that is the unit so"
-        )
-    found = (match["unit"] for text in comments if (match := expression.search(text)))
-    return next((unit for unit in found if unit and known_unit(unit)), None)
-
-
-def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
-    try:
-        return re.compile(pattern)
-    except re.error as error:
-        what = f"{key} = {quoted(pattern)} is no regular expression: {error}"
-        raise InputError(f"{where}: {what}") from None
 
 
 @dataclass(frozen=True)
@@ -237,84 +222,6 @@ def _by_numbers(content: Numbered) -> list[str]:
     found = {delimiter: numbers(delimiter) for delimiter in DELIMITER_NAMES}
     found["space"] *= not found["tab"]  # between tabs blanks are part of names
     return sorted(found, key=lambda delimiter: found[delimiter], reverse=True)
-
-
-# A number in any style, and blanks and apostrophes in it as office programs write them.
-_STYLED = re.compile(f"{NUMBER.pattern}|{THOUSANDS.pattern}")
-_PLAIN = str.maketrans("\u00a0\u202f\u2009\u2019", "   '")
-
-
-class NumberCells:
-    """How the numbers of one file are written."""
-
-    def __init__(
-        self, decimal: str, thousands: str, missing: Sequence[str], sample: Iterable[str]
-    ) -> None:
-        self.thousands = "" if thousands == "none" else thousands
-        self.missing = {*MISSING, *(text.strip().casefold() for text in missing)}
-        self.decimal = decimal
-        if decimal == "auto":
-            bare = [text for cell in sample if _STYLED.fullmatch(text := self._bare(cell))]
-            # Where a cell has both, the last is the decimal mark and the other is told as wrong.
-            both = next((cell for cell in bare if "." in cell and "," in cell), None)
-            points, commas = (any(mark in cell for cell in bare) for mark in ".,")
-            usual = "," if commas and not points else "."
-            self.decimal = max(".,", key=both.rfind) if both else usual
-
-    def _bare(self, cell: str) -> str:
-        text = cell.strip()
-        text = text if text.isascii() else plain_minus(text).translate(_PLAIN)
-        return text.replace(self.thousands, "") if self.thousands else text
-
-    def looks_numeric(self, cell: str) -> bool:
-        bare = self._bare(cell)
-        return bool(NUMBER.fullmatch(bare)) or bare.casefold() in self.missing - {""}
-
-    def value(self, source: str, line: int, header: str, cell: str) -> float | None:
-        """The number, None for a cell without a value."""
-        text = self._bare(cell)
-        if text.casefold() in self.missing:
-            return None
-        own = ("," if self.decimal == "." else ".") not in text and NUMBER.fullmatch(text)
-        if own and math.isfinite(number := float(text.replace(",", "."))):
-            return number
-        others = [mark for mark in ",.' " if mark in text and mark != self.decimal]
-        if others and _STYLED.fullmatch(text):
-            raise InputError(
-                f"{source}, line {line}, column {header}: {quoted(cell)} has "
-                f"{' and '.join(map(quoted, others))} in it, but the file is read with decimal "
-                f"{'points' if self.decimal == '.' else 'commas'}; set decimal or thousands in "
-                "[source.text]"
-            )
-        found = first_bad_cell(source, [(line, [text])], {0: header}, True)
-        raise InputError(
-            f"{found}, or list it in missing if it means no value, or pass over such lines with "
-            "ignore, both in [source.text]"
-        )
-
-
-def seconds_of(
-    source: str, lines: Sequence[int], texts: Sequence[str], formats: Sequence[str]
-) -> list[float]:
-    """Seconds since 1970 (UTC) of the times of a column; one without a zone is taken as UTC.
-
-    The first of `formats` (strptime, or ISO 8601) that reads the first text reads all.
-    """
-    chosen, found = [*formats, ISO], list[float]()
-    for line, text in zip(lines, texts, strict=True):
-        t = " ".join(text.split())
-        for form in chosen:
-            with suppress(ValueError, OverflowError):
-                read = datetime.fromisoformat(t) if form == ISO else datetime.strptime(t, form)
-                found.append((read if read.tzinfo else read.replace(tzinfo=UTC)).timestamp())
-                chosen = [form]
-                break
-        else:
-            raise InputError(
-                f"{source}, line {line}: {quoted(text)} is no time of the form "
-                f"{' or '.join(chosen)}; set time_format in [[source]]"
-            )
-    return found
 
 
 KRL_AXES = tuple(f"{letter}{i}" for letter in "AE" for i in range(1, 7))
@@ -640,3 +547,241 @@ def likely_presets(path: Path) -> list[str]:
             with suppress(ElastocalError):
                 rows[name] = len(read_records(where, path, source, mapping.units))
     return [name for name, n in rows.items() if n == max(rows.values())]
+
+
+# What a row stands for: its position, its labels, its load.
+
+HEIGHT = ("zenith", "elevation")
+SPHERICAL = ("range", "azimuth", *HEIGHT)
+
+
+def with_positions(records: Records, clockwise: bool = False) -> Records:
+    """The records with x, y, z, where the file has spherical coordinates.
+
+    With range d, azimuth α and zenith angle ζ (π/2 − elevation), in a right-handed frame with z up
+    and x at azimuth zero:
+
+        x = d sin ζ cos α,   y = d sin ζ sin α,   z = d cos ζ
+
+    α counts counterclockwise seen from above; where `clockwise`, as theodolites count, y has the
+    other sign.  Readings in the second face, ζ beyond 180° with α turned by 180°, come out right.
+    """
+    found = [stem for stem in SPHERICAL if stem in records.numbers]
+    both = [stem for stem in "xyz" if stem in records.numbers]
+    heights = [stem for stem in HEIGHT if stem in found]
+    missing = [stem for stem in ("range", "azimuth") if stem not in found]
+    missing += [] if heights else ["zenith or elevation"]
+    if not found:
+        return records
+    if both:
+        raise InputError(
+            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
+            f"{listed(found)}; keep one of the two in [source.columns]"
+        )
+    if len(heights) > 1:
+        raise InputError(
+            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
+            "gives (a level line has zenith 90° and elevation 0°)"
+        )
+    if missing:
+        raise InputError(
+            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
+            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
+        )
+    height, numbers = heights[0], dict(records.numbers)
+    d = numbers.pop("range")
+    alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
+    if not (d > 0).all():
+        i = int(np.argmin(d > 0))
+        raise InputError(
+            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
+            "positive: correct the line, or the column of range in [source.columns]"
+        )
+    low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
+    off = (angle < low) | (angle > high)
+    if off.any():
+        i = int(np.argmax(off))
+        raise InputError(
+            f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
+            f"{high:g}°; is it an angle of another unit, or {other}_deg?"
+        )
+    zeta = np.radians(angle if height == "zenith" else 90.0 - angle)
+    level = d * np.sin(zeta)
+    y = level * np.sin(alpha)
+    numbers |= {"x": level * np.cos(alpha), "y": -y if clockwise else y, "z": d * np.cos(zeta)}
+    kept = {stem: unit for stem, unit in records.units.items() if stem not in SPHERICAL}
+    return replace(records, numbers=numbers, units=kept | dict.fromkeys("xyz", "mm"))
+
+
+GROUPS = ("configuration", "marker", "repeat", "load")
+NAMED = "write pattern in [source.names]"
+
+
+def with_labels(where: str, records: Records, names: NamesTable) -> Records:
+    """The records with the texts of GROUPS, from columns and, where a pattern is given, from names.
+
+    A group that a column gives too is taken from the column.  A name that no pattern matches is
+    an error, or with unmatched = "ignore" passed over and listed.
+    """
+    if names.pattern is not None and "name" in records.texts:
+        records = _with_names_read(where, records, names)
+    labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
+    if "marker" in labels:
+        labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
+    if names.in_order and "marker" not in labels:
+        n = len(names.in_order)
+        labels["marker"] = [names.in_order[i % n] for i in range(len(records))]
+        if len(records) % n:
+            raise InputError(
+                f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
+                f"{listed(names.in_order)} of in_order; a point is missing or one too many: name "
+                "the points"
+            )
+    for stem, texts in labels.items():
+        for i, text in enumerate(texts):
+            if not is_label(text):
+                raise InputError(
+                    f"{records.where(i)}: {stem} {quoted(text)} cannot stand in a table; correct "
+                    f"the name, or {NAMED}"
+                )
+    return replace(records, texts=records.texts | labels)
+
+
+def _with_names_read(where: str, records: Records, names: NamesTable) -> Records:
+    named = records.texts["name"]
+    patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
+    expressions = [compiled(where, "pattern", text) for text in patterns]
+    for expression in expressions:
+        if not set(expression.groupindex) & set(GROUPS):
+            raise InputError(
+                f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
+                f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
+            )
+    matches = [next((m for e in expressions if (m := e.search(n))), None) for n in named]
+    groups = [match.groupdict() if match else {} for match in matches]
+    bad = [i for i, match in enumerate(matches) if match is None]
+    if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
+        more = {1: "", 2: ", nor does 1 other"}.get(len(bad), f", nor do {len(bad) - 1} others")
+        raise InputError(
+            f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
+            f'({listed(map(quoted, patterns), 3)}){more}; {NAMED}, or unmatched = "ignore" to '
+            "leave such points out"
+        )
+    found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}
+    present = {stem: texts for stem, texts in found.items() if any(texts)}
+    for stem, texts in present.items():
+        empty = [i for i, text in enumerate(texts) if not text and matches[i]]
+        if empty and stem in ("configuration", "marker"):
+            raise InputError(
+                f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "
+                f"others do; {NAMED} that finds it in every name"
+            )
+        if empty:
+            default = "0" if stem == "repeat" else "none"
+            present[stem] = [text or default for text in texts]
+    reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
+    good = np.setdiff1d(np.arange(len(records)), bad)
+    kept = replace(records, texts=present | records.texts).take(good)
+    ignored = tuple(sorted([*records.understood["ignored"], *reasons]))
+    return replace(kept, understood=kept.understood | {"rows": len(kept), "ignored": ignored})
+
+
+UNLOADED = ("none", "unloaded", "0")
+
+
+def forces_of(
+    where: str, points: Records, loads: Mapping[str, Array | LoadStatesTable]
+) -> Array | None:
+    """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
+
+    A mass m hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as
+    "2600 N" or "2.5 kg", unless [loads] has it.  The names none, unloaded and 0 mean no force
+    unless [loads] says otherwise.
+    """
+    named = points.texts.get("load")
+    if named is None:
+        if loads and not points.forces:
+            raise InputError(
+                f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
+                "to; give load in [[source]], or a group (?P<load>…) in a pattern"
+            )
+        return None
+    if points.forces:
+        raise InputError(
+            f"{points.source}: the load is stated by name and in columns {listed(points.forces)}; "
+            "keep one"
+        )
+    known = {name: np.zeros(3) for name in UNLOADED}
+    for name, stated in loads.items():
+        if isinstance(stated, LoadStatesTable):
+            stated = np.array([0.0, 0.0, -stated.mass_kg * STANDARD_GRAVITY])
+        known[name] = stated + 0.0  # no -0.0
+    for i, name in enumerate(named):
+        if name not in known and (size := load_in(name)):
+            known[name] = np.array([0.0, 0.0, 0.0 - size[1]])
+        if name not in known:
+            raise InputError(
+                f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
+                f"{did_you_mean(name, known)}; there are {listed(known)}: add "
+                f"{name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
+            )
+    return np.array([known[name] for name in named])
+
+
+# A load in a file's name: log_2600N, payload_2p5kg, load2.6kN.  A number that follows a letter is a
+# load only after a word for one; a small n counts something.
+_SIZE = re.compile(
+    r"(?:(?<![A-Za-z0-9.,])|(?<=load)|(?<=mass)|(?<=weight))(\d+(?:[.,p]\d+)?)[ _-]?"
+    r"([kK][gG]|kN|N)(?![A-Za-z0-9])"
+)
+_WORD = re.compile(r"(?<!un)(?<!no)(?<!without)[ _-]?(?:pay)?load(?:ed)?(?![a-z])|weight", re.I)
+_NEWTONS = {"kg": STANDARD_GRAVITY, "kn": 1e3, "n": 1.0}
+
+
+def load_in(text: str) -> tuple[str, float] | None:
+    """The load that a text states, as it is written and in N; None where none is."""
+    found = _SIZE.search(text)
+    if found is None:
+        return None
+    size = float(re.sub("[,p]", ".", found[1]))
+    return f"{size:g} {found[2]}", size * _NEWTONS[found[2].lower()]
+
+
+def with_loads_of_names(
+    by_role: Mapping[str, list[Records]], loads: Mapping[str, Any]
+) -> tuple[dict[str, list[Records]], list[str]]:
+    """The records with the loads that their files are named for, where nothing else states any, and
+    what to tell.  They hang straight down."""
+    made, every = dict(by_role), [r for role in by_role.values() for r in role]
+    if loads or any(r.load or "load" in r.texts or r.forces for r in every):
+        return made, []
+    named = {r.source: load_in(Path(r.source).stem) for r in every}
+    if not any(named.values()):
+        told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
+        told += [f"column {name} of {r.source}" for r in every
+                 for name in r.understood["unused"] if _WORD.search(name)]  # fmt: skip
+        return made, [
+            f"{listed(told)}: named for a load that is not taken, and the rows are written "
+            "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
+            "[source.columns]"
+        ] if told else []  # fmt: skip
+    for role, files in by_role.items():
+        made[role] = [replace(r, load=(named[r.source] or UNLOADED[1:])[0]) for r in files]
+    if not any(named[r.source] for r in by_role["points"]):
+        # The points are those of the joint logs.
+        only = {r.load for r in made["joints"]}
+        if len(only) > 1:
+            raise InputError(
+                f"{by_role['joints'][0].source}: joint logs are named for the loads "
+                f"{listed(sorted(map(str, only)))} and the points for none; give load in the "
+                "[[source]] of each file of points"
+            )
+        made["points"] = [replace(r, load=next(iter(only))) for r in by_role["points"]]
+    elif not any(named[r.source] for r in by_role["joints"]):
+        made["joints"] = list(by_role["joints"])  # one log for every load
+    return made, [
+        f"{r.source}: taken as measured under {found[0]} by its name, hanging straight down "
+        f"(0, 0, {0.0 - found[1]:.6g}) N; load in [[source]] states another"
+        for r in every
+        if (found := named[r.source])
+    ]

@@ -1,4 +1,4 @@
-"""The mapping file: what the columns, names and units of somebody's export mean.
+"""The mapping file: what the columns, names, numbers and units of somebody's export mean.
 
 A mapping and its presets are read and checked first; against a file they then say which of its
 columns fills which column of the measurement table, and in which unit.
@@ -6,10 +6,13 @@ columns fills which column of the measurement table, and in which unit.
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
@@ -35,10 +38,11 @@ from elastocal.messages import (
     did_you_mean,
     listed,
     option,
+    plain_minus,
     quoted,
     said_of,
 )
-from elastocal.tables import column
+from elastocal.tables import NUMBER, THOUSANDS, column, first_bad_cell
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
 Place = Annotated[int, Field(ge=1)] | Text
@@ -508,3 +512,109 @@ def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | No
     general = {"length": units.length, "angle": units.angle}.get(target.quantities[0])
     fitting = told if told and set(quantities(told)) & set(target.quantities) else None
     return replace(target, unit=stated or fitting or general or AUTO)
+
+
+# How numbers, times and units are written.
+
+MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
+ISO = "ISO 8601"
+
+
+def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:
+    """What the group `unit` of `pattern` finds in the first comment that it matches."""
+    if pattern is None:
+        return None
+    expression = compiled(where, "unit_comment", pattern)
+    if "unit" not in expression.groupindex:
+        raise InputError(
+            f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
+            "that is the unit so"
+        )
+    found = (match["unit"] for text in comments if (match := expression.search(text)))
+    return next((unit for unit in found if unit and known_unit(unit)), None)
+
+
+def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
+    try:
+        return re.compile(pattern)
+    except re.error as error:
+        what = f"{key} = {quoted(pattern)} is no regular expression: {error}"
+        raise InputError(f"{where}: {what}") from None
+
+
+# A number in any style, and blanks and apostrophes in it as office programs write them.
+_STYLED = re.compile(f"{NUMBER.pattern}|{THOUSANDS.pattern}")
+_PLAIN = str.maketrans("\u00a0\u202f\u2009\u2019", "   '")
+
+
+class NumberCells:
+    """How the numbers of one file are written."""
+
+    def __init__(
+        self, decimal: str, thousands: str, missing: Sequence[str], sample: Iterable[str]
+    ) -> None:
+        self.thousands = "" if thousands == "none" else thousands
+        self.missing = {*MISSING, *(text.strip().casefold() for text in missing)}
+        self.decimal = decimal
+        if decimal == "auto":
+            bare = [text for cell in sample if _STYLED.fullmatch(text := self._bare(cell))]
+            # Where a cell has both, the last is the decimal mark and the other is told as wrong.
+            both = next((cell for cell in bare if "." in cell and "," in cell), None)
+            points, commas = (any(mark in cell for cell in bare) for mark in ".,")
+            usual = "," if commas and not points else "."
+            self.decimal = max(".,", key=both.rfind) if both else usual
+
+    def _bare(self, cell: str) -> str:
+        text = cell.strip()
+        text = text if text.isascii() else plain_minus(text).translate(_PLAIN)
+        return text.replace(self.thousands, "") if self.thousands else text
+
+    def looks_numeric(self, cell: str) -> bool:
+        bare = self._bare(cell)
+        return bool(NUMBER.fullmatch(bare)) or bare.casefold() in self.missing - {""}
+
+    def value(self, source: str, line: int, header: str, cell: str) -> float | None:
+        """The number, None for a cell without a value."""
+        text = self._bare(cell)
+        if text.casefold() in self.missing:
+            return None
+        own = ("," if self.decimal == "." else ".") not in text and NUMBER.fullmatch(text)
+        if own and math.isfinite(number := float(text.replace(",", "."))):
+            return number
+        others = [mark for mark in ",.' " if mark in text and mark != self.decimal]
+        if others and _STYLED.fullmatch(text):
+            raise InputError(
+                f"{source}, line {line}, column {header}: {quoted(cell)} has "
+                f"{' and '.join(map(quoted, others))} in it, but the file is read with decimal "
+                f"{'points' if self.decimal == '.' else 'commas'}; set decimal or thousands in "
+                "[source.text]"
+            )
+        found = first_bad_cell(source, [(line, [text])], {0: header}, True)
+        raise InputError(
+            f"{found}, or list it in missing if it means no value, or pass over such lines with "
+            "ignore, both in [source.text]"
+        )
+
+
+def seconds_of(
+    source: str, lines: Sequence[int], texts: Sequence[str], formats: Sequence[str]
+) -> list[float]:
+    """Seconds since 1970 (UTC) of the times of a column; one without a zone is taken as UTC.
+
+    The first of `formats` (strptime, or ISO 8601) that reads the first text reads all.
+    """
+    chosen, found = [*formats, ISO], list[float]()
+    for line, text in zip(lines, texts, strict=True):
+        t = " ".join(text.split())
+        for form in chosen:
+            with suppress(ValueError, OverflowError):
+                read = datetime.fromisoformat(t) if form == ISO else datetime.strptime(t, form)
+                found.append((read if read.tzinfo else read.replace(tzinfo=UTC)).timestamp())
+                chosen = [form]
+                break
+        else:
+            raise InputError(
+                f"{source}, line {line}: {quoted(text)} is no time of the form "
+                f"{' or '.join(chosen)}; set time_format in [[source]]"
+            )
+    return found
