@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -280,7 +281,7 @@ class SumOfComponents:
 
     def across(self, columns: Sequence[Array]) -> Iterator[Across]:
         """Of each of these columns."""
-        for some in (columns[k : k + BUNDLE] for k in range(0, len(columns), BUNDLE)):
+        for some in bundles(columns):
             cross, own, z = self._beside(side_by_side(self.data, some))
             for at in spans_of([c.shape[2] for c in some], len(z)):
                 yield cross[:, at], own[at, at], z[at]
@@ -288,8 +289,9 @@ class SumOfComponents:
     def joined(self, more: Sequence[Component]) -> SumOfComponents:
         """The sum with these as well."""
         out = self
-        for some in (more[k : k + BUNDLE] for k in range(0, len(more), BUNDLE)):
-            cross, own, z = out._beside(side_by_side(self.data, [c.columns for c in some]))
+        for columns in bundles([c.columns for c in more]):
+            some, more = more[: len(columns)], more[len(columns) :]
+            cross, own, z = out._beside(side_by_side(self.data, columns))
             M = np.block([[out.products.M, cross], [cross.T, own]])
             products = replace(out.products, M=M, z=np.append(out.products.z, z))
             out = replace(out, components=(*out.components, *some), products=products)
@@ -358,9 +360,15 @@ def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
 
-# Groups of columns that are multiplied together, since a few columns by themselves wait for memory,
-# and all columns of thousands of poses would take hundreds of megabytes.
-BUNDLE = 12
+# About so many columns are multiplied together, since a few by themselves wait for memory, and all
+# of thousands of poses would take hundreds of megabytes.
+BUNDLE = 200
+
+
+def bundles(columns: Sequence[Array]) -> Iterator[Sequence[Array]]:
+    ends = np.cumsum([0, *(c.shape[2] for c in columns)]) // BUNDLE
+    at = np.flatnonzero(np.diff(ends)) + 1
+    yield from (columns[a:b] for a, b in pairwise([0, *at, len(columns)]) if b > a)
 
 
 def posed(
