@@ -23,6 +23,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -51,7 +52,7 @@ Family = Literal[
 
 # Prior probability that a kind of component is there.  The logarithms of sizes, of typical ones,
 # spread by SPREAD, of which ALONE is each component's own and the rest that of its kind.
-# Afterwards a size is known to about a third of itself, a length likewise.
+# Afterwards a length is known to about a third of itself; how well a size is, the readings say.
 PRESENT = 0.2
 SPREAD, ALONE, AFTERWARDS = 1.5, 1.0, 0.3
 COMMON = float(np.sqrt(SPREAD**2 - ALONE**2))
@@ -174,38 +175,40 @@ class Pool:
             apart = ALONE**2 * np.eye(len(own)) + COMMON**2
             self.precision[np.ix_(own, own)] = np.linalg.inv(apart)
 
-    @property
-    def cost(self) -> float:
-        """Nats that all of them have to earn."""
-        return float(self.sought.sum()) + sum(_cost(n, len(own)) for n, own in self.kinds)
+    def cost(self, spread: Array) -> float:
+        """Nats that all of them have to earn, the logarithms of whose sizes are known to this
+        covariance (K, K)."""
+        there = sum(presence_cost(n, len(own)) for n, own in self.kinds)
+        return float(self.sought.sum()) + there + self._size(spread, np.arange(len(spread)))
 
-    @cached_property
-    def costs(self) -> Array:
+    def costs(self, spread: Array) -> Array:
         """Nats (K,) that each has to earn, the others there."""
-        out = self.sought.copy()
+        out = self.sought + np.array(
+            [self._size(spread, np.array([k])) for k in range(len(spread))]
+        )
         for n, own in self.kinds:
-            out[own] += _cost(n, len(own)) - _cost(n, len(own) - 1)
+            out[own] += presence_cost(n, len(own)) - presence_cost(n, len(own) - 1)
         return out
 
-    def costs_of(self, earned: Array) -> Array:
+    def costs_of(self, spread: Array, earned: Array) -> Array:
         """The same; where a kind as a whole does not earn its cost (K,), its mean for each."""
-        out = self.costs.copy()
+        out = self.costs(spread)
         for n, own in self.kinds:
-            whole = _cost(n, len(own))
+            whole = presence_cost(n, len(own)) + self._size(spread, own)
             if (earned - self.sought)[own].sum() < whole:
                 out[own] = np.maximum(out[own], whole / len(own) + self.sought[own])
         return out
+
+    def _size(self, spread: Array, own: IntArray) -> float:
+        """Nats that finding sizes costs: how much narrower the readings make what they may be.
+        Where they say nothing of a size, it costs nothing."""
+        at = np.ix_(own, own)
+        return -0.5 * float(sum(np.linalg.slogdet(m[at])[1] for m in (spread, self.precision)))
 
     def penalty(self, sizes: Array) -> tuple[float, Array]:
         """−2 log prior of the logarithms (K,) of sizes, and its slope."""
         slope = self.precision @ sizes
         return float(sizes @ slope), 2 * slope
-
-
-def _cost(n: int, k: int) -> float:
-    """Nats of k components at n places, and of the search for their sizes."""
-    log_det = 2 * k * np.log(ALONE / AFTERWARDS) + np.log(1 + k * (COMMON / ALONE) ** 2)
-    return presence_cost(n, k) + float(log_det) / 2
 
 
 def presence_cost(n: int, k: int) -> float:
@@ -280,7 +283,7 @@ class SumOfComponents:
 
     def across(self, columns: Sequence[Array]) -> Iterator[Across]:
         """Of each of these columns."""
-        for some in (columns[k : k + BUNDLE] for k in range(0, len(columns), BUNDLE)):
+        for some in bundles(columns):
             cross, own, z = self._beside(side_by_side(self.data, some))
             for at in spans_of([c.shape[2] for c in some], len(z)):
                 yield cross[:, at], own[at, at], z[at]
@@ -288,8 +291,9 @@ class SumOfComponents:
     def joined(self, more: Sequence[Component]) -> SumOfComponents:
         """The sum with these as well."""
         out = self
-        for some in (more[k : k + BUNDLE] for k in range(0, len(more), BUNDLE)):
-            cross, own, z = out._beside(side_by_side(self.data, [c.columns for c in some]))
+        for columns in bundles([c.columns for c in more]):
+            some, more = more[: len(columns)], more[len(columns) :]
+            cross, own, z = out._beside(side_by_side(self.data, columns))
             M = np.block([[out.products.M, cross], [cross.T, own]])
             products = replace(out.products, M=M, z=np.append(out.products.z, z))
             out = replace(out, components=(*out.components, *some), products=products)
@@ -329,6 +333,12 @@ class SumOfComponents:
             information[0, 0] += 2 / 0.25
         return value, slope, information
 
+    def spread(self, at: Sizes) -> Array:
+        """Covariance (K, K) of the logarithms of the sizes, all else as it is."""
+        own = slice(1, len(self.components) + 1)
+        theta = np.concatenate([[at.factor], at.size, at.length])
+        return np.asarray(np.linalg.inv(self.objective(theta)[2][own, own] / 2))
+
     def climbed(self, at: Sizes, enough: float = SETTLED, factor_alone: bool = False) -> Sizes:
         """The sizes after steps by the average information until one promises less than `enough` of
         −2ℓ; the noise's factor alone, the others as they are."""
@@ -358,9 +368,15 @@ def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
 
-# Groups of columns that are multiplied together, since a few columns by themselves wait for memory,
-# and all columns of thousands of poses would take hundreds of megabytes.
-BUNDLE = 12
+# About so many columns are multiplied together, since a few by themselves wait for memory, and all
+# of thousands of poses would take hundreds of megabytes.
+BUNDLE = 200
+
+
+def bundles(columns: Sequence[Array]) -> Iterator[Sequence[Array]]:
+    ends = np.cumsum([0, *(c.shape[2] for c in columns)]) // BUNDLE
+    at = np.flatnonzero(np.diff(ends)) + 1
+    yield from (columns[a:b] for a, b in pairwise([0, *at, len(columns)]) if b > a)
 
 
 def posed(
@@ -395,6 +411,8 @@ class FittedSum:
     sizes: Sizes
     noise: NoiseValues
     earned: Array
+    costs: Array
+    cost: float
     score: float
     sums: SumOfComponents
     variances: Array
@@ -476,11 +494,15 @@ def fit_sum(
 
 def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     found, value = problem.factored(at)
-    score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
+    spread = problem.spread(at)
+    cost, costs = problem.pool.cost(spread), problem.pool.costs(spread)
+    score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - cost
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)
     earned, within = problem.earned(found)
     own = problem.variances(at)[len(problem.data.precision) :]
-    return FittedSum(at, problem.noise, earned, score + float(within.sum()), problem, own)
+    return FittedSum(
+        at, problem.noise, earned, costs, cost, score + float(within.sum()), problem, own
+    )
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
@@ -490,7 +512,7 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     prior = problem.pool.precision  # −log prior falls where a component is left out
     earned = problem.earned(problem.factored(at)[0])[0]
     earned = earned - (prior @ at.size) ** 2 / np.diag(prior) / 2
-    spare = earned - (problem.pool.costs_of(earned) if strict else MOST_AT_ONCE)
+    spare = earned - (problem.pool.costs_of(problem.spread(at), earned) if strict else MOST_AT_ONCE)
     stays = np.array([c.given for c in problem.components], dtype=bool)
     poor = (spare < 0) & ~stays
     if not poor.any():

@@ -374,14 +374,15 @@ class Slot:
         total = float(logsumexp(np.append(self.scores, 0.0)))
         return np.exp(self.scores - total), float(np.exp(-total))
 
-    @property
-    def claimable(self) -> bool:
+    def claimable_beside(self, current: ModelSet) -> bool:
         """Whether what can be claimed, one of the LARGEST_SET likeliest effects or something
-        without a name, is more probable than nothing."""
+        without a name, is more probable than nothing; and beside items, that there is nothing more
+        no more probable than DOUBT_MORE."""
         each, nothing = self.probabilities()
         known = np.array([item.known for item in self.items], dtype=bool)
         named = np.sort(each[known])[-LARGEST_SET:].sum()
-        return bool(max(named, each[~known].sum()) > nothing)
+        most = DOUBT_MORE if current.items else 1.0
+        return bool(max(named, each[~known].sum()) > nothing and nothing <= most)
 
 
 @dataclass(frozen=True)
@@ -513,7 +514,7 @@ class ForwardSelection:
         while True:
             best, slot = self._best_addition(current, scanned)
             observed = scanned
-            if best is not None:
+            if best is not None and slot.claimable_beside(current):
                 # Score all again under the noise beside the winner: an effect that is still missing
                 # looks like noise, and hides others with it.
                 if len(scanned.odds) == 1 or (best.noise.logs() != scanned.noise.logs()).any():
@@ -524,9 +525,7 @@ class ForwardSelection:
                 slot = slot.best_of(again)
             if not current.items:
                 start = slot
-            if best is None or not slot.claimable:
-                break
-            if current.items and slot.probabilities()[1] > DOUBT_MORE:
+            if best is None or not slot.claimable_beside(current):
                 break
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
