@@ -26,7 +26,7 @@ from elastocal.cell.arm_description import (
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
 from elastocal.identification.identify import identify
-from elastocal.identification.residuals import rms_3d
+from elastocal.identification.least_squares import rms_3d
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model

@@ -11,7 +11,7 @@ from support.cells import random_poses
 
 import elastocal as ec
 from elastocal.identification import outliers, solve, weighted_problem
-from elastocal.identification.residuals import held_out_by_parts
+from elastocal.identification.least_squares import held_out_by_parts
 from elastocal.identification.weighted_problem import Problem, Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

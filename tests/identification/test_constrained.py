@@ -8,14 +8,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.constrained import Minimum, minimise
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     GaussianPrior,
     LinearEquality,
+    Minimum,
     SemidefiniteMatrix,
     System,
+    minimise,
 )
 
 NONE = Constraints()

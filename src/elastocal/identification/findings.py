@@ -14,9 +14,9 @@ from elastocal.errors import option
 from elastocal.identification import noise_summary
 from elastocal.identification.mistakes import exchanged
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
+from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
-from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding
 from elastocal.identification.sentences import AT_BOUND, made, more_poses
 from elastocal.identification.solve import Solution, far_off

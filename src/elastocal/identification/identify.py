@@ -20,9 +20,11 @@ from elastocal.identification.findings import KNOWN_NOISE, judged
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
-    PriorRows,
     Rows,
     clustered,
+    held_out_residual,
+    rms_3d,
+    told_by_one,
     variance_of,
 )
 from elastocal.identification.mistakes import refuse_nonsense
@@ -34,7 +36,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Kind, Readings
-from elastocal.identification.noise_summary import noise_of
+from elastocal.identification.noise_summary import noise_of, summarise_residuals
 from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
 from elastocal.identification.outliers import describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
@@ -42,12 +44,6 @@ from elastocal.identification.prediction import (
     left_open,
     over_the_workspace,
     predicted_error,
-)
-from elastocal.identification.residuals import (
-    held_out_residual,
-    rms_3d,
-    summarise_residuals,
-    told_by_one,
 )
 from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
 from elastocal.identification.scrutiny import MOST_NUMBERS
@@ -73,7 +69,7 @@ from elastocal.identification.start import (
     start_values,
     without_copies,
 )
-from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
+from elastocal.identification.weighted_problem import Part, PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Scatter, ShownPoses

@@ -9,19 +9,9 @@ import numpy as np
 from scipy import special
 
 from elastocal.errors import ElastocalError, InsufficientDataError, option, require
-from elastocal.identification.constrained import Reduced
-from elastocal.identification.knowledge import Constraints, share_of_prior
-from elastocal.identification.least_squares import (
-    LEVEL,
-    Covariance,
-    Fit,
-    Objective,
-    PriorRows,
-    t_quantile,
-)
-from elastocal.identification.least_squares import fit as least_squares
+from elastocal.identification.knowledge import Constraints, Reduced, share_of_prior
+from elastocal.identification.least_squares import LEVEL, Covariance, held_out_by_parts, t_quantile
 from elastocal.identification.options import MethodResult, Options
-from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Reduction,
@@ -29,7 +19,8 @@ from elastocal.identification.solve import (
     reduce,
     residual_sigma,
 )
-from elastocal.identification.weighted_problem import RFactor
+from elastocal.identification.weighted_problem import Fit, Objective, PriorRows, RFactor
+from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.text import listed, quoted, size_of, some
 from elastocal.units import Array, BoolArray, IntArray, Progress
 

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse, special
 
-from elastocal.engine import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
+from elastocal.engine import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts, least_norm
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
@@ -35,7 +35,6 @@ from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
     inverse_factor,
-    least_norm,
     same_size,
     stated_by_observation,
     whitener,

@@ -26,12 +26,11 @@ from scipy import special
 
 from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
+from elastocal.engine import least_norm
 from elastocal.errors import ElastocalError
-from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
+from elastocal.identification.least_squares import Covariance, drawing_root, rms_3d, variance_of
 from elastocal.identification.noise_summary import Noise
-from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import Solution, deviates, reduce
-from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVisits, OpenParameters

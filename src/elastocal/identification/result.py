@@ -21,6 +21,7 @@ from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
+from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (
     Excess,
@@ -32,7 +33,6 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     position_at,
 )
-from elastocal.identification.residuals import ResidualSummary
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import (

@@ -21,16 +21,22 @@ from scipy import sparse, special
 
 from elastocal.engine import Products, climb
 from elastocal.identification.knowledge import share_of_prior
-from elastocal.identification.least_squares import Covariance, Fit, PriorRows
-from elastocal.identification.least_squares import fit as least_squares
+from elastocal.identification.least_squares import ALONE, Covariance, held_out_by_parts, rms_3d
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Course, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
-from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates, own_size
 from elastocal.identification.start import ordinary
-from elastocal.identification.weighted_problem import Part, Problem, RFactor, same_size
+from elastocal.identification.weighted_problem import (
+    Fit,
+    Part,
+    PriorRows,
+    Problem,
+    RFactor,
+    same_size,
+)
+from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations
 from elastocal.text import listed

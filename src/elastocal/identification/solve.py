@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
+from elastocal.engine import least_norm
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.least_squares import EPS, Fit, PriorRows, drawing_root, fit, moved
-from elastocal.identification.residuals import (
+from elastocal.identification.least_squares import (
     CHANCE,
+    EPS,
     as_of_another_campaign,
+    drawing_root,
     f_test,
     held_out_by_parts,
     held_out_residual,
@@ -23,7 +25,15 @@ from elastocal.identification.residuals import (
     rms_3d,
 )
 from elastocal.identification.start import nothing_shown
-from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
+from elastocal.identification.weighted_problem import (
+    Fit,
+    PriorRows,
+    Problem,
+    RFactor,
+    Weights,
+    fit,
+    moved,
+)
 from elastocal.measurements import numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from elastocal.engine import least_norm
 from elastocal.errors import ElastocalError
+from elastocal.identification.noise_summary import groupings
 from elastocal.identification.prediction import over_the_workspace
-from elastocal.identification.residuals import groupings
-from elastocal.identification.weighted_problem import least_norm
 from elastocal.model.effects.base import index
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
