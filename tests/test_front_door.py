@@ -22,7 +22,7 @@ from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.demo.example import LOAD_N, run_demo
 from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.errors import options_as_flags
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.planning.design import DesignOptions
 from elastocal.report.renderers import FRAMES
 from elastocal.saving import WRITERS

@@ -14,7 +14,7 @@ from joblib import Parallel, delayed
 from elastocal.cell.work_cell import read_cell
 from elastocal.demo.example import published_compliances
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, shares_of

@@ -14,9 +14,8 @@ from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker, Uns
 from elastocal.errors import InputError
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
 from elastocal.identification.scrutiny import autocorrelation
-from elastocal.identification.start import copied
+from elastocal.identification.start import Options, copied
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import undetermined_lines

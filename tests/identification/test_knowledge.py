@@ -19,7 +19,7 @@ from elastocal.identification.knowledge import (
     LinearEquality,
     read_knowledge,
 )
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 

@@ -12,8 +12,8 @@ from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
 from elastocal.identification.noise_structure import in_random_order
-from elastocal.identification.options import Options
 from elastocal.identification.sentences import warning_sentences
+from elastocal.identification.start import Options
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation import simulate

@@ -16,7 +16,7 @@ from support.design_cells import as_table, plan_cell
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.work_cell import Cell, Workspace
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.design import DesignOptions, design

@@ -18,7 +18,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model

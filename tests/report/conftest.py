@@ -11,8 +11,8 @@ from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Method, Options
 from elastocal.identification.result import Calibration
+from elastocal.identification.start import Method, Options
 from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Plan

@@ -19,7 +19,7 @@ from support.study_scripts import study_of
 from elastocal.cell.work_cell import read_cell
 from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.simulation import expand_plan, simulate, values_from

@@ -37,7 +37,6 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.noise_summary import noise_of, summarise_residuals
-from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
 from elastocal.identification.outliers import describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
@@ -49,6 +48,8 @@ from elastocal.identification.result import Calibration, Combination, Estimate, 
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.solve import (
+    Course,
+    MethodResult,
     Solution,
     bent,
     choose,
@@ -59,6 +60,9 @@ from elastocal.identification.solve import (
     solve,
 )
 from elastocal.identification.start import (
+    ROBUST,
+    IntervalKind,
+    Options,
     check_rows,
     check_table,
     copied,

@@ -11,14 +11,15 @@ from scipy import special
 from elastocal.errors import ElastocalError, InsufficientDataError, option, require
 from elastocal.identification.knowledge import Constraints, Reduced, share_of_prior
 from elastocal.identification.least_squares import LEVEL, Covariance, held_out_by_parts, t_quantile
-from elastocal.identification.options import MethodResult, Options
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
+    MethodResult,
     Reduction,
     Solution,
     reduce,
     residual_sigma,
 )
+from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import Fit, Objective, PriorRows, RFactor
 from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.text import listed, quoted, size_of, some

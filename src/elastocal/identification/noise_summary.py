@@ -24,8 +24,8 @@ from elastocal.identification.noise_choice import (
     with_stated_sharing,
 )
 from elastocal.identification.noise_structure import CONFIGURATION, TURNED
-from elastocal.identification.options import MethodResult
 from elastocal.identification.outliers import kept_of
+from elastocal.identification.solve import MethodResult
 from elastocal.identification.weighted_problem import (
     inverse_factor,
     stated_by_observation,

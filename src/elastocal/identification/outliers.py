@@ -25,8 +25,7 @@ from elastocal.identification.least_squares import (
 )
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import MethodResult
-from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
+from elastocal.identification.solve import PLACED, SAMPLE, MethodResult, Solution, is_placed
 from elastocal.identification.weighted_problem import Part, Problem
 from elastocal.units import Array, BoolArray, IntArray
 

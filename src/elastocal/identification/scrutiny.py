@@ -18,9 +18,8 @@ from scipy import linalg, special
 from elastocal.engine import Standardised, least_norm
 from elastocal.identification.least_squares import held_out_residual, left_out, rms_3d
 from elastocal.identification.noise_summary import Noise
-from elastocal.identification.options import SmoothPart
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
-from elastocal.identification.solve import WORTH_A_COLUMN, reduce
+from elastocal.identification.solve import WORTH_A_COLUMN, SmoothPart, reduce
 from elastocal.identification.weighted_problem import Weights, weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm

@@ -24,9 +24,17 @@ from elastocal.identification.knowledge import share_of_prior
 from elastocal.identification.least_squares import ALONE, Covariance, held_out_by_parts, rms_3d
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import Course, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates, own_size
+from elastocal.identification.solve import (
+    WORTH_A_COLUMN,
+    Course,
+    MethodResult,
+    Reduction,
+    SmoothPart,
+    choose,
+    deviates,
+    own_size,
+)
 from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import (
     Fit,

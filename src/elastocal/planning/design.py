@@ -26,7 +26,7 @@ from elastocal.errors import (
 )
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
