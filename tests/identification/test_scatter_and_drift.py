@@ -8,11 +8,10 @@ from support.calibration import PLACED, cell_of, random_chain, table_at, true_va
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
-from elastocal.identification.findings import judged
+from elastocal.identification.findings import judged, warning_sentences
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
 from elastocal.identification.noise_structure import in_random_order
-from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.start import Options
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line

@@ -16,7 +16,7 @@ from scipy import sparse
 
 from elastocal.errors import ElastocalError, option, said_of
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import KNOWN_NOISE, judged
+from elastocal.identification.findings import KNOWN_NOISE, judged, warning_sentences
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
@@ -46,7 +46,6 @@ from elastocal.identification.prediction import (
 )
 from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
 from elastocal.identification.scrutiny import MOST_NUMBERS
-from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.solve import (
     Course,
     MethodResult,

@@ -96,14 +96,13 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     u = np.zeros(len(size))
     at = objective.evaluate(u)
     for _ in range(MOST_STEPS):
-        A, b = objective.rows(u, at)
-        reduced = Reduced(A, b, objective.limits.moved(u, np.ones(len(u))))
+        reduced, A = Reduced(at.A, at.b, objective.limits.moved(u, np.ones(len(u)))), at.A
         best = reduced.minimum()
         step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
         while True:
             try:
                 at = objective.evaluate(u + step)
-                if objective.cost(u + step, at) <= limit + ASTRAY * rise:
+                if at.cost <= limit + ASTRAY * rise:
                     break
             except ElastocalError:
                 pass  # no equilibrium so far out

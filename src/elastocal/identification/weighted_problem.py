@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -443,10 +444,8 @@ NEGLIGIBLE = "the steps became negligible"
 EXHAUSTED = "the step limit was reached; the start may be far off or the data ill-conditioned"
 
 LEAST_DAMPING = 1e-18  # of the largest squared column, once a full step has failed
-SHORTER = 0.3
+SHORTER = 0.3  # than a step that failed
 ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
-
-
 # What a step promises of the cost where a descent ends.  The last step is taken: at a million rows
 # it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
 TOLERANCE = 1e-8
@@ -516,6 +515,23 @@ class Fit:
         return (inverse @ inverse.T) * np.outer(size, size)
 
 
+class Linearised(NamedTuple):
+    """The residual, its R factor with B per unit of u, and the cost |b − A step|² about a u."""
+
+    residual: Array
+    r_factor: RFactor
+    A: Array
+    b: Array
+
+    @property
+    def cost(self) -> float:
+        return float(self.b @ self.b)
+
+    @property
+    def steepest(self) -> float:
+        return float((self.r_factor.R**2).sum(axis=0).max(initial=0.0))
+
+
 class Objective:
     """|e(u)|² + |target − P u|² under the `limits` on u, where X[columns] = x[columns] + size · u
     and the other parameters are x (parameters,)."""
@@ -528,9 +544,8 @@ class Objective:
         self.system = known.system
         self.limits = None if self.system is None else self.system.moved(x[columns], size)
 
-    def evaluate(self, u: Array) -> Evaluation:
-        """e, and the R factor of it and of B per unit of u; ElastocalError where the model has no
-        prediction."""
+    def evaluate(self, u: Array) -> Linearised:
+        """ElastocalError where the model has no prediction."""
         problem = self.problem
         at = problem.evaluate(self.values(u), self.columns)
         if not np.isfinite(at.r_factor.rss):
@@ -538,7 +553,10 @@ class Objective:
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        return replace(at, r_factor=at.r_factor.scaled(self.size))
+        r_factor = at.r_factor.scaled(self.size)
+        A = np.vstack([r_factor.augmented[:, :-1], self.P])
+        b = np.concatenate([r_factor.augmented[:, -1], self.target - self.P @ u])
+        return Linearised(at.residual, r_factor, A, b)
 
     def values(self, u: Array) -> Array:
         """X (parameters,), what lies at its bound but for rounding on it."""
@@ -550,28 +568,15 @@ class Objective:
             values[self.columns] = np.clip(own, system.lower, system.upper)
         return values
 
-    def rows(self, u: Array, at: Evaluation) -> tuple[Array, Array]:
-        """A and b of the linearised cost |b − A step|²."""
-        rows = at.r_factor.augmented
-        A, b = np.vstack([rows[:, :-1], self.P]), self.target - self.P @ u
-        return A, np.concatenate([rows[:, -1], b])
+    def step(self, u: Array, at: Linearised, damping: float) -> Array:
+        """Minimiser of the linearised cost + damping · |step|²."""
+        p = len(u)
+        A, b = np.vstack([at.A, np.sqrt(damping) * np.eye(p)]), np.append(at.b, np.zeros(p))
+        if self.limits is not None:
+            return minimise(A, b, self.limits.moved(u, np.ones(p))).x
+        return least_norm(A, b, cond=max(at.r_factor.rows, p) * np.finfo(float).eps)
 
-    def cost(self, u: Array, at: Evaluation) -> float:
-        return at.r_factor.rss + float(np.sum((self.target - self.P @ u) ** 2))
-
-    def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
-        """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
-        p, (A, b) = len(u), self.rows(u, at)
-        damped, target = np.vstack([A, np.sqrt(damping) * np.eye(p)]), np.append(b, np.zeros(p))
-        if self.limits is None:
-            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
-            step = least_norm(damped, target, cond=cond)
-        else:
-            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
-        left = b - A @ step
-        return step, float(b @ b - left @ left)
-
-    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Evaluation, str]:
+    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Linearised, str]:
         """Full Gauss–Newton steps while they lower the cost, damped ones where they do not: where
         they end, and why.
 
@@ -580,43 +585,30 @@ class Objective:
         converges.  Steps are judged by the cost itself, so no rounding of it can keep it from
         ending.
         """
-        at = self.evaluate(u)
-        cost, damping = self.cost(u, at), 0.0
+        at, damping = self.evaluate(u), 0.0
         failed = -1.0  # the damping that was too little a step ago
         for _ in range(most - 1):
-            step, promised = self.step(u, at, damping)
-            last, small = promised <= tolerance * cost, np.abs(step).max(initial=0.0) <= ROUNDING
-            if last and small:
-                return u, at, NEGLIGIBLE
-            try:
+            step = self.step(u, at, damping)
+            left = at.b - at.A @ step
+            promised, trial, cost = at.cost - float(left @ left), at, np.inf
+            with suppress(ElastocalError):
                 trial = self.evaluate(u + step)
-                trial_cost = self.cost(u + step, trial)
-            except ElastocalError:
-                trial, trial_cost = at, np.inf
-            if last and (damping == 0 or failed >= 0):  # more than what is left is not to be had
-                kept = trial_cost <= cost * (1 + ROUNDING)
+                cost = trial.cost
+            if promised <= tolerance * at.cost:  # more than what is left is not to be had
+                kept = cost <= at.cost * (1 + ROUNDING)
                 return (*((u + step, trial) if kept else (u, at)), SETTLED)
-            if cost - trial_cost > 1e-4 * promised:
-                u, at, cost = u + step, trial, trial_cost
-                less = damping / 10 if damping > LEAST_DAMPING * _steepest(at) else 0.0
+            if at.cost - cost > 1e-4 * promised:
+                u, at = u + step, trial
+                less = damping / 10 if damping > LEAST_DAMPING * at.steepest else 0.0
                 damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
-            elif small:
+            elif np.abs(step).max(initial=0.0) <= ROUNDING:
                 return u, at, NEGLIGIBLE
             else:
-                failed, damping = damping, self._shortened(u, at, damping, step)
+                failed, damping = damping, max(10 * damping, LEAST_DAMPING * at.steepest)
+                longest = SHORTER * np.linalg.norm(step)
+                while np.linalg.norm(self.step(u, at, damping)) > longest:
+                    damping *= 10
         return u, at, EXHAUSTED
-
-    def _shortened(self, u: Array, at: Evaluation, damping: float, step: Array) -> float:
-        """The damping with which a step that failed has at most SHORTER of its length."""
-        longest = SHORTER * float(np.linalg.norm(step))
-        damping = max(10 * damping, LEAST_DAMPING * _steepest(at))
-        while np.linalg.norm(self.step(u, at, damping)[0]) > longest:
-            damping *= 10
-        return damping
-
-
-def _steepest(at: Evaluation) -> float:
-    return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
 
 def moved(x: Array, columns: IntArray, step: Array) -> Array:

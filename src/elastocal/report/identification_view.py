@@ -11,10 +11,10 @@ import numpy as np
 
 from elastocal.errors import option
 from elastocal.identification import findings
+from elastocal.identification.findings import next_steps
 from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
-from elastocal.identification.sentences import next_steps
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
 from elastocal.report import blocks as say
