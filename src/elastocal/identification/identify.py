@@ -210,8 +210,7 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     if table.time is None and model.cell.model.clock == "rows":  # after the campaign
         table = replace(table, time=np.full(len(table), NEVER_YET))
     observed = observe(table, model.observe)
-    unit, x, every = Weights("none", None, False, ""), result.x, np.arange(len(model.parameters))
-    error = Problem(model, observed, unit, x, every, np.ones(len(x))).residual(x)
+    error = observed.value - model.predict(table, result.x, observed)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
     errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
@@ -712,8 +711,8 @@ def _published(course: Course, start: Solution) -> MethodResult:
     observed, fit, options = start.problem.observations, start.fit, course.options
     method, good, group = options.resolved, ~course.faulty, None
     if method == "eq14":
-        key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
-        group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
+        own = observed.configuration[:, None] * observed.size + np.arange(observed.size)
+        group = own.ravel()
     size = start.problem.sizes[fit.columns]
     with said_of(f"{observed.table.source}: {option('method', method)}"):
         last = published.eq14(fit.B * size, fit.residual, group)[-1]

@@ -599,13 +599,7 @@ class Reduced:
                 self.lengths = np.append(self.lengths, lengths)
             if len(self.cuts) == known:
                 break
-        n = len(self.sides)
-        kept = np.append(np.ones(n, dtype=bool), prices[n:] > 0)
-        self.cuts = [cut for cut, own in zip(self.cuts, kept[n:], strict=True) if own]
-        self.rows, self.least, self.lengths = (
-            a[kept] for a in (self.rows, self.least, self.lengths)
-        )
-        return u, prices[kept]
+        return u, prices
 
     def _nearest_of_rows(self, target: Array) -> tuple[Array, Array]:
         least, prices = self.least - self.rows @ target, np.zeros(len(self.least))

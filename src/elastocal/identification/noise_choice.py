@@ -167,20 +167,15 @@ class NoisyReadings:
         # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
         unit = np.trace(self.structure.matrix.sum(axis=1), axis1=1, axis2=2)[sets.first] / size
         own = float(np.median(e2 / unit))
-        if dof := sets.contrasts.size:
+        if sets.contrasts.size:
             # A few repeats may agree by rounding: from near zero the search does not come back.
-            own = max((float((sets.contrasts**2).sum()) + own / dof) / (dof + 1 / dof), 1e-9 * own)
+            own = max(float((sets.contrasts**2).mean()), 1e-9 * own)
         share = 0.1 * float((self.readings.e**2).mean())
         shared = [share * size / d.mean_square(size) for d in self.deviations]
         theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)
-        if like is None:
-            return theta
-        known = dict(zip(like.noisy.names, like.theta.tolist(), strict=True))
-        same = like.noisy.structure.names == self.structure.names
-        for k, name in enumerate(self.names):
-            if (same or k >= self.own) and known.get(name, 0.0) > LEAST_START * theta[k]:
-                theta[k] = known[name]
-        return theta
+        former = {} if like is None else dict(zip(like.noisy.names, like.theta, strict=True))
+        known = np.array([former.get(name, 0.0) for name in self.names])
+        return np.where(known > LEAST_START * theta, known, theta)
 
 
 def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:

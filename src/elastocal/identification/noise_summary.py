@@ -305,8 +305,8 @@ def noise_of(found: MethodResult, sigma: float) -> tuple[Noise, dict[str, float]
     problem, residual = solution.problem, solution.fit.residual
     observed, cell, weights = problem.observations, problem.model.cell, problem.weights
     stated, size = stated_by_observation(observed, cell.tracker), observed.size
-    spent = found.effective if found.smooth else None
-    spent, single = len(solution.fit.columns) if spent is None else spent, None
+    spent, single = (found.effective if found.smooth else None), None
+    spent = len(solution.fit.columns) if spent is None else spent
     if stated is not None and cell.noise.tails is None:
         told = not cell.noise.shared  # else repeats scatter by more than the instrument
         single = single_readings(observed, residual, stated, spent, told)

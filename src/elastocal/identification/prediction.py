@@ -443,9 +443,8 @@ def predicted_error(
     what was read.
     """
     left = arm.left
-    if left is None or not arm.determined or observed.kind == "distance":
-        return None
-    if not np.isfinite(arm.covariance).all():
+    told = arm.determined and observed.kind != "distance" and np.isfinite(arm.covariance).all()
+    if left is None or not told:
         return None
     try:
         B, weight = readings_at(arm.model, arm.x, observed, poses)

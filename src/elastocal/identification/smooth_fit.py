@@ -318,13 +318,10 @@ def fit_smooth(course: Course) -> MethodResult:
 
 def _followed(observed: Observations, group: SmoothGroup) -> Array:
     """What a function follows, in every observation (N,)."""
-    table = observed.table
     if group.basis is None:
         return np.zeros(0)
-    if not group.lasting:
-        assert table.time is not None
-        return table.time[observed.lead]
-    return np.asarray(table.q[observed.lead, group.joint])
+    table = observed.table
+    return np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
 
 
 class _Search:

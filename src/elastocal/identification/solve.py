@@ -205,13 +205,10 @@ def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) 
 
 def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:
     """Fit of the kept parameters, the others held at the start; their share moves over first."""
-    start, kept = x.copy(), chosen.kept
-    start[chosen.dropped] = problem.x0[chosen.dropped]
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
-    for trial in (chosen.shifted(x, problem.x0), start):
-        with suppress(ElastocalError):
-            return fit(problem, kept, trial, max_steps=max_steps)
-    return fit(problem, kept, problem.x0, max_steps=max_steps)
+    with suppress(ElastocalError):
+        return fit(problem, chosen.kept, chosen.shifted(x, problem.x0), max_steps=max_steps)
+    return fit(problem, chosen.kept, problem.x0, max_steps=max_steps)
 
 
 def looked_at(found: Fit) -> tuple[Array, Array]:
