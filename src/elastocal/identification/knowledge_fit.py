@@ -115,8 +115,6 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     return side * np.inf
 
 
-# The fit of a method again, under constraints and with a prior.
-
 # Which parameters a fit with constraints and a prior has.
 
 

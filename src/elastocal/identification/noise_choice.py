@@ -191,9 +191,6 @@ def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
     return Parts(of, loading.reshape(C, numbers, M * size, M * size))
 
 
-# A kind of noise fitted to readings.
-
-
 class Fitted(MixedFit):
     """A kind of noise fitted to readings: the variances of single readings are its `own`, those of
     deviations `common`, and what drifts is `lasting` a share of the campaign (None: nothing)."""

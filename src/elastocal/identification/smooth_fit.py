@@ -202,8 +202,6 @@ class Posterior:
         return np.asarray(1 - (self.P**2).sum(axis=0) * np.diag(self.cofactor))
 
 
-# The course of the fit.
-
 STEPS = 150  # a few do mostly; springs beside weights that no load tells go along a valley
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUNDS = 6

@@ -678,9 +678,6 @@ class SmoothPart:
         ]  # fmt: skip
 
 
-# What a method ends with.
-
-
 NO_MATTER = 1e-4  # one over degrees of freedom that make no difference to an interval
 
 
