@@ -140,7 +140,7 @@ def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntAr
         f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
     )
     named = np.intersect1d(np.union1d(known, tied), free)
-    R = problem.evaluate(solution.fit.x, free).r_factor.R
+    R = problem.evaluate(solution.fit.x, free)[1].R
     # An equality is exact: it counts as much as the most that anything else tells.
     A = A[:, free][A[:, free].any(axis=1)]
     most = np.linalg.norm(np.vstack([R, P[:, free]]) * problem.sizes[free], axis=0).max()
@@ -312,7 +312,7 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     columns, k = found.fit.columns, len(found.fit.columns)
     dropped = np.setdiff1d(before.dropped, columns)
     both = np.concatenate([columns, dropped])
-    R = problem.evaluate(found.fit.x, both).r_factor.R
+    R = problem.evaluate(found.fit.x, both)[1].R
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * problem.sizes[dropped] / problem.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0

@@ -121,11 +121,6 @@ class NoisyReadings:
     def names(self) -> tuple[str, ...]:
         return (*self.structure.names, *(d.name for d in self.deviations))
 
-    @property
-    def may_vanish(self) -> list[int]:
-        """Variances that may be none: what is shared, but the prior of what drifts."""
-        return [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
-
     def model(self, prior: LogPrior | None = None) -> Mixed:
         """Packs of clusters of the sets: readings of a configuration that share anything are one.
 
@@ -198,7 +193,9 @@ class Fitted(MixedFit):
     def __init__(
         self, noisy: NoisyReadings, prior: LogPrior | None, start: Array, enough: float
     ) -> None:
-        super().__init__(noisy.model(prior), start, noisy.may_vanish, enough)
+        # What is shared may be none, but not the prior of what drifts.
+        shared = [k for k, d in enumerate(noisy.deviations, noisy.own) if d.waves is None]
+        super().__init__(noisy.model(prior), start, shared, enough)
         self.noisy, self.lasting = noisy, noisy.lasting
         self.own, self.common = np.split(self.theta, [noisy.own])
 

@@ -137,17 +137,15 @@ class LinearRows:
             return value + float(over @ over), slope, information
 
         variance = max(products.squares / products.rows, 1e-300)
+        start = start or Scales(np.ones(n), NOISE * variance, np.zeros(n))
         least, most = 0.5 * np.log([LEAST, MOST])
         lower = np.append(0.5 * np.log(variance) - 20.0, np.full(n, least))
         upper = np.append(0.5 * np.log(variance) + 1.0, np.full(n, most))
-        if start is not None:
-            gone = 1 + np.flatnonzero(start.scale == 0)
-            lower[gone], upper[gone] = -np.inf, -np.inf
-
+        gone = 1 + np.flatnonzero(start.scale == 0)
+        lower[gone], upper[gone] = -np.inf, -np.inf
         # From nothing the likelihood shows no way back: what is small begins anew.
-        known = np.ones(n) if start is None else np.where(start.scale < SMALL, 1.0, start.scale)
-        level = NOISE * variance if start is None else start.variance
-        begun = np.clip(0.5 * np.log(np.append(level, known)), lower, upper)
+        known = np.where(start.scale < SMALL, 1.0, start.scale)
+        begun = np.clip(0.5 * np.log(np.append(start.variance, known)), lower, upper)
         theta = climb(objective, begun, lower, upper, ENOUGH, CLIMBS)[0]
         at = products.at(variances(theta), theta[0])
         gain = at.left_out([np.flatnonzero(mine) for mine in own.T])
@@ -386,7 +384,7 @@ class _Search:
         return JointFit(found, reduction, scales, self._rows(problem, found.x).only(kept))
 
     def _rows(self, problem: Problem, x: Array) -> LinearRows:
-        f, factor = self.functions, problem.evaluate(x, problem.free).r_factor
+        f, factor = self.functions, problem.evaluate(x, problem.free)[1]
         rows, away = factor.augmented.copy(), x[f.columns] - f.nominal
         rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
         return LinearRows(RFactor(rows, factor.rows), f.std, f.group, len(f.groups))

@@ -477,7 +477,7 @@ def posed(
     rows, p = len(observed.value), len(free)
     if rows > p:  # more equations than unknowns need no rank
         return problem
-    R = problem.evaluate(x0, free).r_factor.R * problem.sizes[free]
+    R = problem.evaluate(x0, free)[1].R * problem.sizes[free]
     rank = int(np.linalg.matrix_rank(R, rtol=STRUCTURAL))
     if rank == rows:
         lacking = max(-(-(rank + 1) // observed.size), -(-p // observed.size))

@@ -317,14 +317,6 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Residual (rows,), observed minus predicted and raw, and the R factor of whitened B and it."""
-
-    residual: Array
-    r_factor: RFactor
-
-
-@dataclass(frozen=True)
 class Problem:
     """Fit parameters among those that are `free` to the observations, the others held at x0
     (parameters,); `sizes` (parameters,) are typical ones, by which variables are scaled."""
@@ -399,8 +391,8 @@ class Problem:
         with ThreadPoolExecutor(AT_ONCE) as pool:
             yield from pool.map(lambda index: work(self.part(index)), others)
 
-    def evaluate(self, x: Array, columns: NDArray[np.integer]) -> Evaluation:
-        """B of the `columns` at x and the residual, whitened and reduced to their R factor.
+    def evaluate(self, x: Array, columns: NDArray[np.integer]) -> tuple[Array, RFactor]:
+        """The raw residual (rows,) at x, and with B of the `columns`, whitened, their R factor.
 
         Raises ElastocalError where a reading has no static equilibrium at x.
         """
@@ -411,7 +403,7 @@ class Problem:
             residual[part.rows] = at.residual
             return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
 
-        return Evaluation(residual, reduce(RFactor.merged, self.each(reduced)))
+        return residual, reduce(RFactor.merged, self.each(reduced))
 
     def residual(self, x: Array) -> Array:
         """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
@@ -506,7 +498,7 @@ class Fit:
         problem = self.problem
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
-        return problem.evaluate(self.x, problem.free).r_factor
+        return problem.evaluate(self.x, problem.free)[1]
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
@@ -546,17 +538,17 @@ class Objective:
 
     def evaluate(self, u: Array) -> Linearised:
         """ElastocalError where the model has no prediction."""
-        problem = self.problem
-        at = problem.evaluate(self.values(u), self.columns)
-        if not np.isfinite(at.r_factor.rss):
+        residual, r_factor = self.problem.evaluate(self.values(u), self.columns)
+        if not np.isfinite(r_factor.rss):
+            source = self.problem.observations.table.source
             raise ElastocalError(
-                f"{problem.observations.table.source}: the model predicts no finite numbers at the "
+                f"{source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        r_factor = at.r_factor.scaled(self.size)
+        r_factor = r_factor.scaled(self.size)
         A = np.vstack([r_factor.augmented[:, :-1], self.P])
         b = np.concatenate([r_factor.augmented[:, -1], self.target - self.P @ u])
-        return Linearised(at.residual, r_factor, A, b)
+        return Linearised(residual, r_factor, A, b)
 
     def values(self, u: Array) -> Array:
         """X (parameters,), what lies at its bound but for rounding on it."""
