@@ -164,7 +164,8 @@ class NoisyReadings:
         own = float(np.median(e2 / unit))
         if sets.contrasts.size:
             # A few repeats may agree by rounding: from near zero the search does not come back.
-            own = max(float((sets.contrasts**2).mean()), 1e-9 * own)
+            square = (sets.contrasts**2).mean(axis=1) / unit[sets.sets]
+            own = max(float(square.mean()), 1e-9 * own)
         share = 0.1 * float((self.readings.e**2).mean())
         shared = [share * size / d.mean_square(size) for d in self.deviations]
         theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)

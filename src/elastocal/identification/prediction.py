@@ -27,7 +27,7 @@ from scipy import special
 from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
 from elastocal.engine import least_norm
-from elastocal.errors import ElastocalError
+from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Covariance, drawing_root, rms_3d, variance_of
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.solve import Solution, deviates, reduce
@@ -450,8 +450,6 @@ def predicted_error(
         B, weight = readings_at(arm.model, arm.x, observed, poses)
     except ElastocalError:
         return None
-    if not len(weight):
-        return None
     known, off = _moves(arm, B[:, :3])
     root = drawing_root(arm.covariance)
     each = np.sqrt(weight)[:, None, None]
@@ -484,7 +482,7 @@ def readings_at(
     model: Model, x: Array, observed: Observations, poses: NewPoses
 ) -> tuple[Array, Array]:
     """B (R, size, parameters) of readings at new poses, one for each pose and marker, and their
-    weight (R,) of sum 1; without those that have no static equilibrium.
+    weight (R,) of sum 1; without those that have no static equilibrium, if any has one.
 
     Whatever else the model asks for, as times and temperatures, is that of the readings in turn.
     """
@@ -505,7 +503,7 @@ def readings_at(
     good = np.bincount(pose, ~still, minlength=T) == 0
     new = new.take(good[pose])
     if not len(new):
-        return np.zeros((0, 1, len(x))), np.zeros(0)
+        raise InsufficientDataError("no pose has a static equilibrium")
     again = observe(new, observed.kind)
     B = model.regressor(new, x, observations=again).B
     weight = poses.weight[new.configuration[again.lead]]

@@ -262,18 +262,15 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
     if not predicts_better(held, linear, *judges):
         return found, reduction
-    try:
+    # Along a direction that is hardly determined the wide set may leave every valid arm, or come to
+    # rest where it is singular.
+    with suppress(ElastocalError, np.linalg.LinAlgError, ValueError):
         wide = fit_kept(problem, start, wider, max_steps=30)
-        after = looked_at(wide)[0]
-    except (ElastocalError, np.linalg.LinAlgError, ValueError):
-        # Along a direction that is hardly determined the wide set may leave every valid arm, or
-        # come to rest where it is singular.
-        return found, reduction
-    better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-    if not better or not predicts_better(held, after, *judges):
-        return found, reduction
-    # What its zero hid may be worth a column now; each set is wider than the last.
-    return prefer_wider(wide, wider) if lost else (wide, wider)
+        better = wide.converged and fits_better(found.r_factor, wide.r_factor)
+        if better and predicts_better(held, looked_at(wide)[0], *judges):
+            # What its zero hid may be worth a column now; each set is wider than the last.
+            return prefer_wider(wide, wider) if lost else (wide, wider)
+    return found, reduction
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.

@@ -583,17 +583,20 @@ class Objective:
             step = self.step(u, at, damping)
             left = at.b - at.A @ step
             promised, trial, cost = at.cost - float(left @ left), at, np.inf
+            last, small = promised <= tolerance * at.cost, np.abs(step).max(initial=0) <= ROUNDING
+            if last and small:
+                return u, at, NEGLIGIBLE
             with suppress(ElastocalError):
                 trial = self.evaluate(u + step)
                 cost = trial.cost
-            if promised <= tolerance * at.cost:  # more than what is left is not to be had
+            if last:  # more than what is left is not to be had
                 kept = cost <= at.cost * (1 + ROUNDING)
                 return (*((u + step, trial) if kept else (u, at)), SETTLED)
             if at.cost - cost > 1e-4 * promised:
                 u, at = u + step, trial
                 less = damping / 10 if damping > LEAST_DAMPING * at.steepest else 0.0
                 damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
-            elif np.abs(step).max(initial=0.0) <= ROUNDING:
+            elif small:
                 return u, at, NEGLIGIBLE
             else:
                 failed, damping = damping, max(10 * damping, LEAST_DAMPING * at.steepest)
