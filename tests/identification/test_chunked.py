@@ -59,7 +59,7 @@ def peak_of_a_pass(model, truth, observed):
     problem = Problem(model, observed, unit, truth, columns, np.ones(len(truth)))
     assert len(problem.parts) > 1
     tracemalloc.start()
-    r_factor = problem.evaluate(truth, columns).r_factor.of_columns(kept)
+    r_factor = problem.evaluate(truth, columns)[1].of_columns(kept)
     held_out_by_parts(problem, truth, kept, r_factor.half)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
