@@ -14,9 +14,8 @@ import numpy as np
 from bench_tools import Clock
 
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
 from elastocal.identification.solve import posed, solve
-from elastocal.identification.start import start_values
+from elastocal.identification.start import Options, start_values
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model

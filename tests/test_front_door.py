@@ -20,7 +20,7 @@ import elastocal as ec
 from elastocal import plugins
 from elastocal.cell_tables import DesignSpec
 from elastocal.diagnosis.diagnose import DiagnosisOptions
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.messages import options_as_flags
 from elastocal.planning.design import DesignOptions
 from elastocal.report.renderers import FRAMES

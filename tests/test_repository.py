@@ -28,7 +28,7 @@ LAYERS = (
 )
 
 # A file holds one idea whole: above the ceiling it holds several, and more files hold parts of one.
-MOST_LINES, MOST_FILES = 800, 114
+MOST_LINES, MOST_FILES = 800, 110
 
 ELSEWHERE = ("--install", "--version")  # flags of other programs
 

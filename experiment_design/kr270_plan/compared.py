@@ -13,7 +13,7 @@ from joblib import Parallel, delayed
 
 from elastocal.cell import read_cell
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design

@@ -25,7 +25,7 @@ from elastocal.cell_tables import (
     Tracker,
 )
 from elastocal.identification.identify import identify
-from elastocal.identification.residuals import rms_3d
+from elastocal.identification.least_squares import rms_3d
 from elastocal.measurements import Measurements
 from elastocal.messages import ElastocalError
 from elastocal.model.chain import Chain

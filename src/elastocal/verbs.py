@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from elastocal.compensation import Compensation, Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
-    from elastocal.identification.options import FaultyReadings, IntervalKind, Method
     from elastocal.identification.result import Calibration
+    from elastocal.identification.start import FaultyReadings, IntervalKind, Method
     from elastocal.identification.weighted_problem import WeightKind
     from elastocal.measurements import Measurements
     from elastocal.model.calibrated import CalibratedArm
@@ -44,7 +44,7 @@ else:
         "elastocal.compensation Compensation Targets",
         "elastocal.diagnosis.diagnosis Diagnosis",
         "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
-        "elastocal.identification.options FaultyReadings IntervalKind Method",
+        "elastocal.identification.start FaultyReadings IntervalKind Method",
         "elastocal.identification.result Calibration",
         "elastocal.identification.weighted_problem WeightKind",
         "elastocal.measurements Measurements",
@@ -465,7 +465,7 @@ def identify(
     import numpy as np
 
     from elastocal.identification.identify import identify as run
-    from elastocal.identification.options import Options
+    from elastocal.identification.start import Options
     from elastocal.measurements import read_matrix
 
     if isinstance(covariance, str | Path):

@@ -13,9 +13,8 @@ from support.cells import random_poses
 from elastocal.cell_tables import CartesianNoise, Nominal, Tracker, Unsteadiness
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
 from elastocal.identification.scrutiny import autocorrelation
-from elastocal.identification.start import copied
+from elastocal.identification.start import Options, copied
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

@@ -11,7 +11,7 @@ from support.cells import random_poses
 
 import elastocal as ec
 from elastocal.identification import outliers, solve, weighted_problem
-from elastocal.identification.residuals import held_out_by_parts
+from elastocal.identification.least_squares import held_out_by_parts
 from elastocal.identification.weighted_problem import Problem, Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -59,7 +59,7 @@ def peak_of_a_pass(model, truth, observed):
     problem = Problem(model, observed, unit, truth, columns, np.ones(len(truth)))
     assert len(problem.parts) > 1
     tracemalloc.start()
-    r_factor = problem.evaluate(truth, columns).r_factor.of_columns(kept)
+    r_factor = problem.evaluate(truth, columns)[1].of_columns(kept)
     held_out_by_parts(problem, truth, kept, r_factor.half)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()

@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.identification.constrained import Minimum, minimise
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     GaussianPrior,
     LinearEquality,
+    Minimum,
     SemidefiniteMatrix,
     System,
+    minimise,
 )
 from elastocal.messages import InputError, InsufficientDataError
 

@@ -13,10 +13,9 @@ from support.calibration import GEOMETRY, campaign
 from elastocal.cell_tables import CartesianNoise, Tracker
 from elastocal.diagnosis import diagnosis as diagnosis_result
 from elastocal.identification import findings as module
-from elastocal.identification.findings import judged
+from elastocal.identification.findings import judged, warning_sentences
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import LackOfFit
-from elastocal.identification.sentences import warning_sentences
 
 SIGMA = 5e-5
 PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"

@@ -8,7 +8,7 @@ from support.cells import random_poses
 
 from elastocal.cell_tables import Nominal
 from elastocal.identification.identify import identify
-from elastocal.identification.residuals import held_out_residual, predicts_better
+from elastocal.identification.least_squares import held_out_residual, predicts_better
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 

@@ -18,7 +18,7 @@ from elastocal.identification.knowledge import (
     LinearEquality,
     read_knowledge,
 )
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.messages import InputError
 from elastocal.model.manipulator import Model

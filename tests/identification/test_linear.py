@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from elastocal.engine import least_norm
 from elastocal.identification import weighted_problem
-from elastocal.identification.weighted_problem import RFactor, least_norm
+from elastocal.identification.weighted_problem import RFactor
 
 
 @pytest.mark.parametrize("shape", [(9, 4), (4, 9), (6, 6)])

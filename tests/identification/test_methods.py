@@ -20,7 +20,7 @@ from elastocal.cell_tables import CartesianNoise, Tracker
 from elastocal.identification import published
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import lack_of_fit
-from elastocal.identification.options import METHODS, ROBUST, Options
+from elastocal.identification.start import METHODS, ROBUST, Options
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.simulation import simulate

@@ -8,8 +8,8 @@ from support.calibration import campaign, cell_of, measured, planar_chain, table
 from support.cells import random_poses
 
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
 from elastocal.identification.outliers import blocks, kept_of, rejection_point
+from elastocal.identification.start import Options
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5

@@ -11,8 +11,8 @@ from support.cells import random_poses
 
 from elastocal.cell_tables import CartesianNoise, Tracker
 from elastocal.identification.identify import identify
+from elastocal.identification.least_squares import rms_3d
 from elastocal.identification.prediction import NewPoses
-from elastocal.identification.residuals import rms_3d
 from elastocal.model.calibrated import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

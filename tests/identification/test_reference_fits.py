@@ -19,9 +19,8 @@ from scipy import sparse, stats
 
 from elastocal.identification.knowledge import Bounds, Constraints
 from elastocal.identification.knowledge_fit import KnownFit, profile_end
-from elastocal.identification.least_squares import PriorRows, fit
 from elastocal.identification.published import ols
-from elastocal.identification.weighted_problem import Problem, Weights
+from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, fit
 from elastocal.messages import ElastocalError
 from elastocal.model.manipulator import Regression
 from elastocal.model.observations import Observations

@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse, stats
 from support.calibration import binomial_band, table_at
 
-from elastocal.identification.residuals import normal_scores, summarise_residuals
+from elastocal.identification.noise_summary import normal_scores, summarise_residuals
 from elastocal.model.observations import Observations
 
 LOADS = ((0, 0, 0), (0, 0, -2600.0))

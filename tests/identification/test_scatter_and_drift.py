@@ -8,12 +8,11 @@ from support.calibration import PLACED, cell_of, random_chain, table_at, true_va
 from support.cells import random_poses
 
 from elastocal.cell_tables import CartesianNoise, Tracker, Unsteadiness
-from elastocal.identification.findings import judged
+from elastocal.identification.findings import judged, warning_sentences
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
 from elastocal.identification.noise_structure import in_random_order
-from elastocal.identification.options import Options
-from elastocal.identification.sentences import warning_sentences
+from elastocal.identification.start import Options
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation import simulate

@@ -12,7 +12,7 @@ from support.stick import stick
 
 from elastocal.cell_tables import Nominal, Tool
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

@@ -16,7 +16,7 @@ from support.design_cells import as_table, plan_cell
 from elastocal.cell import Cell, Workspace
 from elastocal.cell_tables import PolarNoise
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.planning import poses as target_poses
 from elastocal.planning.design import DesignOptions, design

@@ -16,7 +16,7 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import Nominal, PolarNoise, TargetPose
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.messages import InsufficientDataError
 from elastocal.model.chain import Chain

@@ -10,8 +10,8 @@ from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_
 
 from elastocal.cell_tables import CartesianNoise, DesignSpec, Tracker
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Method, Options
 from elastocal.identification.result import Calibration
+from elastocal.identification.start import Method, Options
 from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Plan

@@ -13,10 +13,9 @@ import pytest
 from identification.test_far_values import CASES
 
 import elastocal as ec
-from elastocal.identification.findings import judged
+from elastocal.identification.findings import judged, next_steps
 from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.result import TestErrors
-from elastocal.identification.sentences import next_steps
 from elastocal.report import judgement_view
 from elastocal.report.blocks import ShownVerdict, length
 from elastocal.report.renderers import page_of

@@ -18,7 +18,7 @@ from support.study_scripts import study_of
 
 from elastocal.cell import read_cell
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.simulation import LOAD_N, expand_plan, published_compliances, simulate, values_from

@@ -22,10 +22,9 @@ from elastocal.engine import (
     Whitened,
     climb,
 )
-from elastocal.identification.least_squares import TOLERANCE
 from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit, with_placed
 from elastocal.identification.start import start_values
-from elastocal.identification.weighted_problem import stated_by_observation, weights_for
+from elastocal.identification.weighted_problem import TOLERANCE, stated_by_observation, weights_for
 from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.evaluate import thread_count

@@ -38,10 +38,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from elastocal.above import Result, checked_arguments
-from elastocal.identification.least_squares import correlations, moved, variance_of
-from elastocal.identification.residuals import holm
+from elastocal.identification.least_squares import correlations, variance_of
+from elastocal.identification.noise_summary import holm
 from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN
+from elastocal.identification.weighted_problem import moved
 from elastocal.messages import InsufficientDataError, listed, option, require, size_of
 from elastocal.model.calibrated import (
     CalibratedArm,

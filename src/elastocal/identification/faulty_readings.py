@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from elastocal.identification.least_squares import f_test
 from elastocal.identification.noise_choice import NoiseFit, linearised, own_noise, weights_of
 from elastocal.identification.outliers import (
     FALSE_ALARM,
@@ -21,7 +22,6 @@ from elastocal.identification.outliers import (
     median_scale,
     prior_widths,
 )
-from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.messages import length

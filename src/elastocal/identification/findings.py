@@ -1,43 +1,43 @@
-"""What a result is worth: each judgement with its numbers, its threshold and what to do."""
+"""What a result is worth: each judgement with its numbers, threshold and remedy; in sentences."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy import linalg, special
 
 from elastocal.identification import noise_summary
-from elastocal.identification.mistakes import exchanged
+from elastocal.identification.mistakes import (
+    STATED_BY_FILE,
+    exchanged,
+    far_values,
+    impossible,
+    impossible_values,
+    load_unit,
+)
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
-from elastocal.identification.outliers import kept_of
+from elastocal.identification.noise_summary import ResidualSummary
+from elastocal.identification.outliers import kept_of, named_runs
 from elastocal.identification.prediction import unread_markers
-from elastocal.identification.residuals import ResidualSummary
-from elastocal.identification.result import Calibration, Estimate, Finding
-from elastocal.identification.sentences import AT_BOUND, made, more_poses
-from elastocal.identification.solve import Solution, far_off
-from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits
+from elastocal.identification.result import (
+    Calibration,
+    Estimate,
+    Finding,
+    made,
+    more_poses,
+)
+from elastocal.identification.solve import Solution
 from elastocal.measurements import Measurements, numbered
-from elastocal.messages import EXACT, counted, listed, option, rounded
+from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of
 from elastocal.model.calibrated import MOSTLY, mostly_prior
-from elastocal.model.effects.base import Parameter, index
+from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.geometry import (
-    JointOffset,
-    LinkGeometry,
-    MarkerOrientation,
-    TrackerDistortion,
-)
-from elastocal.model.effects.statics import (
-    RATED_WIND_UP,
-    JointCompliance,
-    rated_torque,
-    usual_over_stated_mass,
-    weight_torque,
-)
+from elastocal.units import display
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
 # own.  A threshold stands here.
@@ -53,10 +53,6 @@ LITTLE = 1.25  # times better than the nominal arm, below which little was gaine
 # Test data lie where the calibration was not made, or the arm has changed, where their errors are
 # this much larger than held-out poses' and chance allows for it in one table of a hundred.
 WORSE, CHANCE = 1.25, 0.01
-# Factor to which the compliances of an arm are known before: those of the KR 270 are 0.8 times what
-# its links' weights let expect, and 1.5 times what its length does.
-EXPECTED_TO = 2.0
-SURELY = 5.0  # standard deviations beyond a physical bound, by which no estimate errs by chance
 MANY = 0.05  # share of the readings fitted, above which those beyond the noise are no accidents
 SCATTERS = 0.01  # p-value below which joints settle anew at each visit, or something drifts
 NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
@@ -100,21 +96,21 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
     fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
     noise = [*compared, *_repeats(result, fits)]
     explained = _explained(result, noise)
-    visits, far = list(_visits(result, fits)), list(_far_values(result, explained))
+    visits, far = list(_visits(result, fits)), list(far_values(result, explained, _lacking(result)))
     held, nominal, shares = result.heldout_rms, result.nominal_rms, result.prior_share
     if not result.converged:
         yield _poor("not_converged", reason=result.reason)
     if nominal <= held < math.inf and not only_placed(result):
         yield _poor("no_better_than_nominal", heldout_rms_um=held, nominal_rms_um=nominal)
     yield from (f for f in of_solution if f.kind == "exchanged_markers")
-    yield from _impossible(result)
+    yield from impossible_values(result)
     yield from far
     if copies := result.copies:
         fitted = len(result.observations.lead)
         yield _note("copied_readings", copies=len(copies), fitted=fitted, lines=copies)
     # Where all lengths are others than the cell's, so are the compliances to expect.
     if not any(f.kind == "scale" for f in far):
-        yield from _load_unit(result)
+        yield from load_unit(result)
     if weak := tuple(name for name, standing in standings(result).items() if standing == WEAK):
         yield _note("hardly_shown", parameters=weak)
     yield from (f for f in visits if f.kind == "scatter_not_counted")
@@ -169,198 +165,6 @@ def _explained(result: Calibration, noise: list[Finding]) -> bool:
 
 def _overfitted(result: Calibration) -> float:
     return len(result.observations.value) / max(result.dof, 1)
-
-
-# Loads in another unit.
-#
-# Deflections tell compliance times load: loads that are too small by a factor make every
-# compliance too large by it, without a trace in the residual.
-
-KILOGRAMS = 9.80665  # N, the weight of one
-
-
-def _load_unit(result: Calibration) -> Iterator[Finding]:
-    """Are all compliances about as much too large as kilograms for newtons make them, or too small?
-
-    Without a load there is no unit of one.  What they should be about is what the cell states, else
-    what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
-    The median of the ratios has to be that factor to within what arms differ from what is expected
-    of them (EXPECTED_TO).  By the links' weights, a rule of thumb, it is worth a look, and no more.
-    """
-    model, chain = result.model, result.model.chain
-    known = {e.name: e.value for e in result.ordinary if e.value is not None}
-    # Turned round, the loads may be in another unit as well: then the sizes tell.
-    known |= {p.name: abs(e.held) for p, e in impossible(result)}
-    given, rated, heavier = list[float](), list[float](), usual_over_stated_mass(chain)
-    for p in model.parameters if result.observations.table.force.any() else ():
-        value = known.get(p.name, 0.0)
-        if p.effect != JointCompliance.name or value <= 0:
-            continue
-        i = index(p.where)
-        if p.nominal > 0:
-            given.append(value / p.nominal)
-        elif chain.kinds[i] == "revolute" and weight_torque(chain, i) > 0:
-            torque = rated_torque(chain, model.cell, i) or 0.0
-            rated.append(value * heavier * torque / RATED_WIND_UP)
-    if not (ratios := given or rated):
-        return
-    ratio, by = float(np.median(ratios)), "the cell's nominal compliances"
-    if not given:
-        by = "the weights of the links" if heavier == 1 else "the length of the arm"
-    if abs(abs(math.log(ratio)) - math.log(KILOGRAMS)) > math.log(EXPECTED_TO):
-        return
-    unit, cause, undo = (
-        ("kilograms", "the force columns hold kilograms", "multiply")
-        if ratio > 1
-        else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
-    )
-    remedy = (
-        f"Check the unit of the loads: the compliances are {rounded(ratio, 2)} times those "
-        f"expected from {by}, as where {cause}. If so, {undo} force_x_N, force_y_N "
-        "and force_z_N by 9.81."
-    )
-    yield (_care if given else _note)("load_unit", remedy, ratio=ratio, by=by, unit=unit)
-
-
-def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
-    """Those more than SURELY standard deviations beyond a physical bound (of the interval of 95 %,
-    half is 1.96 of them or more)."""
-    return [
-        (p, e)
-        for p, e in zip(result.model.parameters, result.estimates, strict=True)
-        if e.limits is not None
-        and max(p.lower - e.held, e.held - p.upper) > SURELY / 1.96 * np.ptp(e.limits) / 2
-    ]
-
-
-def _impossible(result: Calibration) -> Iterator[Finding]:
-    """Values that no arm has.  Where most compliances are among them, no missing effect explains
-    it, but loads in the opposite direction do, and no load is compensated rightly."""
-    if not (found := impossible(result)):
-        return
-    springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
-    turned = [p for p, _ in found if p.effect == JointCompliance.name]
-    signs = 2 * len(turned) > len(springs) and bool(result.observations.table.force.any())
-    parameters, estimates = zip(*found, strict=True)
-    turn_round = (
-        "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
-        "negative. Turn the sign round in the table if it is wrong (torque columns too), and "
-        "identify again."
-    )
-    yield (_poor if signs else _care)(
-        "impossible_values", turn_round if signs else AT_BOUND,
-        parameters=tuple(p.name for p in parameters), values=tuple(e.held for e in estimates),
-        units=tuple(p.unit for p in parameters),
-        likely="the sign of the force columns" if signs else "",
-    )  # fmt: skip
-
-
-# Values far from nominal: a joint to remaster, a robot file of another arm, a missing effect.
-#
-# How large a value is says nothing by itself.  Where the noise explains what is left and held-out
-# poses agree, the value is what the arm has; where much is left, a value that no arm has stands in
-# for what the model lacks.
-
-LARGEST = 0.5  # beyond it the points hardly move, as of a tip that touches one, or do so otherwise
-NEARLY = 0.1  # share of the square that a scale leaves of what it explains
-SOME = 400  # readings that are enough for it
-FEWEST_POSES = 8
-# What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
-# effect is in the cell because someone named it: their sizes are findings, no evidence.
-STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
-
-
-def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
-    """Values whose whole interval lies more than FAR typical deviations from nominal, of a
-    combination all that it may hold; doubted unless the noise explains the residual, and held-out
-    poses agree (`explained`)."""
-    ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
-    typical = {p.name: p.typical or 0.0 for p in result.model.parameters}
-    for c in result.combinations:
-        name = next(iter(c.terms))
-        ends[name] = c.ci95
-        typical[name] = math.hypot(*(share * typical[n] for n, share in c.terms.items()))
-    half = {name: (high - low) / 2 for name, (low, high) in ends.items()}
-    far = [
-        (p, x - p.nominal, times)
-        for p, x in zip(result.model.parameters, result.x.tolist(), strict=True)
-        if p.effect in STATED_BY_FILE and p.typical and p.name in half
-        and (times := far_off(x - p.nominal, half[p.name], typical[p.name]))
-    ]  # fmt: skip
-    if zeros := [(p, off) for p, off, _ in far if p.effect == JointOffset.name]:
-        told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
-                f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
-        turned = zeros[-1][0].where == f"joint{result.model.chain.n_joints}"
-        turned &= result.observations.kind == "pose"
-        turned &= MarkerOrientation.name not in {p.effect for p in result.model.parameters}
-        yield _note(
-            "joint_zero",
-            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration."
-            + " Where the target is mounted at an angle, fit marker_orientation." * turned,
-            joints=tuple(p.where for p, _ in zeros), values=tuple(v for _, v in zeros),
-            units=tuple(p.unit for p, _ in zeros), ci95_half=tuple(half[p.name] for p, _ in zeros),
-        )  # fmt: skip
-    if (scale := scale_of(result)) is not None:
-        other = abs(scale - 1) > OF_A_TARGET
-        likely = "another robot" if other else "a scale error"
-        remedy = (
-            "Check that the cell describes the robot that was measured ([robot]): no target or "
-            "scale bar is wrong by so much."
-            if other
-            else "Look for what scales the readings: the size stated of a tag or scale bar, or a "
-            f"unit. Multiplied by {rounded(1 / scale, 4)} they have the robot's file's lengths."
-        )
-        yield _care("scale", remedy, readings_over_file=scale, likely=likely)
-        return
-    others = sorted((f for f in far if f[0].effect != JointOffset.name), key=lambda f: -f[2])
-    if others:
-        told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
-                for p, off, _ in others]  # fmt: skip
-        compare = (
-            "The arm is not the one of the robot's file: compare its lengths and angles with the "
-            f"data sheet (off, and known to: {listed(told, 3)})."
-        )
-        yield (_note if explained else _care)(
-            "far_from_nominal" if explained else "unheard_of",
-            compare if explained else _lacking(result),
-            parameters=tuple(p.name for p, *_ in others),
-            typical_sizes=tuple(times for *_, times in others),
-            values=tuple(off + p.nominal for p, off, _ in others),
-            units=tuple(p.unit for p, *_ in others), readings_set_apart=len(result.excluded),
-        )  # fmt: skip
-
-
-def scale_of(result: Calibration) -> float | None:
-    """By what factor all lengths that were read exceed those of the nominal arm; None where no such
-    scale shows.
-
-    The linear map A of the readings onto the nominal arm is a rotation with a scale where that is
-    wrong.  One that takes nine tenths of the square away, differs less between directions than from
-    one, and is larger than any arm's lengths err together, is one of the readings.
-    """
-    table = result.observations.table
-    own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
-    if table.position is None or own or len(np.unique(table.q, axis=0)) < FEWEST_POSES:
-        return None
-    extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
-    if not SCALED * extent / 10 < result.nominal_rms < math.inf:
-        return None
-    table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
-    flange = result.model.rigid.flange_poses(table)
-    found = LinearFits(flange[None], np.asarray(table.position), table.marker)
-    if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
-        return None
-    size = np.linalg.svd(found.matrix[0], compute_uv=False)
-    off = abs(float(found.scale[0]) - 1)
-    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
-    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST else None
-
-
-def _size(value: float, unit: str) -> str:
-    number, unit = {"m": (value * 1e3, " mm"), "rad": (math.degrees(value), "°")}.get(
-        unit, (value, f" {unit}")
-    )
-    return f"{abs(number):.{2 if abs(number) < 10 else 3}g}{unit}"
 
 
 # Noise, repeats, and what changes with time.
@@ -782,3 +586,145 @@ def only_placed(result: Calibration) -> bool:
         effect_of(p.effect).registered or e.note.startswith("fixed")
         for p, e in zip(result.model.parameters, result.estimates, strict=True)
     )
+
+
+# What a warning says of a finding: its numbers and its remedy by name.
+SENTENCES = {
+    "copied_readings": (
+        "{copies} readings repeat others to the last digit (lines {lines}) and were excluded: "
+        "copies add no information and make intervals too narrow. {remedy}"
+    ),
+    "impossible_values": (
+        "Impossible values: {parameters} beyond a physical bound by more than 5 standard "
+        "deviations."
+    ),
+    **dict.fromkeys(("load_unit", "exchanged_markers", "scatter_not_counted"), "{remedy}"),
+    "not_converged": "The fit did not converge: {reason}. {remedy}",
+    "few_degrees_of_freedom": (
+        "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
+        "and the residual is too small. {remedy}"
+    ),
+    "not_held_out": (
+        "Some configuration alone determines a parameter, so there is no held-out error for "
+        "it. Measure more configurations."
+    ),
+    "ill_conditioned": (
+        "Ill-conditioned (condition number {condition_number} after scaling): the data barely "
+        "separate {parameters}. {remedy}"
+    ),
+    "residual_above_stated_noise": (
+        "The residual is {ratio:.1f} times the stated noise: an effect is missing or the stated "
+        "noise is too small. Intervals use the residual, not the stated noise. {look}."
+    ),
+    "lack_of_fit": (
+        "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
+        "and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
+        "place, or an effect is missing. The intervals do not include it and are too narrow: "
+        "use {count}intervals by cr2; measure more configurations rather than more repeats."
+    ),
+    "drift": (
+        "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
+        "{by}; {p}). Weights and intervals account for it, and whole blocks in time are "
+        "held out. {remedy}"
+    ),
+    "joint_scatter": (
+        "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
+        "{p}). Weights and intervals account for it. {remedy}"
+    ),
+    "beyond_bound": (
+        "{parameter} = {value} ± {std} {unit} lies beyond its physical bound {bound}: {remedy}"
+    ),
+    "many_faulty_readings": (
+        "Too many for reading errors: a shifted block of readings, or a missing effect in some "
+        "load state, marker or region. {remedy}"
+    ),
+}
+DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
+# The same of several parameters, whose names are told together.
+OF_SEVERAL = {
+    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}",
+}
+
+
+def warning_sentences(result: Calibration) -> dict[str, str]:
+    """The findings that call for attention as sentences that name the remedy, each with the kind of
+    finding that it tells; of those that are alike one sentence."""
+    groups: dict[Any, list[Finding]] = {}
+    for k, f in enumerate(result.findings):
+        alike = (f.kind, f.numbers["bound"], f.numbers["unit"]) if f.kind in OF_SEVERAL else k
+        groups.setdefault(alike, []).append(f)
+    return {text: same[0].kind for same in groups.values() for text in _told(result, same)}
+
+
+def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
+    f = same[0]
+    if f.kind == "faulty_readings":
+        if kept := result.outliers:
+            yield (
+                f"{counted(len(kept), 'reading lies', 'readings lie')} beyond what the noise "
+                f"explains (lines {_runs(o.line for o in kept)}); they are in the fit. Check "
+                f"them; {option('outliers', 'drop')} excludes them."
+            )
+        if apart := result.excluded:
+            yield (
+                f"{counted(len(apart), 'reading was', 'readings were')} excluded as outliers "
+                f"(lines {_runs(o.line for o in apart)}). They are mistakes, or signs of a missing "
+                "effect. All are listed in the result under 'excluded'; "
+                f"{option('outliers', 'keep')} keeps them."
+            )
+    elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
+        words = {
+            k: ", ".join(one if isinstance(one, str) else rounded(one) for one in v)
+            if isinstance(v, tuple) else rounded(v, DIGITS[k]) if k in DIGITS else v
+            for k, v in f.numbers.items()
+        }  # fmt: skip
+        words["along"] = "" if result.model.observe == "distance" else " in each direction"
+        words["p"] = size_of(f.number("p")) if "p" in words else ""
+        within = f.kind == "beyond_bound"  # there the remedy ends a sentence
+        words |= _shown(f) if within else {}
+        default = "the default method, whose noise model has this scatter, or "
+        words["count"] = "" if result.noise.estimated else default
+        ask = f.remedy.startswith("Ask")
+        words["look"] = "Look for missing effects (diagnose)" if ask else "Repeat some poses"
+        words["remedy"] = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
+        if f.kind == "copied_readings":
+            words["lines"] = _runs(result.copies)
+        if len(same) == 1:
+            yield SENTENCES[f.kind].format(**words)
+            return
+        pairs = ("{value} ± {std}".format(**_shown(other)) for other in same)
+        words["named"] = gathered(str(other.numbers["parameter"]) for other in same)
+        yield OF_SEVERAL[f.kind].format(**words, values=listed(pairs, 4))
+
+
+def _shown(f: Finding) -> dict[str, str]:
+    """Value, standard deviation and bound of a parameter in the unit that people think in."""
+    unit = str(f.numbers["unit"])
+    digits = {"value": 3, "std": 2, "bound": 3}
+    sizes = {k: rounded(display(f.number(k), unit)[0], n) for k, n in digits.items()}
+    return sizes | {"unit": display(0.0, unit)[1]}
+
+
+def _runs(lines: Iterable[int]) -> str:
+    runs = named_runs(list(lines))
+    return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
+
+
+# Of these the warning, or the line on the prior, says what to do.
+TOLD_ELSEWHERE = {"mostly_prior"} | {k for k, text in SENTENCES.items() if "{remedy}" in text}
+
+
+SLIGHT = 0.1  # of the error at new poses: what is open by less raises it by half a percent
+
+
+def next_steps(result: Calibration) -> list[Finding]:
+    """Findings whose remedy is still to be told, each remedy once, the worthiest first: what speaks
+    against the result, what is worth knowing, what to do with it, and last what hardly matters."""
+    steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in TOLD_ELSEWHERE}
+    # One that begins with another says that too.
+    whole = {r for r in steps if r and not any(s != r and s.startswith(r) for s in steps)}
+    order = [f for f in result.findings if f.remedy in whole and steps[f.remedy] is f]
+    found, ranks = result.predicted, ("poor", "care", "note", "good", "trust", "undetermined")
+    slight = found is not None and found.open < SLIGHT * found.rms
+    last = {"trust", "undetermined"} if slight else {"trust"}
+    return sorted(order, key=lambda f: ranks.index(f.kind if f.kind in last else f.severity))

@@ -15,13 +15,15 @@ import numpy as np
 from scipy import sparse
 
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import KNOWN_NOISE, judged
+from elastocal.identification.findings import KNOWN_NOISE, judged, warning_sentences
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
     Covariance,
-    PriorRows,
     Rows,
     clustered,
+    held_out_residual,
+    rms_3d,
+    told_by_one,
     variance_of,
 )
 from elastocal.identification.mistakes import refuse_nonsense
@@ -33,8 +35,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Kind, Readings
-from elastocal.identification.noise_summary import noise_of
-from elastocal.identification.options import ROBUST, Course, IntervalKind, MethodResult, Options
+from elastocal.identification.noise_summary import noise_of, summarise_residuals
 from elastocal.identification.outliers import describe, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
@@ -42,16 +43,11 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     predicted_error,
 )
-from elastocal.identification.residuals import (
-    held_out_residual,
-    rms_3d,
-    summarise_residuals,
-    told_by_one,
-)
 from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
 from elastocal.identification.scrutiny import MOST_NUMBERS
-from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.solve import (
+    Course,
+    MethodResult,
     Solution,
     bent,
     choose,
@@ -62,6 +58,9 @@ from elastocal.identification.solve import (
     solve,
 )
 from elastocal.identification.start import (
+    ROBUST,
+    IntervalKind,
+    Options,
     check_rows,
     check_table,
     copied,
@@ -72,7 +71,7 @@ from elastocal.identification.start import (
     start_values,
     without_copies,
 )
-from elastocal.identification.weighted_problem import Part, Problem, Weights, weights_for
+from elastocal.identification.weighted_problem import Part, PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.messages import ElastocalError, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
@@ -211,8 +210,7 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     if table.time is None and model.cell.model.clock == "rows":  # after the campaign
         table = replace(table, time=np.full(len(table), NEVER_YET))
     observed = observe(table, model.observe)
-    unit, x, every = Weights("none", None, False, ""), result.x, np.arange(len(model.parameters))
-    error = Problem(model, observed, unit, x, every, np.ones(len(x))).residual(x)
+    error = observed.value - model.predict(table, result.x, observed)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
     errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
@@ -713,8 +711,8 @@ def _published(course: Course, start: Solution) -> MethodResult:
     observed, fit, options = start.problem.observations, start.fit, course.options
     method, good, group = options.resolved, ~course.faulty, None
     if method == "eq14":
-        key = observed.configuration[:, None] * observed.size + np.arange(observed.size)
-        group = np.unique(key.ravel(), return_inverse=True)[1].ravel()
+        own = observed.configuration[:, None] * observed.size + np.arange(observed.size)
+        group = own.ravel()
     size = start.problem.sizes[fit.columns]
     with said_of(f"{observed.table.source}: {option('method', method)}"):
         last = published.eq14(fit.B * size, fit.residual, group)[-1]

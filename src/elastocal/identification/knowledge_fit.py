@@ -8,27 +8,19 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.identification.constrained import Reduced
-from elastocal.identification.knowledge import Constraints, share_of_prior
-from elastocal.identification.least_squares import (
-    LEVEL,
-    Covariance,
-    Fit,
-    Objective,
-    PriorRows,
-    t_quantile,
-)
-from elastocal.identification.least_squares import fit as least_squares
-from elastocal.identification.options import MethodResult, Options
-from elastocal.identification.residuals import held_out_by_parts
+from elastocal.identification.knowledge import Constraints, Reduced, share_of_prior
+from elastocal.identification.least_squares import LEVEL, Covariance, held_out_by_parts, t_quantile
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
+    MethodResult,
     Reduction,
     Solution,
     reduce,
     residual_sigma,
 )
-from elastocal.identification.weighted_problem import RFactor
+from elastocal.identification.start import Options
+from elastocal.identification.weighted_problem import Fit, Objective, PriorRows, RFactor
+from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.messages import (
     ElastocalError,
     InsufficientDataError,
@@ -112,14 +104,13 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     u = np.zeros(len(size))
     at = objective.evaluate(u)
     for _ in range(MOST_STEPS):
-        A, b = objective.rows(u, at)
-        reduced = Reduced(A, b, objective.limits.moved(u, np.ones(len(u))))
+        reduced, A = Reduced(at.A, at.b, objective.limits.moved(u, np.ones(len(u)))), at.A
         best = reduced.minimum()
         step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
         while True:
             try:
                 at = objective.evaluate(u + step)
-                if objective.cost(u + step, at) <= limit + ASTRAY * rise:
+                if at.cost <= limit + ASTRAY * rise:
                     break
             except ElastocalError:
                 pass  # no equilibrium so far out
@@ -131,8 +122,6 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
             break
     return side * np.inf
 
-
-# The fit of a method again, under constraints and with a prior.
 
 # Which parameters a fit with constraints and a prior has.
 
@@ -159,7 +148,7 @@ def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntAr
         f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
     )
     named = np.intersect1d(np.union1d(known, tied), free)
-    R = problem.evaluate(solution.fit.x, free).r_factor.R
+    R = problem.evaluate(solution.fit.x, free)[1].R
     # An equality is exact: it counts as much as the most that anything else tells.
     A = A[:, free][A[:, free].any(axis=1)]
     most = np.linalg.norm(np.vstack([R, P[:, free]]) * problem.sizes[free], axis=0).max()
@@ -331,7 +320,7 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     columns, k = found.fit.columns, len(found.fit.columns)
     dropped = np.setdiff1d(before.dropped, columns)
     both = np.concatenate([columns, dropped])
-    R = problem.evaluate(found.fit.x, both).r_factor.R
+    R = problem.evaluate(found.fit.x, both)[1].R
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * problem.sizes[dropped] / problem.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0

@@ -1,247 +1,20 @@
-"""Nonlinear weighted least squares on the exact B, with what else is known of the parameters:
-
-    |W (y − h(X))|² + |target − P X|²   over X[columns],   lower ≤ X ≤ upper,  A X = b,  M(X) ⪰ 0
-
-A weak tie to the start, the prior of random coefficients and stated knowledge are all of them rows
-P; every fit is the same descent by Levenberg and Marquardt on R factors.  Then the covariance of
-its estimates, under different assumptions on the errors.
-"""
+"""What a least-squares fit says of itself: the covariance of its estimates, under different
+assumptions on the errors, and what it would predict of readings that had been left out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.identification.constrained import minimise
-from elastocal.identification.knowledge import System
-from elastocal.identification.weighted_problem import (
-    Evaluation,
-    Problem,
-    RFactor,
-    least_norm,
-    same_size,
-)
-from elastocal.messages import ElastocalError, InputError, InsufficientDataError
-from elastocal.units import Array, IntArray
-
-SETTLED = "the sum of squares no longer fell"
-NEGLIGIBLE = "the steps became negligible"
-EXHAUSTED = "the step limit was reached; the start may be far off or the data ill-conditioned"
-
-LEAST_DAMPING = 1e-18  # of the largest squared column, once a full step has failed
-SHORTER = 0.3
-ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
-
-
-# What a step promises of the cost where a descent ends.  The last step is taken: at a million rows
-# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
-TOLERANCE = 1e-8
-
-
-@dataclass(frozen=True)
-class PriorRows:
-    """What a fit knows of its columns besides the readings: P (k, columns) and target (k,) with
-    |target − P X|² beside whitened rows, and constraints on them."""
-
-    P: Array
-    target: Array
-    system: System | None = None
-
-    @classmethod
-    def near(cls, centre: Array, width: Array) -> PriorRows:
-        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
-        return cls(np.diag(1 / width), centre / width)
-
-    def restricted(self, columns: IntArray, x: Array) -> PriorRows:
-        """What it says of the `columns`, the others held at x.  Raises InputError where these alone
-        break a constraint."""
-        held = moved(x, columns, -x[columns])
-        system = None if self.system is None else self.system.restricted(columns, x)
-        return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
-
-
-@dataclass(frozen=True)
-class Fit:
-    """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual.
-
-    `columns` (fitted,) index the parameters; `known` is what the fit knew of them.
-    """
-
-    x: Array
-    residual: Array
-    r_factor: RFactor
-    converged: bool
-    reason: str
-    problem: Problem = field(repr=False)
-    columns: NDArray[np.int64]
-    known: PriorRows
-
-    @cached_property
-    def B(self) -> Array:
-        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
-        observed = self.problem.observations
-        return self.problem.model.regressor(observed.table, self.x, self.columns, observed).B
-
-    @cached_property
-    def whitened(self) -> Array:
-        """The whitened residual (rows,)."""
-        return self.problem.weights.apply(self.residual)
-
-    @cached_property
-    def of_free(self) -> RFactor:
-        """The R factor of all free columns at x."""
-        problem = self.problem
-        if np.array_equal(self.columns, problem.free):
-            return self.r_factor
-        return problem.evaluate(self.x, problem.free).r_factor
-
-    def cofactor(self) -> Array:
-        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
-        size = self.problem.sizes[self.columns]
-        inverse = self.r_factor.scaled(size).half
-        return (inverse @ inverse.T) * np.outer(size, size)
-
-
-class Objective:
-    """|e(u)|² + |target − P u|² under the `limits` on u, where X[columns] = x[columns] + size · u
-    and the other parameters are x (parameters,)."""
-
-    def __init__(
-        self, problem: Problem, columns: IntArray, x: Array, size: Array, known: PriorRows
-    ) -> None:
-        self.problem, self.columns, self.x, self.size = problem, columns, x, size
-        self.P, self.target = known.P * size, known.target - known.P @ x[columns]
-        self.system = known.system
-        self.limits = None if self.system is None else self.system.moved(x[columns], size)
-
-    def evaluate(self, u: Array) -> Evaluation:
-        """e, and the R factor of it and of B per unit of u; ElastocalError where the model has no
-        prediction."""
-        problem = self.problem
-        at = problem.evaluate(self.values(u), self.columns)
-        if not np.isfinite(at.r_factor.rss):
-            raise ElastocalError(
-                f"{problem.observations.table.source}: the model predicts no finite numbers at the "
-                "start values; look in the cell for a length, force or compliance far too large"
-            )
-        return replace(at, r_factor=at.r_factor.scaled(self.size))
-
-    def values(self, u: Array) -> Array:
-        """X (parameters,), what lies at its bound but for rounding on it."""
-        values, system = moved(self.x, self.columns, self.size * u), self.system
-        if system is not None:
-            own = values[self.columns]
-            for bound in (system.lower, system.upper):
-                own = np.where(np.abs(own - bound) <= ROUNDING * self.size, bound, own)
-            values[self.columns] = np.clip(own, system.lower, system.upper)
-        return values
-
-    def rows(self, u: Array, at: Evaluation) -> tuple[Array, Array]:
-        """A and b of the linearised cost |b − A step|²."""
-        rows = at.r_factor.augmented
-        A, b = np.vstack([rows[:, :-1], self.P]), self.target - self.P @ u
-        return A, np.concatenate([rows[:, -1], b])
-
-    def cost(self, u: Array, at: Evaluation) -> float:
-        return at.r_factor.rss + float(np.sum((self.target - self.P @ u) ** 2))
-
-    def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
-        """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
-        p, (A, b) = len(u), self.rows(u, at)
-        damped, target = np.vstack([A, np.sqrt(damping) * np.eye(p)]), np.append(b, np.zeros(p))
-        if self.limits is None:
-            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
-            step = least_norm(damped, target, cond=cond)
-        else:
-            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
-        left = b - A @ step
-        return step, float(b @ b - left @ left)
-
-    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Evaluation, str]:
-        """Full Gauss–Newton steps while they lower the cost, damped ones where they do not: where
-        they end, and why.
-
-        Ends where the linearised cost promises less than `tolerance` of itself: that last step is
-        still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
-        converges.  Steps are judged by the cost itself, so no rounding of it can keep it from
-        ending.
-        """
-        at = self.evaluate(u)
-        cost, damping = self.cost(u, at), 0.0
-        failed = -1.0  # the damping that was too little a step ago
-        for _ in range(most - 1):
-            step, promised = self.step(u, at, damping)
-            last, small = promised <= tolerance * cost, np.abs(step).max(initial=0.0) <= ROUNDING
-            if last and small:
-                return u, at, NEGLIGIBLE
-            try:
-                trial = self.evaluate(u + step)
-                trial_cost = self.cost(u + step, trial)
-            except ElastocalError:
-                trial, trial_cost = at, np.inf
-            if last and (damping == 0 or failed >= 0):  # more than what is left is not to be had
-                kept = trial_cost <= cost * (1 + ROUNDING)
-                return (*((u + step, trial) if kept else (u, at)), SETTLED)
-            if cost - trial_cost > 1e-4 * promised:
-                u, at, cost = u + step, trial, trial_cost
-                less = damping / 10 if damping > LEAST_DAMPING * _steepest(at) else 0.0
-                damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
-            elif small:
-                return u, at, NEGLIGIBLE
-            else:
-                failed, damping = damping, self._shortened(u, at, damping, step)
-        return u, at, EXHAUSTED
-
-    def _shortened(self, u: Array, at: Evaluation, damping: float, step: Array) -> float:
-        """The damping with which a step that failed has at most SHORTER of its length."""
-        longest = SHORTER * float(np.linalg.norm(step))
-        damping = max(10 * damping, LEAST_DAMPING * _steepest(at))
-        while np.linalg.norm(self.step(u, at, damping)[0]) > longest:
-            damping *= 10
-        return damping
-
-
-def _steepest(at: Evaluation) -> float:
-    return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
-
-
-def moved(x: Array, columns: IntArray, step: Array) -> Array:
-    out = x.astype(float)
-    out[columns] += step
-    return out
-
-
-def fit(
-    problem: Problem, columns: IntArray, x: Array, *, known: PriorRows | None = None,
-    max_steps: int = 60, tolerance: float = TOLERANCE,
-) -> Fit:  # fmt: skip
-    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
-    other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
-
-    On R factors, with the cost and the gradient of all rows, until a step promises less than
-    `tolerance` of the cost.  Every step starts from the residual of the exact model, so that the
-    rounding of one is taken back by the next.  Constraints are convex and kept in every step: where
-    none improves the fit, the conditions of Karush, Kuhn and Tucker hold.
-
-    Raises ElastocalError where the start has poses without equilibrium, InputError for constraints
-    that contradict each other, InsufficientDataError where they leave something undetermined.
-    """
-    size, u = problem.sizes[columns], np.zeros(len(columns))
-    known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
-    objective = Objective(problem, columns, x, size, known)
-    if objective.limits is not None:  # the nearest that is allowed
-        u = minimise(np.eye(len(u)), u, objective.limits).x
-    u, at, reason = objective.descend(u, tolerance, max_steps)
-    return Fit(
-        objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
-        problem, columns, known,
-    )  # fmt: skip
-
+from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
+from elastocal.measurements import numbered
+from elastocal.messages import InputError, InsufficientDataError
+from elastocal.units import Array, BoolArray, IntArray
 
 # An estimated covariance of a fit, and the t intervals that follow from it.
 
@@ -511,3 +284,186 @@ def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
     power = np.where(single, 1.0, gap) ** (-0.5 if kind[-1] == "2" else -1.0)
     A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
     return (A @ Qc if by_row else Qc @ A), determined
+
+
+# Held-out residuals: cross-validation over configurations in closed form.
+
+
+def held_out_residual(
+    B: Array, residual: Array, weights: Weights, configuration: IntArray, size: int
+) -> Array:
+    """Residual (rows,) of every configuration under the fit to all the others.
+
+    With whitened B = QR and whitened residual e, leaving configuration c out moves the estimate
+    by x̂ − x̂₍₋c₎ = R⁻¹ Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c, exactly for a linear model (Allen 1974, PRESS,
+    by groups); the residual of c then grows by B_c times that.  A configuration that alone
+    determines a parameter has no held-out residual: its rows are infinite.
+
+    B (rows, columns) and residual (rows,) raw; `configuration` (observations,), `size` rows each.
+    Where all readings are correlated, as by a drift, those of `weights.together` are left out at a
+    time.
+    """
+    rows, e = weights.beside_common(B, residual)
+    Q, R = linalg.qr(rows, mode="economic")
+    n, k = len(B), len(rows) - len(B)
+    code = np.repeat(configuration if weights.together is None else weights.together, size)
+    if k:
+        # What all have in common are columns beside B, held by rows of their own that never go out;
+        # what is predicted is without them.
+        e = e - Q @ (Q.T @ e)
+        B = np.pad(B, ((0, k), (0, k)))
+        code = np.concatenate([code, code.max() + 1 + np.arange(k)])
+    seen = np.asarray(linalg.solve_triangular(R, B.T, trans="T").T)
+    return residual + growth(seen, Q, e, code)[:n]
+
+
+def held_out_by_parts(
+    problem: Problem, x: Array, columns: IntArray, half: Array, step: Array | None = None
+) -> tuple[Array, Array]:
+    """The same with the model linearised at x, a part at a time, and the leverage (rows,) of each.
+
+    `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
+    the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
+    step to the linear model's minimum, where x is not it.
+    """
+    held, leverage = np.empty((2, len(problem.observations.value)))
+    together, size = problem.weights.together, problem.observations.size
+
+    def leave_out(part: Part) -> None:
+        at = problem.regressor(part, x, columns)
+        residual = at.residual
+        if step is not None:
+            moved = np.flatnonzero(step)
+            residual = residual - problem.regressor(part, x, moved).B @ step[moved]
+        B = at.B @ half
+        Q, e = part.weights.apply(B), part.weights.apply(residual)
+        labels = part.observations.configuration if together is None else together
+        held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, size))
+        leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
+
+    list(problem.each(leave_out))
+    return held, leverage
+
+
+def growth(B: Array, Q: Array, e: Array, configuration: IntArray) -> Array:
+    """By how much (rows,) the residual grows where its configuration is left out; B are columns
+    that are orthonormal as whitened ones, Q."""
+    grown = np.empty(len(e))
+    for rows, moved, alone in left_out(Q, e, configuration):
+        grown[rows] = (B[rows] @ moved[..., None])[..., 0]
+        grown[rows[alone]] = np.inf
+    return grown
+
+
+def left_out(
+    Q: Array, e: Array, configuration: IntArray
+) -> Iterator[tuple[IntArray, Array, BoolArray]]:
+    """Rows (g, m) of configurations of one size, Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c (g, columns), and which
+    are alone in some direction: there the latter is meaningless."""
+    for rows in same_size(configuration):
+        Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
+        # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
+        many = rows.shape[1] > Q.shape[1]
+        share = Qt @ Qc if many else Qc @ Qt
+        gap, alone = np.eye(share.shape[1]) - share, np.zeros(len(share), dtype=bool)
+        # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
+        heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
+        alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
+        gap[alone] = np.eye(share.shape[1])
+        own = e[rows][..., None]
+        moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)
+        yield rows, np.asarray(moved[..., 0], dtype=np.float64), alone
+
+
+def told_by_one(B: Array, configuration: IntArray) -> Array:
+    """P (columns, columns): the part P·δ of a deviation δ of the estimates that the readings of one
+    of these configurations alone hold, so that nothing checks it.
+
+    With whitened B = QR, a direction u of Q_c with Q_cᵀQ_c u = u is shown by configuration c only
+    (all other Q are at right angles to it); with these as columns of U, P = R⁻¹ U Uᵀ R.
+    `configuration` (rows,), −1 where the others can do without it.
+    """
+    Q, R = linalg.qr(B, mode="economic")
+    found = [np.zeros((len(R), 0))]
+    for c in np.unique(configuration[configuration >= 0]):
+        share, direction = np.linalg.eigh(Q[configuration == c].T @ Q[configuration == c])
+        found.append(direction[:, share > 1 - ALONE])
+    U = np.hstack(found)
+    return np.asarray(linalg.solve_triangular(R, U) @ (U.T @ R))
+
+
+def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
+    """Factors (rows,) that make what blocks in time are off by what a campaign of another day is.
+
+    Blocks of one campaign share part of the drift FFᵀ, and the fit follows it.  With x̂ and û the
+    estimates of parameters and drift from the other blocks, C = cov(x̂ − x, û − u) and Σ₀ the other
+    noise, a reading of the block that was left out and one with a drift of its own vary by
+
+        Σ₀ + FFᵀ + B C_xx Bᵀ + F C_ux Bᵀ + (F C_ux Bᵀ)ᵀ     and     Σ₀ + FFᵀ + B C_xx Bᵀ
+
+    (cov(x̂, û) = 0: Henderson 1975, Biometrics 31, 423).
+    """
+    F, together = weights.common, weights.together
+    assert F is not None and together is not None and weights.whiten is not None
+    p, k = B.shape[1], F.shape[1]
+    Q, R = linalg.qr(weights.beside_common(B, np.zeros(len(B)))[0], mode="economic")
+    T = linalg.solve_triangular(R, np.eye(p + k))
+    factor = np.ones(len(B))
+    block, whiten = np.repeat(together, size), weights.whiten.tocsr()
+    for b in np.unique(block):
+        rows = np.flatnonzero(block == b)
+        gap = np.eye(p + k) - Q[rows].T @ Q[rows]
+        if np.linalg.eigvalsh(gap)[0] < ALONE:
+            continue
+        C = T @ np.linalg.solve(gap, T.T)
+        own = np.linalg.inv(whiten[rows][:, rows].toarray())
+        new = (own**2).sum(axis=1) + (F[rows] ** 2).sum(axis=1)
+        new += ((B[rows] @ C[:p, :p]) * B[rows]).sum(axis=1)
+        shared = ((F[rows] @ C[p:, :p]) * B[rows]).sum(axis=1)
+        factor[rows] = np.sqrt(new / (new + 2 * shared))
+    return factor
+
+
+def rms_3d(residual: Array, size: int) -> float:
+    """Root mean square length in m of the position part of the residual (rows,)."""
+    parts = residual.reshape(-1, size)[:, :3]
+    return float(np.sqrt((parts**2).sum(axis=1).mean()))
+
+
+# Does a wider set of parameters predict better?  A test, since any gain is taken too often.
+
+CHANCE = 0.01  # of the wider set being taken though the parameters it adds are none
+
+
+def f_test(
+    gain: float | Array, columns: int, rest: float | Array, dof: float | Array
+) -> tuple[Any, Any]:
+    """F and its p-value where `columns` took `gain` off a sum of squares of whitened residuals, of
+    which `rest` is left with `dof` degrees of freedom: p is the chance of that if they are none."""
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # nothing is left
+        F = np.divide(gain, columns) * dof / rest
+    return F, special.fdtrc(columns, dof, F)
+
+
+def predicts_better(
+    narrow: Array, wide: Array, weights: Weights, configuration: IntArray, size: int
+) -> bool:
+    """Do the held-out residuals `wide` (rows,) of more parameters show that `narrow` (rows,) lacks
+    some?
+
+    Both models see the same noise, and the wider one errs more from estimating more: under the
+    narrow one's truth f_c = |n_c|² − (|w_c|² − |n_c − w_c|²) = 2 n_cᵀ(n_c − w_c), whitened, has
+    the mean zero over configurations c, since n_c − w_c comes from the others (Clark and West
+    2007, J. Econometrics 138, 291).  True where its t exceeds the quantile of a one-sided test and
+    the squares themselves became smaller.
+    """
+    before, after = rms_3d(narrow, size), rms_3d(wide, size)
+    if not after < before < np.inf:
+        return bool(after < before)
+    n, w = weights.apply(narrow), weights.apply(wide)
+    own = np.repeat(numbered(configuration), size)
+    f = np.bincount(own, 2 * n * (n - w))
+    if len(f) < 2:
+        return False
+    deviation = float(f.std(ddof=1)) / np.sqrt(len(f))
+    return bool(f.mean() > deviation * special.stdtrit(len(f) - 1, 1 - CHANCE))

@@ -8,8 +8,10 @@ residuals no arm could have ends here, with the likely cause.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain as chain_of
 from itertools import combinations, product
 
@@ -20,10 +22,26 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell import Cell
 from elastocal.cell_tables import ModelSpec, Tool
 from elastocal.identification.outliers import FALSE_ALARM, named_runs
+from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
+from elastocal.identification.solve import far_off
 from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
 from elastocal.measurements import Measurements
 from elastocal.messages import InsufficientDataError, length, listed, rounded
 from elastocal.model.chain import Chain
+from elastocal.model.effects.base import Parameter, index
+from elastocal.model.effects.geometry import (
+    JointOffset,
+    LinkGeometry,
+    MarkerOrientation,
+    TrackerDistortion,
+)
+from elastocal.model.effects.statics import (
+    RATED_WIND_UP,
+    JointCompliance,
+    rated_torque,
+    usual_over_stated_mass,
+    weight_torque,
+)
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
@@ -559,3 +577,201 @@ def _as_stated(tool: Tool, names: tuple[str, ...], places: Array) -> IntArray:
         if (off**2).sum() > level * (crossed**2).sum():
             best[[a, b]] = best[[b, a]]
     return best
+
+
+# Loads in another unit.
+#
+# Deflections tell compliance times load: loads that are too small by a factor make every
+# compliance too large by it, without a trace in the residual.
+
+# Factor to which the compliances of an arm are known before: those of the KR 270 are 0.8 times what
+# its links' weights let expect, and 1.5 times what its length does.
+EXPECTED_TO = 2.0
+SURELY = 5.0  # standard deviations beyond a physical bound, by which no estimate errs by chance
+KILOGRAMS = 9.80665  # N, the weight of one
+_note, _care, _poor = (partial(made, s) for s in ("note", "care", "poor"))
+
+
+def load_unit(result: Calibration) -> Iterator[Finding]:
+    """Are all compliances about as much too large as kilograms for newtons make them, or too small?
+
+    Without a load there is no unit of one.  What they should be about is what the cell states, else
+    what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
+    The median of the ratios has to be that factor to within what arms differ from what is expected
+    of them (EXPECTED_TO).  By the links' weights, a rule of thumb, it is worth a look, and no more.
+    """
+    model, chain = result.model, result.model.chain
+    known = {e.name: e.value for e in result.ordinary if e.value is not None}
+    # Turned round, the loads may be in another unit as well: then the sizes tell.
+    known |= {p.name: abs(e.held) for p, e in impossible(result)}
+    given, rated, heavier = list[float](), list[float](), usual_over_stated_mass(chain)
+    for p in model.parameters if result.observations.table.force.any() else ():
+        value = known.get(p.name, 0.0)
+        if p.effect != JointCompliance.name or value <= 0:
+            continue
+        i = index(p.where)
+        if p.nominal > 0:
+            given.append(value / p.nominal)
+        elif chain.kinds[i] == "revolute" and weight_torque(chain, i) > 0:
+            torque = rated_torque(chain, model.cell, i) or 0.0
+            rated.append(value * heavier * torque / RATED_WIND_UP)
+    if not (ratios := given or rated):
+        return
+    ratio, by = float(np.median(ratios)), "the cell's nominal compliances"
+    if not given:
+        by = "the weights of the links" if heavier == 1 else "the length of the arm"
+    if abs(abs(math.log(ratio)) - math.log(KILOGRAMS)) > math.log(EXPECTED_TO):
+        return
+    unit, cause, undo = (
+        ("kilograms", "the force columns hold kilograms", "multiply")
+        if ratio > 1
+        else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
+    )
+    remedy = (
+        f"Check the unit of the loads: the compliances are {rounded(ratio, 2)} times those "
+        f"expected from {by}, as where {cause}. If so, {undo} force_x_N, force_y_N "
+        "and force_z_N by 9.81."
+    )
+    yield (_care if given else _note)("load_unit", remedy, ratio=ratio, by=by, unit=unit)
+
+
+def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
+    """Those more than SURELY standard deviations beyond a physical bound (of the interval of 95 %,
+    half is 1.96 of them or more)."""
+    return [
+        (p, e)
+        for p, e in zip(result.model.parameters, result.estimates, strict=True)
+        if e.limits is not None
+        and max(p.lower - e.held, e.held - p.upper) > SURELY / 1.96 * np.ptp(e.limits) / 2
+    ]
+
+
+def impossible_values(result: Calibration) -> Iterator[Finding]:
+    """Values that no arm has.  Where most compliances are among them, no missing effect explains
+    it, but loads in the opposite direction do, and no load is compensated rightly."""
+    if not (found := impossible(result)):
+        return
+    springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
+    turned = [p for p, _ in found if p.effect == JointCompliance.name]
+    signs = 2 * len(turned) > len(springs) and bool(result.observations.table.force.any())
+    parameters, estimates = zip(*found, strict=True)
+    turn_round = (
+        "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
+        "negative. Turn the sign round in the table if it is wrong (torque columns too), and "
+        "identify again."
+    )
+    yield (_poor if signs else _care)(
+        "impossible_values", turn_round if signs else AT_BOUND,
+        parameters=tuple(p.name for p in parameters), values=tuple(e.held for e in estimates),
+        units=tuple(p.unit for p in parameters),
+        likely="the sign of the force columns" if signs else "",
+    )  # fmt: skip
+
+
+# Values far from nominal: a joint to remaster, a robot file of another arm, a missing effect.
+#
+# How large a value is says nothing by itself.  Where the noise explains what is left and held-out
+# poses agree, the value is what the arm has; where much is left, a value that no arm has stands in
+# for what the model lacks.
+
+LARGEST_SCALE = (
+    0.5  # beyond it the points hardly move, as of a tip that touches one, or do so otherwise
+)
+NEARLY = 0.1  # share of the square that a scale leaves of what it explains
+SOME = 400  # readings that are enough for it
+# What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
+# effect is in the cell because someone named it: their sizes are findings, no evidence.
+STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
+
+
+def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[Finding]:
+    """Values whose whole interval lies more than FAR typical deviations from nominal, of a
+    combination all that it may hold; doubted unless the noise explains the residual, and held-out
+    poses agree (`explained`)."""
+    ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
+    typical = {p.name: p.typical or 0.0 for p in result.model.parameters}
+    for c in result.combinations:
+        name = next(iter(c.terms))
+        ends[name] = c.ci95
+        typical[name] = math.hypot(*(share * typical[n] for n, share in c.terms.items()))
+    half = {name: (high - low) / 2 for name, (low, high) in ends.items()}
+    far = [
+        (p, x - p.nominal, times)
+        for p, x in zip(result.model.parameters, result.x.tolist(), strict=True)
+        if p.effect in STATED_BY_FILE and p.typical and p.name in half
+        and (times := far_off(x - p.nominal, half[p.name], typical[p.name]))
+    ]  # fmt: skip
+    if zeros := [(p, off) for p, off, _ in far if p.effect == JointOffset.name]:
+        told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
+                f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
+        turned = zeros[-1][0].where == f"joint{result.model.chain.n_joints}"
+        turned &= result.observations.kind == "pose"
+        turned &= MarkerOrientation.name not in {p.effect for p in result.model.parameters}
+        yield _note(
+            "joint_zero",
+            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration."
+            + " Where the target is mounted at an angle, fit marker_orientation." * turned,
+            joints=tuple(p.where for p, _ in zeros), values=tuple(v for _, v in zeros),
+            units=tuple(p.unit for p, _ in zeros), ci95_half=tuple(half[p.name] for p, _ in zeros),
+        )  # fmt: skip
+    if (scale := scale_of(result)) is not None:
+        other = abs(scale - 1) > OF_A_TARGET
+        likely = "another robot" if other else "a scale error"
+        remedy = (
+            "Check that the cell describes the robot that was measured ([robot]): no target or "
+            "scale bar is wrong by so much."
+            if other
+            else "Look for what scales the readings: the size stated of a tag or scale bar, or a "
+            f"unit. Multiplied by {rounded(1 / scale, 4)} they have the robot's file's lengths."
+        )
+        yield _care("scale", remedy, readings_over_file=scale, likely=likely)
+        return
+    others = sorted((f for f in far if f[0].effect != JointOffset.name), key=lambda f: -f[2])
+    if others:
+        told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
+                for p, off, _ in others]  # fmt: skip
+        compare = (
+            "The arm is not the one of the robot's file: compare its lengths and angles with the "
+            f"data sheet (off, and known to: {listed(told, 3)})."
+        )
+        yield (_note if explained else _care)(
+            "far_from_nominal" if explained else "unheard_of",
+            compare if explained else lacking,
+            parameters=tuple(p.name for p, *_ in others),
+            typical_sizes=tuple(times for *_, times in others),
+            values=tuple(off + p.nominal for p, off, _ in others),
+            units=tuple(p.unit for p, *_ in others), readings_set_apart=len(result.excluded),
+        )  # fmt: skip
+
+
+def scale_of(result: Calibration) -> float | None:
+    """By what factor all lengths that were read exceed those of the nominal arm; None where no such
+    scale shows.
+
+    The linear map A of the readings onto the nominal arm is a rotation with a scale where that is
+    wrong.  One that takes nine tenths of the square away, differs less between directions than from
+    one, and is larger than any arm's lengths err together, is one of the readings.
+    """
+    table = result.observations.table
+    own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
+    if table.position is None or own or len(np.unique(table.q, axis=0)) < FEWEST_POSES:
+        return None
+    extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
+    if not SCALED * extent / 10 < result.nominal_rms < math.inf:
+        return None
+    table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
+    flange = result.model.rigid.flange_poses(table)
+    found = LinearFits(flange[None], np.asarray(table.position), table.marker)
+    if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
+        return None
+    size = np.linalg.svd(found.matrix[0], compute_uv=False)
+    off = abs(float(found.scale[0]) - 1)
+    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
+    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST_SCALE else None
+
+
+def _size(value: float, unit: str) -> str:
+    number, unit = {"m": (value * 1e3, " mm"), "rad": (math.degrees(value), "°")}.get(
+        unit, (value, f" {unit}")
+    )
+    return f"{abs(number):.{2 if abs(number) < 10 else 3}g}{unit}"

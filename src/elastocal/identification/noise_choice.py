@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import sparse, special
 
-from elastocal.engine import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts
+from elastocal.engine import ENOUGH, LogPrior, Mixed, MixedFit, Pack, Parts, least_norm
 from elastocal.identification.least_squares import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
@@ -34,7 +34,6 @@ from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
     inverse_factor,
-    least_norm,
     same_size,
     stated_by_observation,
     whitener,
@@ -122,11 +121,6 @@ class NoisyReadings:
     def names(self) -> tuple[str, ...]:
         return (*self.structure.names, *(d.name for d in self.deviations))
 
-    @property
-    def may_vanish(self) -> list[int]:
-        """Variances that may be none: what is shared, but the prior of what drifts."""
-        return [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
-
     def model(self, prior: LogPrior | None = None) -> Mixed:
         """Packs of clusters of the sets: readings of a configuration that share anything are one.
 
@@ -168,20 +162,16 @@ class NoisyReadings:
         # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
         unit = np.trace(self.structure.matrix.sum(axis=1), axis1=1, axis2=2)[sets.first] / size
         own = float(np.median(e2 / unit))
-        if dof := sets.contrasts.size:
+        if sets.contrasts.size:
             # A few repeats may agree by rounding: from near zero the search does not come back.
-            own = max((float((sets.contrasts**2).sum()) + own / dof) / (dof + 1 / dof), 1e-9 * own)
+            square = (sets.contrasts**2).mean(axis=1) / unit[sets.sets]
+            own = max(float(square.mean()), 1e-9 * own)
         share = 0.1 * float((self.readings.e**2).mean())
         shared = [share * size / d.mean_square(size) for d in self.deviations]
         theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)
-        if like is None:
-            return theta
-        known = dict(zip(like.noisy.names, like.theta.tolist(), strict=True))
-        same = like.noisy.structure.names == self.structure.names
-        for k, name in enumerate(self.names):
-            if (same or k >= self.own) and known.get(name, 0.0) > LEAST_START * theta[k]:
-                theta[k] = known[name]
-        return theta
+        former = {} if like is None else dict(zip(like.noisy.names, like.theta, strict=True))
+        known = np.array([former.get(name, 0.0) for name in self.names])
+        return np.where(known > LEAST_START * theta, known, theta)
 
 
 def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
@@ -197,9 +187,6 @@ def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
     return Parts(of, loading.reshape(C, numbers, M * size, M * size))
 
 
-# A kind of noise fitted to readings.
-
-
 class Fitted(MixedFit):
     """A kind of noise fitted to readings: the variances of single readings are its `own`, those of
     deviations `common`, and what drifts is `lasting` a share of the campaign (None: nothing)."""
@@ -207,7 +194,9 @@ class Fitted(MixedFit):
     def __init__(
         self, noisy: NoisyReadings, prior: LogPrior | None, start: Array, enough: float
     ) -> None:
-        super().__init__(noisy.model(prior), start, noisy.may_vanish, enough)
+        # What is shared may be none, but not the prior of what drifts.
+        shared = [k for k, d in enumerate(noisy.deviations, noisy.own) if d.waves is None]
+        super().__init__(noisy.model(prior), start, shared, enough)
         self.noisy, self.lasting = noisy, noisy.lasting
         self.own, self.common = np.split(self.theta, [noisy.own])
 

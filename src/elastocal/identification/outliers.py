@@ -15,12 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import linalg, sparse, special
 
-from elastocal.identification.least_squares import Covariance, clustered, orthogonal
+from elastocal.identification.least_squares import (
+    Covariance,
+    clustered,
+    f_test,
+    held_out_residual,
+    orthogonal,
+)
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import MethodResult
-from elastocal.identification.residuals import f_test, held_out_residual
-from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
+from elastocal.identification.solve import PLACED, SAMPLE, MethodResult, Solution, is_placed
 from elastocal.identification.weighted_problem import Part, Problem
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray

@@ -26,13 +26,12 @@ from scipy import special
 
 from elastocal.above import ByValue
 from elastocal.cell import Cell
-from elastocal.identification.least_squares import Covariance, drawing_root, variance_of
+from elastocal.engine import least_norm
+from elastocal.identification.least_squares import Covariance, drawing_root, rms_3d, variance_of
 from elastocal.identification.noise_summary import Noise
-from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import Solution, deviates, reduce
-from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
-from elastocal.messages import EXACT, ElastocalError
+from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVisits, OpenParameters
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.base import Parameter
@@ -443,15 +442,12 @@ def predicted_error(
     what was read.
     """
     left = arm.left
-    if left is None or not arm.determined or observed.kind == "distance":
-        return None
-    if not np.isfinite(arm.covariance).all():
+    told = arm.determined and observed.kind != "distance" and np.isfinite(arm.covariance).all()
+    if left is None or not told:
         return None
     try:
         B, weight = readings_at(arm.model, arm.x, observed, poses)
     except ElastocalError:
-        return None
-    if not len(weight):
         return None
     known, off = _moves(arm, B[:, :3])
     root = drawing_root(arm.covariance)
@@ -485,7 +481,7 @@ def readings_at(
     model: Model, x: Array, observed: Observations, poses: NewPoses
 ) -> tuple[Array, Array]:
     """B (R, size, parameters) of readings at new poses, one for each pose and marker, and their
-    weight (R,) of sum 1; without those that have no static equilibrium.
+    weight (R,) of sum 1; without those that have no static equilibrium, if any has one.
 
     Whatever else the model asks for, as times and temperatures, is that of the readings in turn.
     """
@@ -506,7 +502,7 @@ def readings_at(
     good = np.bincount(pose, ~still, minlength=T) == 0
     new = new.take(good[pose])
     if not len(new):
-        return np.zeros((0, 1, len(x))), np.zeros(0)
+        raise InsufficientDataError("no pose has a static equilibrium")
     again = observe(new, observed.kind)
     B = model.regressor(new, x, observations=again).B
     weight = poses.weight[new.configuration[again.lead]]

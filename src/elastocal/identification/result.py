@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import ItemsView, Iterator, KeysView
+from collections.abc import Callable, ItemsView, Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
@@ -20,6 +20,7 @@ from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.least_squares import Covariance
 from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
+from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (
     Excess,
@@ -31,9 +32,8 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     position_at,
 )
-from elastocal.identification.residuals import ResidualSummary
 from elastocal.measurements import Measurements
-from elastocal.messages import ElastocalError, UnknownNameError, length, plain, rounded
+from elastocal.messages import ElastocalError, UnknownNameError, length, option, plain, rounded
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -217,6 +217,73 @@ class Finding:
         """One of the numbers; infinite where it is not known."""
         value = self.numbers[name]
         return value if isinstance(value, float | int) else math.inf
+
+
+# What to do about a finding.
+
+AT_BOUND = (
+    "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
+)
+
+
+def more_poses() -> str:
+    return (
+        f"Measure more poses: elastocal design with {option('augment')} plans what these data lack."
+    )
+
+
+# What to do about findings of a kind; of others it depends on more.
+REMEDIES: dict[str, str | Callable[[], str]] = {
+    "autocorrelated": "Visit poses and loads in random order and return to a reference pose every "
+    "ten poses: residuals of visits that follow each other are alike, as where something drifts, "
+    "or where the model lacks what neighbouring poses have in common.",
+    "beyond_bound": AT_BOUND,
+    "copied_readings": "Find out how lines came to be in the table twice; readings that were "
+    "rounded until they agree should be given with all their digits.",
+    "few_configurations": more_poses,
+    "few_degrees_of_freedom": "Measure more poses.",
+    "fit_flatters": more_poses,
+    "hardly_shown": "Measure poses and loads that strain what the readings hardly show (elastocal "
+    "design plans them), or give it a prior.",
+    "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
+    "parameters.",
+    "many_faulty_readings": "Check where they lie before excluding any.",
+    "mostly_prior": "Measure poses that load them more.",
+    "new_poses_no_gain": more_poses,
+    "new_poses_not_shown": lambda: (
+        f"{more_poses()} For a part of the joint ranges alone, state test poses in the cell."
+    ),
+    "not_converged": "Give start hints in [model.nominal], fit fewer effects, or measure more "
+    "poses.",
+    "residual_below_stated_noise": "State the tracker's true noise: with noise stated too large, a "
+    "missing effect does not show.",
+    "residuals_heavy_tailed": lambda: (
+        f"Compare with a robust fit ({option('method')} huber or l1): where parameters differ by "
+        "more than their intervals, far readings decide them; look for what makes single readings "
+        "err (line of sight, vibration, a tracker that has not settled)."
+    ),
+    "test_data_far": "Measure poses there: the fit extrapolates.",
+    "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
+    "(joints, load), fit some like them; where they do not, the arm or the tracker has changed in "
+    "between.",
+    "untested": lambda: (
+        "Validate on independent poses: measure some that are not fitted, and give "
+        f"them with {option('test')}."
+    ),
+}
+
+
+def made(severity: Severity, kind: str, remedy: str | None = None, /, **numbers: Any) -> Finding:
+    """A finding with the remedy of its kind unless one is given; numbers whose names end in _um or
+    _urad are given in m and rad."""
+    if remedy is None:
+        known = REMEDIES.get(kind, "")
+        remedy = known if isinstance(known, str) else known()
+    for name, value in numbers.items():
+        if name.endswith(("_um", "_urad")):
+            several = isinstance(value, tuple)
+            numbers[name] = tuple(v * 1e6 for v in value) if several else float(value) * 1e6
+    return Finding(kind, severity, numbers, remedy)
 
 
 @dataclass(frozen=True)

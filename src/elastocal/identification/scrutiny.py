@@ -15,13 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.engine import Standardised
+from elastocal.engine import Standardised, least_norm
+from elastocal.identification.least_squares import held_out_residual, left_out, rms_3d
 from elastocal.identification.noise_summary import Noise
-from elastocal.identification.options import SmoothPart
 from elastocal.identification.prediction import FEWEST_REPEATS, mean_squares
-from elastocal.identification.residuals import held_out_residual, left_out, rms_3d
-from elastocal.identification.solve import WORTH_A_COLUMN, reduce
-from elastocal.identification.weighted_problem import Weights, least_norm, weights_for
+from elastocal.identification.solve import WORTH_A_COLUMN, SmoothPart, reduce
+from elastocal.identification.weighted_problem import Weights, weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -102,7 +101,8 @@ def influence(fit: FoundFit) -> tuple[Influence, ...]:
     information = np.linalg.inv(back @ back.T)
     std = np.sqrt(s2 * np.diag(back @ back.T))
     labels = np.repeat(observed.configuration, observed.size)
-    found: list[tuple[Any, ...]] = []
+    count, names = np.bincount(labels) // observed.size, observed.table.configuration_labels
+    found = dict[int, Influence]()  # by its first row
     for rows, moved, alone in left_out(Q[: len(labels)], e[: len(labels)], labels):
         Qc, move = Q[rows], moved @ back.T
         # A configuration that alone determines something moves that without end.
@@ -111,17 +111,13 @@ def influence(fit: FoundFit) -> tuple[Influence, ...]:
         by, cook = shift.max(axis=1), ((move @ information) * move).sum(axis=1)
         cook = cook / (p * s2) if s2 > 0 else 0 * cook
         by[alone] = cook[alone] = np.inf
-        taken = (Qc**2).sum(axis=(1, 2))
-        found += zip(rows[:, 0], taken, cook, shift.argmax(axis=1), by, strict=True)
-    count = np.bincount(labels) // observed.size
-    names = observed.table.configuration_labels
-    return tuple(
-        Influence(
-            names[labels[first]], int(count[labels[first]]), float(taken), float(cook),
-            fit.model.names[fit.columns[k]], float(by),
-        )
-        for first, taken, cook, k, by in sorted(found)
-    )  # fmt: skip
+        taken, most = (Qc**2).sum(axis=(1, 2)), fit.columns[shift.argmax(axis=1)]
+        for k, row in enumerate(rows[:, 0].tolist()):
+            found[row] = Influence(
+                names[labels[row]], int(count[labels[row]]), float(taken[k]), float(cook[k]),
+                fit.model.names[most[k]], float(by[k]),
+            )  # fmt: skip
+    return tuple(found[row] for row in sorted(found))
 
 
 # Residuals from visit to visit.

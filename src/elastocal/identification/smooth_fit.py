@@ -21,16 +21,30 @@ from scipy import sparse, special
 
 from elastocal.engine import Products, climb
 from elastocal.identification.knowledge import share_of_prior
-from elastocal.identification.least_squares import Covariance, Fit, PriorRows
-from elastocal.identification.least_squares import fit as least_squares
+from elastocal.identification.least_squares import ALONE, Covariance, held_out_by_parts, rms_3d
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import Course, MethodResult, SmoothPart
 from elastocal.identification.outliers import FALSE_ALARM, settle
-from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, choose, deviates, own_size
+from elastocal.identification.solve import (
+    WORTH_A_COLUMN,
+    Course,
+    MethodResult,
+    Reduction,
+    SmoothPart,
+    choose,
+    deviates,
+    own_size,
+)
 from elastocal.identification.start import ordinary
-from elastocal.identification.weighted_problem import Part, Problem, RFactor, same_size
+from elastocal.identification.weighted_problem import (
+    Fit,
+    Part,
+    PriorRows,
+    Problem,
+    RFactor,
+    same_size,
+)
+from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.messages import listed
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations
@@ -123,17 +137,15 @@ class LinearRows:
             return value + float(over @ over), slope, information
 
         variance = max(products.squares / products.rows, 1e-300)
+        start = start or Scales(np.ones(n), NOISE * variance, np.zeros(n))
         least, most = 0.5 * np.log([LEAST, MOST])
         lower = np.append(0.5 * np.log(variance) - 20.0, np.full(n, least))
         upper = np.append(0.5 * np.log(variance) + 1.0, np.full(n, most))
-        if start is not None:
-            gone = 1 + np.flatnonzero(start.scale == 0)
-            lower[gone], upper[gone] = -np.inf, -np.inf
-
+        gone = 1 + np.flatnonzero(start.scale == 0)
+        lower[gone], upper[gone] = -np.inf, -np.inf
         # From nothing the likelihood shows no way back: what is small begins anew.
-        known = np.ones(n) if start is None else np.where(start.scale < SMALL, 1.0, start.scale)
-        level = NOISE * variance if start is None else start.variance
-        begun = np.clip(0.5 * np.log(np.append(level, known)), lower, upper)
+        known = np.where(start.scale < SMALL, 1.0, start.scale)
+        begun = np.clip(0.5 * np.log(np.append(start.variance, known)), lower, upper)
         theta = climb(objective, begun, lower, upper, ENOUGH, CLIMBS)[0]
         at = products.at(variances(theta), theta[0])
         gain = at.left_out([np.flatnonzero(mine) for mine in own.T])
@@ -187,8 +199,6 @@ class Posterior:
         is the trace of the hat matrix."""
         return np.asarray(1 - (self.P**2).sum(axis=0) * np.diag(self.cofactor))
 
-
-# The course of the fit.
 
 STEPS = 150  # a few do mostly; springs beside weights that no load tells go along a valley
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
@@ -304,13 +314,10 @@ def fit_smooth(course: Course) -> MethodResult:
 
 def _followed(observed: Observations, group: SmoothGroup) -> Array:
     """What a function follows, in every observation (N,)."""
-    table = observed.table
     if group.basis is None:
         return np.zeros(0)
-    if not group.lasting:
-        assert table.time is not None
-        return table.time[observed.lead]
-    return np.asarray(table.q[observed.lead, group.joint])
+    table = observed.table
+    return np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
 
 
 class _Search:
@@ -377,7 +384,7 @@ class _Search:
         return JointFit(found, reduction, scales, self._rows(problem, found.x).only(kept))
 
     def _rows(self, problem: Problem, x: Array) -> LinearRows:
-        f, factor = self.functions, problem.evaluate(x, problem.free).r_factor
+        f, factor = self.functions, problem.evaluate(x, problem.free)[1]
         rows, away = factor.augmented.copy(), x[f.columns] - f.nominal
         rows[:, -1] += rows[:, -1 - len(away) : -1] @ away
         return LinearRows(RFactor(rows, factor.rows), f.std, f.group, len(f.groups))

@@ -2,32 +2,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.identification.least_squares import EPS, Fit, PriorRows, drawing_root, fit, moved
-from elastocal.identification.residuals import (
+from elastocal.engine import least_norm
+from elastocal.identification.knowledge import ActiveConstraint
+from elastocal.identification.least_squares import (
     CHANCE,
+    EPS,
+    LEVEL,
+    Covariance,
     as_of_another_campaign,
+    drawing_root,
     f_test,
     held_out_by_parts,
     held_out_residual,
     predicts_better,
     rms_3d,
+    t_quantile,
 )
-from elastocal.identification.start import nothing_shown
-from elastocal.identification.weighted_problem import Problem, RFactor, Weights, least_norm
+from elastocal.identification.noise_choice import NoiseFit
+from elastocal.identification.start import Options, nothing_shown
+from elastocal.identification.weighted_problem import (
+    Fit,
+    PriorRows,
+    Problem,
+    RFactor,
+    Weights,
+    fit,
+    moved,
+)
 from elastocal.measurements import numbered
 from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
 from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, SmoothGroup
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -188,13 +204,10 @@ def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) 
 
 def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:
     """Fit of the kept parameters, the others held at the start; their share moves over first."""
-    start, kept = x.copy(), chosen.kept
-    start[chosen.dropped] = problem.x0[chosen.dropped]
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
-    for trial in (chosen.shifted(x, problem.x0), start):
-        with suppress(ElastocalError):
-            return fit(problem, kept, trial, max_steps=max_steps)
-    return fit(problem, kept, problem.x0, max_steps=max_steps)
+    with suppress(ElastocalError):
+        return fit(problem, chosen.kept, chosen.shifted(x, problem.x0), max_steps=max_steps)
+    return fit(problem, chosen.kept, problem.x0, max_steps=max_steps)
 
 
 def looked_at(found: Fit) -> tuple[Array, Array]:
@@ -248,18 +261,15 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
     linear = held_out_by_parts(problem, found.x, wider.kept, own.half, start - found.x)[0]
     if not predicts_better(held, linear, *judges):
         return found, reduction
-    try:
+    # Along a direction that is hardly determined the wide set may leave every valid arm, or come to
+    # rest where it is singular.
+    with suppress(ElastocalError, np.linalg.LinAlgError, ValueError):
         wide = fit_kept(problem, start, wider, max_steps=30)
-        after = looked_at(wide)[0]
-    except (ElastocalError, np.linalg.LinAlgError, ValueError):
-        # Along a direction that is hardly determined the wide set may leave every valid arm, or
-        # come to rest where it is singular.
-        return found, reduction
-    better = wide.converged and fits_better(found.r_factor, wide.r_factor)
-    if not better or not predicts_better(held, after, *judges):
-        return found, reduction
-    # What its zero hid may be worth a column now; each set is wider than the last.
-    return prefer_wider(wide, wider) if lost else (wide, wider)
+        better = wide.converged and fits_better(found.r_factor, wide.r_factor)
+        if better and predicts_better(held, looked_at(wide)[0], *judges):
+            # What its zero hid may be worth a column now; each set is wider than the last.
+            return prefer_wider(wide, wider) if lost else (wide, wider)
+    return found, reduction
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.
@@ -463,7 +473,7 @@ def posed(
     rows, p = len(observed.value), len(free)
     if rows > p:  # more equations than unknowns need no rank
         return problem
-    R = problem.evaluate(x0, free).r_factor.R * problem.sizes[free]
+    R = problem.evaluate(x0, free)[1].R * problem.sizes[free]
     rank = int(np.linalg.matrix_rank(R, rtol=STRUCTURAL))
     if rank == rows:
         lacking = max(-(-(rank + 1) // observed.size), -(-p // observed.size))
@@ -563,3 +573,183 @@ def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:
             return found
+
+
+# What an identification says of a smooth function: its size, and how sure.
+
+PLACES = 500
+DRAWS = 400
+
+
+@dataclass(frozen=True)
+class SmoothPart:
+    """A smooth function as it was fitted.
+
+    Attributes:
+        group: Its parameters and what it follows.
+        scale: By how much the variance of its coefficients is larger than the prior that the cell
+            states; 0 where it was left out.
+        effective: How many coefficients' worth of it the readings determine.
+        value: Coefficients (components, waves).
+        covariance: Theirs, (components · waves, components · waves).
+        places: What it follows in the readings fitted (n,), in rad or s.
+    """
+
+    group: SmoothGroup
+    scale: float
+    effective: float
+    value: Array
+    covariance: Array
+    places: Array
+
+    @property
+    def coefficients(self) -> int:
+        """How many parameters it has."""
+        return int(self.value.size)
+
+    def refitted(self, x: Array, columns: IntArray, covariance: Array) -> SmoothPart:
+        """The same function at other parameters x (parameters,), the covariance that of the
+        `columns` fitted."""
+        mine = self.group.columns
+        place = {int(c): k for k, c in enumerate(columns)}
+        at = np.array([place.get(int(c), -1) for c in mine.ravel()])
+        there, matrix = np.flatnonzero(at >= 0), np.zeros((mine.size, mine.size))
+        matrix[np.ix_(there, there)] = covariance[np.ix_(at[there], at[there])]
+        return replace(self, value=x[mine], covariance=matrix)
+
+    def _own_waves(self, x: Array) -> Array:
+        """The waves at x (n,) without their mean and their wave of one period per turn (of a time,
+        its slope), for which offsets, lengths and tilts of the arm can stand."""
+        assert self.group.basis is not None
+        alike = [np.ones(len(x)), *((np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],))]
+        Q, _ = np.linalg.qr(np.column_stack(alike))
+        waves = self.group.basis(x)
+        return np.asarray(waves - Q @ (Q.T @ waves))
+
+    @cached_property
+    def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
+        """By unit, over all components and the places of the readings: rms of what is left of the
+        function without what the arm can stand for, the 95 % interval of that, and the rms half
+        width of its 95 % band.
+
+        Of parameters that are no function of one quantity, the root of their sum of squares.
+        """
+        basis = self.group.basis
+        found = {}
+        for unit in dict.fromkeys(self.group.units):
+            own = [c for c, u in enumerate(self.group.units) if u == unit]
+            if basis is None:
+                waves = np.eye(self.value.shape[1]) * np.sqrt(self.value.shape[1])
+            else:
+                places = np.sort(self.places)
+                even = np.linspace(0, len(places) - 1, min(len(places), PLACES)).astype(int)
+                waves = self._own_waves(places[even])
+            mean = self.value[own] @ waves.T
+            rng = np.random.default_rng(0)
+            k = waves.shape[1]
+            total, spread = np.zeros(DRAWS), 0.0
+            for c, m in zip(own, mean, strict=True):
+                mine = slice(c * k, (c + 1) * k)
+                covariance = self.covariance[mine, mine]
+                drawn = rng.normal(size=(DRAWS, k)) @ drawing_root(covariance).T @ waves.T
+                total += ((m + drawn) ** 2).mean(axis=1)
+                spread += float(((waves @ covariance) * waves).sum(axis=1).mean())
+            rms = np.sqrt(total / (1 if basis is None else len(own)))
+            low, high = np.quantile(rms, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+            half = float(t_quantile(LEVEL, np.array(np.inf))) * np.sqrt(spread / len(own))
+            found[unit] = (float(np.median(rms)), (float(low), float(high)), float(half))
+        return found
+
+    def to_json(self) -> list[dict[str, Any]]:
+        """An entry for each unit that the function has, in SI."""
+        g = self.group
+        return [
+            {
+                "effect": g.effect, "where": g.where, "follows": g.follows or None, "unit": unit,
+                "size": g.size, "length": g.length, "low": g.low, "high": g.high,
+                "scale": self.scale, "coefficients": self.coefficients,
+                "effective": self.effective, "rms": rms, "rms_ci95": ci95, "band95": half,
+            }
+            for unit, (rms, ci95, half) in self.sizes.items()
+        ]  # fmt: skip
+
+
+NO_MATTER = 1e-4  # one over degrees of freedom that make no difference to an interval
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """The final fit, its `spread`, and the noise where it was estimated.
+
+    Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
+    fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
+    many parameters the readings paid for (`effective`; in a fit to readings alone all fitted), and
+    `warnings` where the readings contradict them.  `smooth` are the smooth functions, `beside`
+    which σ of a whitened row and its degrees of freedom were found, and `standard` (N, size) the
+    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
+    the parameters that the readings `hardly_shown`, by their index.
+    """
+
+    method: str
+    solution: Solution
+    spread: Covariance
+    noise: NoiseFit | None
+    good: BoolArray
+    active: tuple[ActiveConstraint, ...] = ()
+    prior_share: dict[str, float] = field(default_factory=dict)
+    effective: int | None = None
+    warnings: tuple[str, ...] = ()
+    smooth: tuple[SmoothPart, ...] = ()
+    beside: tuple[float, float] | None = None
+    standard: Array | None = None
+    limits: dict[int, tuple[float, float]] = field(default_factory=dict)
+
+    @cached_property
+    def ci95(self) -> Array:
+        """The 95 % intervals (fitted, 2)."""
+        return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
+
+    def told(
+        self, k: int, bent: float = 0.0, unsure: float = 0.0
+    ) -> tuple[dict[int, float], float, float, tuple[float, float]]:
+        """Of kept parameter number k the parameters combined with it and their factors, its
+        standard deviation with degrees of freedom, and its interval.
+
+        A dropped parameter d is combined with it where its typical deviation s_d would shift the
+        estimate by more than its standard deviation σ.  The others widen it to
+        √(σ² + Σ_d (m_kd s_d)²), their typical deviations being a prior N(0, s_d²), as does what a
+        combination leaves out by being linear (`bent`, its square known with the relative variance
+        `unsure`: degrees of freedom by Welch and Satterthwaite); bounds cut the interval off.
+        """
+        chosen, std = self.solution.reduction, float(self.spread.std[k])
+        shift = np.abs(chosen.mixing[k]) * self.solution.problem.sizes[chosen.dropped]
+        terms = {int(chosen.dropped[j]): float(chosen.mixing[k, j])
+                 for j in np.flatnonzero(shift > std)}  # fmt: skip
+        left = np.append(shift[shift <= std], bent)
+        wide = float(np.sqrt(1 + ((left / std) ** 2).sum())) if std > 0 else 1.0
+        dof, share = float(self.spread.dof[k]), (bent / (wide * std)) ** 2 if std > 0 else 0.0
+        value, system = self.solution.fit.x[chosen.kept[k]], self.solution.fit.known.system
+        ends = value + wide * (self.ci95[k] - value)
+        if (unknown := share**2 * unsure / 2) > NO_MATTER:
+            own = 1 / ((1 - share) ** 2 / dof + unknown)
+            wider, usual = t_quantile(LEVEL, np.array([own, dof]))
+            ends, dof = value + wider / usual * (ends - value), own
+        if system is not None:
+            ends = np.clip(ends, system.lower[k], system.upper[k])
+        return terms, wide * std, dof, (float(ends[0]), float(ends[1]))
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a method starts from: fits to all observations, and to those that are not `faulty` (N,);
+    `refit` makes another such, of those it is given.  They know nothing of smooth functions among
+    the parameters `free`.
+    """
+
+    every: Solution
+    sound: Solution
+    faulty: BoolArray
+    free: IntArray
+    refit: Callable[[BoolArray], Solution]
+    options: Options
+    progress: Progress

@@ -1,9 +1,11 @@
-"""Before the first fit: does the table fit the robot, and where are base and markers?"""
+"""Before the first fit: what is asked for, does the table fit the robot, where are its markers?"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from typing import Literal, get_args
 
 import numpy as np
 import scipy  # whose `optimize` loads where it is used: it takes as long as a small fit
@@ -11,6 +13,9 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell
+from elastocal.identification.knowledge import Constraints, GaussianPrior
+from elastocal.identification.noise_structure import Kind
+from elastocal.identification.weighted_problem import WeightKind
 from elastocal.measurements import Measurements, numbered, visits
 from elastocal.messages import (
     InputError,
@@ -19,6 +24,7 @@ from elastocal.messages import (
     length,
     listed,
     option,
+    quoted,
     rounded,
 )
 from elastocal.model.chain import beyond_limits
@@ -27,6 +33,138 @@ from elastocal.model.effects.geometry import BaseFrame, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray
+
+# How to identify: method, noise, what is held, what becomes of faulty readings, where it starts.
+
+IntervalKind = Literal[
+    "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
+    "profile",
+]  # fmt: skip
+KINDS = get_args(IntervalKind)
+Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "l1"]
+FaultyReadings = Literal["auto", "drop", "keep"]
+METHODS = get_args(Method)
+ROBUST = ("huber", "l1")
+WITH_KNOWLEDGE = ("auto", "profile")
+# A larger share of readings beyond the noise is no accident of measuring: an effect that the model
+# lacks looks like that.  Setting them apart would hide it.
+MOST_SET_ASIDE = 0.1
+# What there was once, or is looked for by this name: what does the same.
+SUCCESSORS = {
+    "method": dict.fromkeys(
+        ("lts", "s", "mm", "tukey", "student-t"),
+        "the default method, which excludes what the fit of the majority contradicts, or huber",
+    ),
+    "intervals": {
+        "wild": "cr2, which allows any correlation within a configuration as well",
+        "hc4": "hc3, which is nearly the jackknife over rows",
+        "bootstrap": "profile, which is lopsided where the model bends as well",
+    },
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to identify.
+
+    `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
+    stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
+    published weights with σ by group or from each residual; huber and l1 are robust.  `noise`: the
+    model whose variances reml estimates (structure.noise_models).
+    `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
+    `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
+    `constraints` and `prior`: a
+    constrained or regularised fit on top of the method's weights (`knowledge_fit`).  `faulty`:
+    readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
+    always, or never; they are listed in the result in any case.  `seed`: of multi-start and
+    searches.
+    """
+
+    method: Method = "auto"
+    noise: str = "auto"
+    weights: WeightKind = "auto"
+    covariance: Array | None = None
+    intervals: IntervalKind = "auto"
+    fixed: tuple[str, ...] = ()
+    constraints: Constraints | None = None
+    prior: GaussianPrior | None = None
+    faulty: FaultyReadings = "auto"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, value, valid in (
+            ("method", self.method, METHODS),
+            ("weights", self.weights, get_args(WeightKind)),
+            ("intervals", self.intervals, KINDS),
+            ("outliers", self.faulty, get_args(FaultyReadings)),
+        ):
+            if successor := SUCCESSORS.get(name, {}).get(str(value)):
+                raise InputError(f"there is no {option(name, value)}: use {successor}")
+            if value not in valid:
+                raise InputError(
+                    f"{option(name)} takes one of {', '.join(valid)}; found {quoted(value)}"
+                    f"{did_you_mean(str(value), valid)}"
+                )
+        Kind.of(self.noise)
+        if self.noise != "auto" and self.resolved != "reml":
+            raise InputError(
+                f"the noise model '{self.noise}' is estimated by the method reml; "
+                f"{self.resolved} takes its weights from elsewhere"
+            )
+        if self.method == "wls" and self.weights == "none":
+            raise InputError("the method wls needs weights; for none, choose the method ols")
+        stated = self.weights != "auto" or self.covariance is not None
+        if stated and self.weights != "none" and self.resolved not in ("wls", *ROBUST):
+            raise InputError(
+                f"the method {self.resolved} does not take stated weights; choose the method wls"
+            )
+        if self.knows:
+            remedy = f"with these there are {', '.join(WITH_KNOWLEDGE)}"
+            self._refuse(ROBUST, WITH_KNOWLEDGE, "neither constraints nor a prior", remedy)
+
+    def check_functions(self) -> None:
+        """Raise InputError for methods and intervals that take no prior, as functions have."""
+        without = (*ROBUST, "eq14", "eq14-residual")
+        what = "no prior, which smooth functions have"
+        self._refuse(without, ("auto", "classical"), what, "leave it away")
+
+    def _refuse(
+        self, without: tuple[str, ...], intervals: tuple[str, ...], what: str, remedy: str
+    ) -> None:
+        if self.resolved in without:
+            raise InputError(
+                f"the method {self.resolved} takes {what}; use the default method, which excludes "
+                "outliers"
+            )
+        if self.intervals not in intervals:
+            raise InputError(f"{option('intervals', self.intervals)} knows of {what}; {remedy}")
+
+    def sets_aside(
+        self, faulty: BoolArray, explained: Callable[[], BoolArray] | None = None
+    ) -> bool:
+        """Whether the `faulty` readings (N,) are left out of the fit: in auto, where but for those
+        `explained` by one common shift each, whose cause is known, they are few."""
+        if self.faulty == "auto":
+            share = faulty.mean()
+            if share > MOST_SET_ASIDE and explained is not None:
+                return bool((faulty & ~explained()).mean() <= MOST_SET_ASIDE)
+            return bool(0 < share <= MOST_SET_ASIDE)
+        return self.faulty == "drop" and bool(faulty.any())
+
+    @property
+    def knows(self) -> bool:
+        """Whether anything is stated beyond the readings."""
+        return self.prior is not None or self.constraints not in (None, Constraints())
+
+    @property
+    def resolved(self) -> str:
+        """The method that auto stands for."""
+        if self.method != "auto":
+            return self.method
+        if self.weights == "auto" and self.covariance is None:
+            return "reml"
+        return "ols" if self.weights == "none" else "wls"
+
 
 # The linear map of readings onto the nominal arm.  With G_i m + t_i the nominal place of a marker
 # m, the readings p_i fit where A p_i + s = G_i m + t_i has a solution: linear in A (3, 3), s and m.

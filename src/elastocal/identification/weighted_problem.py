@@ -1,19 +1,22 @@
-"""The weighted problem: Σ and W with WᵀW = Σ⁻¹; B and e, reduced to their R factor in parts."""
+"""The weighted problem, Σ and W with WᵀW = Σ⁻¹, B and e as their R factor in parts, and its fit."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from elastocal.cell_tables import Tracker
-from elastocal.messages import InputError, length, option
+from elastocal.engine import least_norm
+from elastocal.identification.knowledge import System, minimise
+from elastocal.messages import ElastocalError, InputError, length, option
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import (
     Observations,
@@ -272,22 +275,6 @@ class RFactor:
         return np.asarray(linalg.solve_triangular(self.R, np.eye(self.columns)))
 
 
-def least_norm(A: Array, b: Array, cond: float | None = None) -> Array:
-    """x (k, …) of least norm among those that minimise |A x − b|, by singular values; those below
-    `cond` of the largest count as zero, by default what the rounding of so many rows makes.
-
-    By LAPACK's divide and conquer.  That may fail to converge on finite numbers (a matrix of
-    condition 3e6 did, by AVX-512 kernels, where it does not a rounding away); the slower
-    iteration then converges.
-    """
-    if cond is None:
-        cond = np.finfo(np.float64).eps * max(A.shape)
-    try:
-        return np.asarray(linalg.lstsq(A, b, cond=cond)[0])
-    except linalg.LinAlgError:
-        return np.asarray(linalg.lstsq(A, b, cond=cond, lapack_driver="gelss")[0])
-
-
 def _factor(rows: Array) -> Array:
     """R factor (k, k) of `rows` (n, k), filled up with zeros where n < k."""
     k = rows.shape[1]
@@ -326,14 +313,6 @@ class Part:
     rows: IntArray
     observations: Observations
     weights: Weights
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Residual (rows,), observed minus predicted and raw, and the R factor of whitened B and it."""
-
-    residual: Array
-    r_factor: RFactor
 
 
 @dataclass(frozen=True)
@@ -411,8 +390,8 @@ class Problem:
         with ThreadPoolExecutor(AT_ONCE) as pool:
             yield from pool.map(lambda index: work(self.part(index)), others)
 
-    def evaluate(self, x: Array, columns: NDArray[np.integer]) -> Evaluation:
-        """B of the `columns` at x and the residual, whitened and reduced to their R factor.
+    def evaluate(self, x: Array, columns: NDArray[np.integer]) -> tuple[Array, RFactor]:
+        """The raw residual (rows,) at x, and with B of the `columns`, whitened, their R factor.
 
         Raises ElastocalError where a reading has no static equilibrium at x.
         """
@@ -423,7 +402,7 @@ class Problem:
             residual[part.rows] = at.residual
             return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
 
-        return Evaluation(residual, reduce(RFactor.merged, self.each(reduced)))
+        return residual, reduce(RFactor.merged, self.each(reduced))
 
     def residual(self, x: Array) -> Array:
         """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
@@ -442,3 +421,218 @@ class Problem:
 
     def regressor(self, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
         return self.model.regressor(part.observations.table, x, columns, part.observations)
+
+
+# Nonlinear weighted least squares on the exact B, with what else is known of the parameters:
+#
+#     |W (y − h(X))|² + |target − P X|²   over X[columns],   lower ≤ X ≤ upper,  A X = b,  M(X) ⪰ 0
+#
+# A weak tie to the start, the prior of random coefficients and stated knowledge are all of them
+# rows P; every fit is the same descent by Levenberg and Marquardt on R factors.
+
+SETTLED = "the sum of squares no longer fell"
+NEGLIGIBLE = "the steps became negligible"
+EXHAUSTED = "the step limit was reached; the start may be far off or the data ill-conditioned"
+
+LEAST_DAMPING = 1e-18  # of the largest squared column, once a full step has failed
+SHORTER = 0.3  # than a step that failed
+ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
+# What a step promises of the cost where a descent ends.  The last step is taken: at a million rows
+# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
+TOLERANCE = 1e-8
+
+
+@dataclass(frozen=True)
+class PriorRows:
+    """What a fit knows of its columns besides the readings: P (k, columns) and target (k,) with
+    |target − P X|² beside whitened rows, and constraints on them."""
+
+    P: Array
+    target: Array
+    system: System | None = None
+
+    @classmethod
+    def near(cls, centre: Array, width: Array) -> PriorRows:
+        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
+        return cls(np.diag(1 / width), centre / width)
+
+    def restricted(self, columns: IntArray, x: Array) -> PriorRows:
+        """What it says of the `columns`, the others held at x.  Raises InputError where these alone
+        break a constraint."""
+        held = moved(x, columns, -x[columns])
+        system = None if self.system is None else self.system.restricted(columns, x)
+        return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual.
+
+    `columns` (fitted,) index the parameters; `known` is what the fit knew of them.
+    """
+
+    x: Array
+    residual: Array
+    r_factor: RFactor
+    converged: bool
+    reason: str
+    problem: Problem = field(repr=False)
+    columns: NDArray[np.int64]
+    known: PriorRows
+
+    @cached_property
+    def B(self) -> Array:
+        """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
+        observed = self.problem.observations
+        return self.problem.model.regressor(observed.table, self.x, self.columns, observed).B
+
+    @cached_property
+    def whitened(self) -> Array:
+        """The whitened residual (rows,)."""
+        return self.problem.weights.apply(self.residual)
+
+    @cached_property
+    def of_free(self) -> RFactor:
+        """The R factor of all free columns at x."""
+        problem = self.problem
+        if np.array_equal(self.columns, problem.free):
+            return self.r_factor
+        return problem.evaluate(self.x, problem.free)[1]
+
+    def cofactor(self) -> Array:
+        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
+        size = self.problem.sizes[self.columns]
+        inverse = self.r_factor.scaled(size).half
+        return (inverse @ inverse.T) * np.outer(size, size)
+
+
+class Linearised(NamedTuple):
+    """The residual, its R factor with B per unit of u, and the cost |b − A step|² about a u."""
+
+    residual: Array
+    r_factor: RFactor
+    A: Array
+    b: Array
+
+    @property
+    def cost(self) -> float:
+        return float(self.b @ self.b)
+
+    @property
+    def steepest(self) -> float:
+        return float((self.r_factor.R**2).sum(axis=0).max(initial=0.0))
+
+
+class Objective:
+    """|e(u)|² + |target − P u|² under the `limits` on u, where X[columns] = x[columns] + size · u
+    and the other parameters are x (parameters,)."""
+
+    def __init__(
+        self, problem: Problem, columns: IntArray, x: Array, size: Array, known: PriorRows
+    ) -> None:
+        self.problem, self.columns, self.x, self.size = problem, columns, x, size
+        self.P, self.target = known.P * size, known.target - known.P @ x[columns]
+        self.system = known.system
+        self.limits = None if self.system is None else self.system.moved(x[columns], size)
+
+    def evaluate(self, u: Array) -> Linearised:
+        """ElastocalError where the model has no prediction."""
+        residual, r_factor = self.problem.evaluate(self.values(u), self.columns)
+        if not np.isfinite(r_factor.rss):
+            source = self.problem.observations.table.source
+            raise ElastocalError(
+                f"{source}: the model predicts no finite numbers at the "
+                "start values; look in the cell for a length, force or compliance far too large"
+            )
+        r_factor = r_factor.scaled(self.size)
+        A = np.vstack([r_factor.augmented[:, :-1], self.P])
+        b = np.concatenate([r_factor.augmented[:, -1], self.target - self.P @ u])
+        return Linearised(residual, r_factor, A, b)
+
+    def values(self, u: Array) -> Array:
+        """X (parameters,), what lies at its bound but for rounding on it."""
+        values, system = moved(self.x, self.columns, self.size * u), self.system
+        if system is not None:
+            own = values[self.columns]
+            for bound in (system.lower, system.upper):
+                own = np.where(np.abs(own - bound) <= ROUNDING * self.size, bound, own)
+            values[self.columns] = np.clip(own, system.lower, system.upper)
+        return values
+
+    def step(self, u: Array, at: Linearised, damping: float) -> Array:
+        """Minimiser of the linearised cost + damping · |step|²."""
+        p = len(u)
+        A, b = np.vstack([at.A, np.sqrt(damping) * np.eye(p)]), np.append(at.b, np.zeros(p))
+        if self.limits is not None:
+            return minimise(A, b, self.limits.moved(u, np.ones(p))).x
+        return least_norm(A, b, cond=max(at.r_factor.rows, p) * np.finfo(float).eps)
+
+    def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Linearised, str]:
+        """Full Gauss–Newton steps while they lower the cost, damped ones where they do not: where
+        they end, and why.
+
+        Ends where the linearised cost promises less than `tolerance` of itself: that last step is
+        still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
+        converges.  Steps are judged by the cost itself, so no rounding of it can keep it from
+        ending.
+        """
+        at, damping = self.evaluate(u), 0.0
+        failed = -1.0  # the damping that was too little a step ago
+        for _ in range(most - 1):
+            step = self.step(u, at, damping)
+            left = at.b - at.A @ step
+            promised, trial, cost = at.cost - float(left @ left), at, np.inf
+            last, small = promised <= tolerance * at.cost, np.abs(step).max(initial=0) <= ROUNDING
+            if last and small:
+                return u, at, NEGLIGIBLE
+            with suppress(ElastocalError):
+                trial = self.evaluate(u + step)
+                cost = trial.cost
+            if last:  # more than what is left is not to be had
+                kept = cost <= at.cost * (1 + ROUNDING)
+                return (*((u + step, trial) if kept else (u, at)), SETTLED)
+            if at.cost - cost > 1e-4 * promised:
+                u, at = u + step, trial
+                less = damping / 10 if damping > LEAST_DAMPING * at.steepest else 0.0
+                damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
+            elif small:
+                return u, at, NEGLIGIBLE
+            else:
+                failed, damping = damping, max(10 * damping, LEAST_DAMPING * at.steepest)
+                longest = SHORTER * np.linalg.norm(step)
+                while np.linalg.norm(self.step(u, at, damping)) > longest:
+                    damping *= 10
+        return u, at, EXHAUSTED
+
+
+def moved(x: Array, columns: IntArray, step: Array) -> Array:
+    out = x.astype(float)
+    out[columns] += step
+    return out
+
+
+def fit(
+    problem: Problem, columns: IntArray, x: Array, *, known: PriorRows | None = None,
+    max_steps: int = 60, tolerance: float = TOLERANCE,
+) -> Fit:  # fmt: skip
+    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
+    other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
+
+    On R factors, with the cost and the gradient of all rows, until a step promises less than
+    `tolerance` of the cost.  Every step starts from the residual of the exact model, so that the
+    rounding of one is taken back by the next.  Constraints are convex and kept in every step: where
+    none improves the fit, the conditions of Karush, Kuhn and Tucker hold.
+
+    Raises ElastocalError where the start has poses without equilibrium, InputError for constraints
+    that contradict each other, InsufficientDataError where they leave something undetermined.
+    """
+    size, u = problem.sizes[columns], np.zeros(len(columns))
+    known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))
+    objective = Objective(problem, columns, x, size, known)
+    if objective.limits is not None:  # the nearest that is allowed
+        u = minimise(np.eye(len(u)), u, objective.limits).x
+    u, at, reason = objective.descend(u, tolerance, max_steps)
+    return Fit(
+        objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
+        problem, columns, known,
+    )  # fmt: skip

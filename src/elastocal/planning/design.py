@@ -17,7 +17,7 @@ from elastocal.cell import Cell
 from elastocal.cell_tables import TEST_POSE
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.options import Options
+from elastocal.identification.start import Options
 from elastocal.measurements import Measurements
 from elastocal.messages import (
     InputError,

@@ -21,10 +21,10 @@ from elastocal.identification.noise_structure import (
     common_to,
     stated_deviations,
 )
-from elastocal.identification.options import Options
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.result import Calibration
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
+from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from elastocal.engine import least_norm
+from elastocal.identification.noise_summary import groupings
 from elastocal.identification.prediction import over_the_workspace
-from elastocal.identification.residuals import groupings
-from elastocal.identification.weighted_problem import least_norm
 from elastocal.messages import ElastocalError, printable
 from elastocal.model.effects.base import index
 from elastocal.model.manipulator import Model

@@ -10,10 +10,10 @@ from functools import cache
 import numpy as np
 
 from elastocal.identification import findings
+from elastocal.identification.findings import next_steps
 from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
-from elastocal.identification.sentences import next_steps
 from elastocal.messages import listed, option, printable, some
 from elastocal.model.chain import names_told
 from elastocal.model.effects.base import Parameter

@@ -9,13 +9,11 @@ from collections.abc import Callable
 import numpy as np
 
 from elastocal.identification.faulty_readings import FaultyGroup
-from elastocal.identification.findings import only_placed, shape_of
+from elastocal.identification.findings import only_placed, shape_of, warning_sentences
 from elastocal.identification.knowledge import ActiveConstraint
 from elastocal.identification.noise_structure import Kind
-from elastocal.identification.noise_summary import Noise, NoiseSize
-from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.noise_summary import Noise, NoiseSize, ResidualSummary
 from elastocal.identification.result import Calibration, Finding
-from elastocal.identification.sentences import warning_sentences
 from elastocal.messages import gathered, listed, option, printable, rounded, some
 from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
