@@ -19,10 +19,11 @@ from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.least_squares import Covariance, clustered, orthogonal
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import MethodResult
+from elastocal.identification.options import MethodResult, Options
 from elastocal.identification.residuals import f_test, held_out_residual
 from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import Part, Problem
+from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
@@ -234,10 +235,45 @@ def until_it_stands(
     return best if explains_more(best, last) else last
 
 
+# Faulty readings, or an effect that the model lacks?  It follows the pose and the load, a fault the
+# time: a marker that slipped, a joint that was misread for a while.
+
+FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
+
+
+def drops(options: Options, observed: Observations, faulty: BoolArray) -> bool:
+    """Whether the `faulty` observations (N,) are left out of the fit."""
+    if options.faulty != "auto" or not faulty.any():
+        return options.faulty == "drop" and bool(faulty.any())
+    return are_accidents(observed, faulty)
+
+
+def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
+    """Whether the `faulty` observations (N,) are few, or follow each other in the order of lines,
+    of all or of each marker, as by chance they would not, and far less than in the order of any
+    joint within a load state."""
+    if faulty.mean() <= FEW:
+        return True
+    line, marker = observed.table.row[observed.lead], observed.table.marker[observed.lead]
+    p = 2 * min(_so_few_runs(faulty, line), _so_few_runs(faulty, line, marker))
+    load, q = observed.load, observed.table.q[observed.lead].T
+    near = (_so_few_runs(faulty, *np.roll(q, j, axis=0), load) for j in range(len(q)))
+    return p < FALSE_ALARM * min(near)
+
+
+def _so_few_runs(faulty: BoolArray, *keys: ArrayLike) -> float:
+    """Chance of no more runs of `faulty` ones (N,) in the order of keys (N,), the last one first,
+    were any order as likely: Σ C(n − k + 1, r) C(k − 1, r − 1) / C(n, k) (Wald, Wolfowitz 1940)."""
+    follows = np.diff(np.concatenate([[0], faulty[np.lexsort(np.array(keys))]])) > 0
+    n, k, r = len(faulty), int(faulty.sum()), np.arange(int(follows.sum())) + 1
+    of, taken = np.array([n - k + 1, k - 1, n])[:, None], np.stack([r, r - 1, np.full_like(r, k)])
+    log_choose = -special.betaln(of - taken + 1, taken + 1) - np.log1p(of)
+    return float(np.exp([1, 1, -1] @ log_choose).sum())
+
+
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
 # must not be taken for faulty because they move its parameters.
 WEAK = 10.0
-FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
 STEPS = 4  # to a set's values, from those of the set before
 SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at the end
 
@@ -286,24 +322,12 @@ def find_faulty(solution: Solution) -> BoolArray:
     if not ends:
         return faulty
     # What all parameters say against so many is noise that readings share, or a missing effect.
-    last = ends[-1] if (~ends[-1][1]).mean() <= FEW else ends[0]
+    last = ends[-1] if are_accidents(part.observations, ~ends[-1][1]) else ends[0]
     fit, good, _ = last if explains_more(last, ends[0]) else ends[0]
-    if (~good).mean() > FEW:
-        # Part of a block that errs alike bends all parameters, and is then contradicted no more.
-        sets, variance = (good, starts[0][0]), fit.variance
-        good = min(sets, key=lambda one: _beside_a_shift(B, y, one, variance))
-        fit = FitToGood(B, y, good, variance)
     faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
-
-
-def _beside_a_shift(B: Array, y: Array, good: BoolArray, variance: float) -> float:
-    """The sum of squares of a fit to all readings where those that are not `good` share a shift."""
-    shift = np.abs(y).max() * np.eye(y.shape[1]) * ~good[:, None, None]
-    every = np.ones(len(y), dtype=bool)
-    return FitToGood(np.concatenate([B, shift], axis=2), y, every, variance).rss
 
 
 def prior_widths(problem: Problem) -> Array:
