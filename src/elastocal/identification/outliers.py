@@ -249,16 +249,20 @@ def drops(options: Options, observed: Observations, faulty: BoolArray) -> bool:
 
 
 def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
-    """Whether the `faulty` observations (N,) are few, or follow each other in the order of lines,
-    of all or of each marker, as by chance they would not, and far less than in the order of any
-    joint within a load state."""
-    if faulty.mean() <= FEW:
-        return True
+    """Whether the `faulty` observations (N,) are few, or a matter of time."""
+    return bool(faulty.mean() <= FEW or _by_chance(observed, faulty) < FALSE_ALARM)
+
+
+def _by_chance(observed: Observations, faulty: BoolArray) -> float:
+    """Chance that the `faulty` ones (N,) follow each other in the order of lines, of all or of each
+    marker, as they do, over the chance of what the order of any joint within a load state shows."""
+    if not faulty.any():
+        return 1.0
     line, marker = observed.table.row[observed.lead], observed.table.marker[observed.lead]
     p = 2 * min(_so_few_runs(faulty, line), _so_few_runs(faulty, line, marker))
     load, q = observed.load, observed.table.q[observed.lead].T
     near = (_so_few_runs(faulty, *np.roll(q, j, axis=0), load) for j in range(len(q)))
-    return p < FALSE_ALARM * min(near)
+    return p / max(min(near), TINY)
 
 
 def _so_few_runs(faulty: BoolArray, *keys: ArrayLike) -> float:
@@ -324,6 +328,11 @@ def find_faulty(solution: Solution) -> BoolArray:
     # What all parameters say against so many is noise that readings share, or a missing effect.
     last = ends[-1] if are_accidents(part.observations, ~ends[-1][1]) else ends[0]
     fit, good, _ = last if explains_more(last, ends[0]) else ends[0]
+    if (~good).mean() > FEW:
+        # Part of a block that errs alike bends all parameters, and is then contradicted no more.
+        sets = (good, starts[0][0])
+        good = min(sets, key=lambda one: _by_chance(part.observations, ~one))
+        fit = FitToGood(B, y, good, fit.variance)
     faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
