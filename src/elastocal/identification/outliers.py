@@ -215,8 +215,7 @@ def until_it_stands(
 
     Raises ElastocalError where the first fit fails.
     """
-    ended = False
-    visited: list[Stand[Found]] = []
+    ended, visited = False, list[Stand[Found]]()
     for _ in range(ROUNDS):
         try:
             found, squared, dof, agrees = judged(good)
@@ -235,17 +234,15 @@ def until_it_stands(
     return best if explains_more(best, last) else last
 
 
-# Faulty readings, or an effect that the model lacks?  It follows the pose and the load, a fault the
-# time: a marker that slipped, a joint that was misread for a while.
+# What slipped, or was misread for a while, follows the lines; a missing effect pose and load.
 
 FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
 
 
 def drops(options: Options, observed: Observations, faulty: BoolArray) -> bool:
     """Whether the `faulty` observations (N,) are left out of the fit."""
-    if options.faulty != "auto" or not faulty.any():
-        return options.faulty == "drop" and bool(faulty.any())
-    return are_accidents(observed, faulty)
+    auto = options.faulty == "auto" and are_accidents(observed, faulty)
+    return bool(faulty.any()) and (auto or options.faulty == "drop")
 
 
 def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
@@ -256,8 +253,6 @@ def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
 def _by_chance(observed: Observations, faulty: BoolArray) -> float:
     """Chance that the `faulty` ones (N,) follow each other in the order of lines, of all or of each
     marker, as they do, over the chance of what the order of any joint within a load state shows."""
-    if not faulty.any():
-        return 1.0
     line, marker = observed.table.row[observed.lead], observed.table.marker[observed.lead]
     p = 2 * min(_so_few_runs(faulty, line), _so_few_runs(faulty, line, marker))
     load, q = observed.load, observed.table.q[observed.lead].T
@@ -330,7 +325,7 @@ def find_faulty(solution: Solution) -> BoolArray:
     fit, good, _ = last if explains_more(last, ends[0]) else ends[0]
     if (~good).mean() > FEW:
         # Part of a block that errs alike bends all parameters, and is then contradicted no more.
-        sets = (good, starts[0][0])
+        sets = [one for one in (good, starts[0][0]) if not one.all()]
         good = min(sets, key=lambda one: _by_chance(part.observations, ~one))
         fit = FitToGood(B, y, good, fit.variance)
     faulty[part.index[~good]] = True
