@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,7 +35,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.noise_summary import noise_of, summarise_residuals
-from elastocal.identification.outliers import describe, find_faulty, robust_result, settle
+from elastocal.identification.outliers import describe, drops, find_faulty, robust_result, settle
 from elastocal.identification.prediction import (
     NewPoses,
     left_open,
@@ -568,10 +567,8 @@ def _by_method(course: Course) -> MethodResult:
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
-    explained = partial(_explained, every, sound, None, ~faulty)
-    drop = options.sets_aside(faulty, explained) and (
-        method in ("wls", "reml") or options.faulty == "drop"
-    )
+    drop = drops(options, every.problem.observations, faulty)
+    drop = drop and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):
         return _published(course, solution)
@@ -651,8 +648,7 @@ def _reml(course: Course) -> MethodResult:
 
     def found(start: Solution, good: BoolArray, visits: bool = True) -> Adapted:
         solution, noise, good = _adapted(course, start, good, options.noise, visits=visits)
-        explained = partial(_explained, every, solution, noise, good)
-        if not good.all() and not options.sets_aside(~good, explained):
+        if not good.all() and not drops(options, every.problem.observations, ~good):
             # So many faulty readings look like anything that scatters or drifts.
             everything, visits = np.ones_like(good), visits and options.noise != "auto"
             solution, noise, _ = _adapted(
@@ -674,15 +670,6 @@ def _reml(course: Course) -> MethodResult:
             noise = replace(plain[1], tests=noise.tests)  # which say what is not counted
     spread = spread_of(solution, options.intervals, noise)
     return MethodResult("reml", solution, spread, noise, good)
-
-
-def _explained(
-    every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
-) -> BoolArray:
-    """Readings (N,) that are not `good`, of groups which one common shift each explains."""
-    report = report_faulty(every, fitted, noise, good)
-    known = [] if report is None else [f.readings for f in report.shifted]
-    return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
 
 
 WORSE = 1.02  # held-out errors that differ by less are alike

@@ -25,8 +25,10 @@ from elastocal.identification.least_squares import (
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.solve import PLACED, SAMPLE, MethodResult, Solution, is_placed
+from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import Part, Problem
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
+from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
@@ -218,8 +220,7 @@ def until_it_stands(
 
     Raises ElastocalError where the first fit fails.
     """
-    ended = False
-    visited: list[Stand[Found]] = []
+    ended, visited = False, list[Stand[Found]]()
     for _ in range(ROUNDS):
         try:
             found, squared, dof, agrees = judged(good)
@@ -238,10 +239,45 @@ def until_it_stands(
     return best if explains_more(best, last) else last
 
 
+# What slipped, or was misread for a while, follows the lines; a missing effect pose and load.
+
+FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
+
+
+def drops(options: Options, observed: Observations, faulty: BoolArray) -> bool:
+    """Whether the `faulty` observations (N,) are left out of the fit."""
+    auto = options.faulty == "auto" and are_accidents(observed, faulty)
+    return bool(faulty.any()) and (auto or options.faulty == "drop")
+
+
+def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
+    """Whether the `faulty` observations (N,) are few, or a matter of time."""
+    return bool(faulty.mean() <= FEW or _by_chance(observed, faulty) < FALSE_ALARM)
+
+
+def _by_chance(observed: Observations, faulty: BoolArray) -> float:
+    """Chance that the `faulty` ones (N,) follow each other in the order of lines, of all or of each
+    marker, as they do, over the chance of what the order of any joint within a load state shows."""
+    line, marker = observed.table.row[observed.lead], observed.table.marker[observed.lead]
+    p = 2 * min(_so_few_runs(faulty, line), _so_few_runs(faulty, line, marker))
+    load, q = observed.load, observed.table.q[observed.lead].T
+    near = (_so_few_runs(faulty, *np.roll(q, j, axis=0), load) for j in range(len(q)))
+    return p / max(min(near), TINY)
+
+
+def _so_few_runs(faulty: BoolArray, *keys: ArrayLike) -> float:
+    """Chance of no more runs of `faulty` ones (N,) in the order of keys (N,), the last one first,
+    were any order as likely: Σ C(n − k + 1, r) C(k − 1, r − 1) / C(n, k) (Wald, Wolfowitz 1940)."""
+    follows = np.diff(np.concatenate([[0], faulty[np.lexsort(np.array(keys))]])) > 0
+    n, k, r = len(faulty), int(faulty.sum()), np.arange(int(follows.sum())) + 1
+    of, taken = np.array([n - k + 1, k - 1, n])[:, None], np.stack([r, r - 1, np.full_like(r, k)])
+    log_choose = -special.betaln(of - taken + 1, taken + 1) - np.log1p(of)
+    return float(np.exp([1, 1, -1] @ log_choose).sum())
+
+
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
 # must not be taken for faulty because they move its parameters.
 WEAK = 10.0
-FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
 STEPS = 4  # to a set's values, from those of the set before
 SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at the end
 
@@ -290,24 +326,17 @@ def find_faulty(solution: Solution) -> BoolArray:
     if not ends:
         return faulty
     # What all parameters say against so many is noise that readings share, or a missing effect.
-    last = ends[-1] if (~ends[-1][1]).mean() <= FEW else ends[0]
+    last = ends[-1] if are_accidents(part.observations, ~ends[-1][1]) else ends[0]
     fit, good, _ = last if explains_more(last, ends[0]) else ends[0]
     if (~good).mean() > FEW:
         # Part of a block that errs alike bends all parameters, and is then contradicted no more.
-        sets, variance = (good, starts[0][0]), fit.variance
-        good = min(sets, key=lambda one: _beside_a_shift(B, y, one, variance))
-        fit = FitToGood(B, y, good, variance)
+        sets = [one for one in (good, starts[0][0]) if not one.all()]
+        good = min(sets, key=lambda one: _by_chance(part.observations, ~one))
+        fit = FitToGood(B, y, good, fit.variance)
     faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
-
-
-def _beside_a_shift(B: Array, y: Array, good: BoolArray, variance: float) -> float:
-    """The sum of squares of a fit to all readings where those that are not `good` share a shift."""
-    shift = np.abs(y).max() * np.eye(y.shape[1]) * ~good[:, None, None]
-    every = np.ones(len(y), dtype=bool)
-    return FitToGood(np.concatenate([B, shift], axis=2), y, every, variance).rss
 
 
 def prior_widths(problem: Problem) -> Array:

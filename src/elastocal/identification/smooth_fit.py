@@ -24,7 +24,7 @@ from elastocal.identification.knowledge import share_of_prior
 from elastocal.identification.least_squares import ALONE, Covariance, held_out_by_parts, rms_3d
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.outliers import FALSE_ALARM, settle
+from elastocal.identification.outliers import FALSE_ALARM, drops, settle
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Course,
@@ -403,7 +403,7 @@ class _Search:
         noise: NoiseFit | None = None
         x, reduction, scales, level = self.sound.fit.x, self.sound.reduction, None, np.inf
         for k in range(ROUNDS):
-            fitted = good if self.options.sets_aside(~good) else np.ones_like(good)
+            fitted = good | (not drops(self.options, self.observed, ~good))
             part = self.chosen(noise, fitted)
             problem = replace(
                 self.sound.problem, observations=part.observations, weights=part.weights

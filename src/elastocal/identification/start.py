@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Literal, get_args
@@ -46,9 +45,6 @@ FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
 ROBUST = ("huber", "l1")
 WITH_KNOWLEDGE = ("auto", "profile")
-# A larger share of readings beyond the noise is no accident of measuring: an effect that the model
-# lacks looks like that.  Setting them apart would hide it.
-MOST_SET_ASIDE = 0.1
 # What there was once, or is looked for by this name: what does the same.
 SUCCESSORS = {
     "method": dict.fromkeys(
@@ -138,18 +134,6 @@ class Options:
             )
         if self.intervals not in intervals:
             raise InputError(f"{option('intervals', self.intervals)} knows of {what}; {remedy}")
-
-    def sets_aside(
-        self, faulty: BoolArray, explained: Callable[[], BoolArray] | None = None
-    ) -> bool:
-        """Whether the `faulty` readings (N,) are left out of the fit: in auto, where but for those
-        `explained` by one common shift each, whose cause is known, they are few."""
-        if self.faulty == "auto":
-            share = faulty.mean()
-            if share > MOST_SET_ASIDE and explained is not None:
-                return bool((faulty & ~explained()).mean() <= MOST_SET_ASIDE)
-            return bool(0 < share <= MOST_SET_ASIDE)
-        return self.faulty == "drop" and bool(faulty.any())
 
     @property
     def knows(self) -> bool:
