@@ -50,7 +50,7 @@ DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
 PROBABLE = 0.5
 NAMED = 0.9  # probability from which an effect is named without rivals beside it
-CHANCE = 0.05  # probability from which a rival is told
+CHANCE = 0.05  # probability from which a rival or a share is told
 PAYS = 0.01  # of the error of left-out configurations, by which a name has to lower it
 HARM = 2.0  # standard errors by which they are predicted worse with what is taken out of the sum
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
@@ -286,16 +286,19 @@ class SumAnswer:
 
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
-        """One for each kind of dependence at each place, the largest first."""
+        """One for each kind of dependence at each place, the largest first; none for what hardly
+        moves the markers."""
         rows = []
         for (family, where), members in self._by(lambda c: (c.family, c.where)).items():
+            if (there := self._matters(members)) < CHANCE:
+                continue
             chosen = [self.found.components[k] for k in members]
             every = [k for k, c in enumerate(self._every) if (c.family, c.where) == (family, where)]
             rms, _, rms_ci95 = with_intervals(np.sqrt(self.squares(every)))
             rows.append(ComponentShare(
                 family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
                 *with_intervals(self.shares(every))[:2], rms, rms_ci95,
-                self._matters(members), any(c.named for c in chosen),
+                there, any(c.named for c in chosen),
             ))  # fmt: skip
         return tuple(sorted(rows, key=lambda row: -row.share))
 
@@ -422,7 +425,7 @@ class SumAnswer:
             own = self.found.components[k].hypothesis
             assert own is not None
             alike = self._of_kind(_kind(self.found.components[k]))
-            if abs(float(np.median(self.shares(alike)))) < TOLD:
+            if k in self._slight or abs(float(np.median(self.shares(alike)))) < TOLD:
                 continue
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]

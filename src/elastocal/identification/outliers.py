@@ -257,12 +257,22 @@ def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
 
 def _by_chance(observed: Observations, faulty: BoolArray) -> float:
     """Chance that the `faulty` ones (N,) follow each other in the order of lines, of all or of each
-    marker, as they do, over the chance of what the order of any joint within a load state shows."""
-    line, marker = observed.table.row[observed.lead], observed.table.marker[observed.lead]
-    p = 2 * min(_so_few_runs(faulty, line), _so_few_runs(faulty, line, marker))
-    load, q = observed.load, observed.table.q[observed.lead].T
-    near = (_so_few_runs(faulty, *np.roll(q, j, axis=0), load) for j in range(len(q)))
-    return p / max(min(near), TINY)
+    marker, as they do, over the chance of what the order of any joint within a load state shows.
+
+    What is read before the arm moves on counts once: it has the errors of its pose in common.
+    """
+    table, lead = observed.table, observed.lead
+    line, marker, q = table.row[lead], table.marker[lead], table.q[lead]
+    order, stay = np.argsort(line), np.zeros(len(line), dtype=np.int64)
+    where = table.configuration[lead][order]
+    stay[order] = np.cumsum(np.diff(where, prepend=where[0]) != 0)
+    odds = []
+    for group in (np.zeros_like(marker), marker):
+        _, first, of = np.unique([group, stay], axis=1, return_index=True, return_inverse=True)
+        hit, g, load = np.bincount(of, faulty) > 0, group[first], observed.load[first]
+        near = min(_so_few_runs(hit, joint, load, g) for joint in q[first].T)
+        odds.append(_so_few_runs(hit, line[first], g) / max(near, TINY))
+    return 2 * min(odds)
 
 
 def _so_few_runs(faulty: BoolArray, *keys: ArrayLike) -> float:
