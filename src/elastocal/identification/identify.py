@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -567,7 +568,8 @@ def _by_method(course: Course) -> MethodResult:
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
-    drop = drops(options, every.problem.observations, faulty)
+    explained = partial(_explained, every, sound, None, ~faulty)
+    drop = drops(options, every.problem.observations, faulty, explained)
     drop = drop and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):
@@ -648,7 +650,8 @@ def _reml(course: Course) -> MethodResult:
 
     def found(start: Solution, good: BoolArray, visits: bool = True) -> Adapted:
         solution, noise, good = _adapted(course, start, good, options.noise, visits=visits)
-        if not good.all() and not drops(options, every.problem.observations, ~good):
+        explained = partial(_explained, every, solution, noise, good)
+        if not good.all() and not drops(options, every.problem.observations, ~good, explained):
             # So many faulty readings look like anything that scatters or drifts.
             everything, visits = np.ones_like(good), visits and options.noise != "auto"
             solution, noise, _ = _adapted(
@@ -670,6 +673,15 @@ def _reml(course: Course) -> MethodResult:
             noise = replace(plain[1], tests=noise.tests)  # which say what is not counted
     spread = spread_of(solution, options.intervals, noise)
     return MethodResult("reml", solution, spread, noise, good)
+
+
+def _explained(
+    every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
+) -> BoolArray:
+    """Readings (N,) that are not `good`, of groups which one common shift each explains."""
+    report = report_faulty(every, fitted, noise, good)
+    known = [] if report is None else [f.readings for f in report.shifted]
+    return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
 
 
 WORSE = 1.02  # held-out errors that differ by less are alike

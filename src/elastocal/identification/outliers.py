@@ -244,10 +244,15 @@ def until_it_stands(
 FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
 
 
-def drops(options: Options, observed: Observations, faulty: BoolArray) -> bool:
-    """Whether the `faulty` observations (N,) are left out of the fit."""
-    auto = options.faulty == "auto" and are_accidents(observed, faulty)
-    return bool(faulty.any()) and (auto or options.faulty == "drop")
+def drops(
+    options: Options, observed: Observations, faulty: BoolArray,
+    explained: Callable[[], BoolArray] | None = None,
+) -> bool:  # fmt: skip
+    """Whether the `faulty` observations (N,) are left out of the fit: in auto, where they are
+    accidents, or but for those `explained` by one common shift each, whose cause is known, few."""
+    if options.faulty != "auto" or not faulty.any() or are_accidents(observed, faulty):
+        return bool(faulty.any()) and options.faulty != "keep"
+    return explained is not None and bool((faulty & ~explained()).mean() <= FEW)
 
 
 def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
