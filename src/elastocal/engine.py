@@ -510,11 +510,7 @@ class Products:
         self, variances: Array, grown: Array, factor: float
     ) -> tuple[float, Array, Array]:
         """−2ℓ, slope and average information in the factor and θ (1 + m,), which let the logarithms
-        of the variances grow by `grown` (k, m).
-
-        Of two parameters that let them grow by s and t the mean of observed and expected curvature
-        (Gilmour, Thompson and Cullis 1995, Biometrics 51, 1440) is sᵀb(1 − A⁻¹)bt.
-        """
+        of the variances grow by `grown` (k, m)."""
         at = self.at(variances, factor)
         b, a2, inverse = at.b, at.noise**2, at.inverse
         left = np.einsum("ij,ij->j", inverse, inverse)  # posterior over prior variance
@@ -523,10 +519,8 @@ class Products:
         slope = np.empty(1 + grown.shape[1])
         slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss)
         slope[1:] = ((1 - left) - b**2) @ grown
-        moved = grown * b[:, None]
-        half, of_noise = linalg.blas.dtrmm(1.0, inverse, moved, lower=1), 2 * (inverse @ b)
-        information = np.empty((len(slope),) * 2)
-        information[1:, 1:] = moved.T @ moved - half.T @ half
+        information, of_noise = np.empty((len(slope),) * 2), 2 * (inverse @ b)
+        information[1:, 1:], half = at.information(grown)
         information[0, 1:] = information[1:, 0] = of_noise @ half
         information[0, 0] = 4 * rss - float(of_noise @ of_noise)
         return self.value(at), slope, information
@@ -560,10 +554,21 @@ class Standardised:
     def log_det(self) -> float:
         return 2 * float(np.log(np.diag(self.L)).sum())
 
-    @property
+    @cached_property
     def inverse(self) -> Array:
         """L⁻¹ (k, k)."""
         return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
+
+    def information(self, grown: Array) -> tuple[Array, Array]:
+        """Average information (m, m) of parameters that let the logarithms of prior variances grow
+        by `grown` (k, m), and L⁻¹ of b so grown (k, m).
+
+        Of two that let them grow by s and t the mean of observed and expected curvature of −2ℓ
+        (Gilmour, Thompson and Cullis 1995, Biometrics 51, 1440) is sᵀb(1 − A⁻¹)bt.
+        """
+        moved = grown * self.b[:, None]
+        half = linalg.blas.dtrmm(1.0, self.inverse, moved, lower=1)
+        return moved.T @ moved - half.T @ half, half
 
     @cached_property
     def covariance(self) -> Array:

@@ -542,7 +542,7 @@ class SumAnswer:
     @cached_property
     def _present(self) -> Array:
         """Probability (K,) that there is anything at a component's place."""
-        return np.asarray(expit(self.found.earned - self.found.costs))
+        return np.asarray(expit(self.found.earned - self.found.sums.pool.costs(self.found.spread)))
 
     def _probability(self, k: int) -> float:
         c = self.found.components[k]

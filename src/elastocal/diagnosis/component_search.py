@@ -416,8 +416,9 @@ def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
     def price(c: Component) -> float:
         return usual if c.hypothesis is None else odds.get(c.hypothesis.key, usual)
 
-    score = found.score + found.cost - sum(c.search for c in found.components)
-    for n, own in found.sums.pool.kinds:
+    pool = found.sums.pool
+    score = found.score + pool.cost(found.spread) - sum(c.search for c in found.components)
+    for n, own in pool.kinds:
         for before, k in enumerate(own):
             fellow = presence_cost(n, before + 1) - presence_cost(n, before)
             paid = -price(found.components[k])

@@ -183,9 +183,7 @@ class Pool:
 
     def costs(self, spread: Array) -> Array:
         """Nats (K,) that each has to earn, the others there."""
-        out = self.sought + np.array(
-            [self._size(spread, np.array([k])) for k in range(len(spread))]
-        )
+        out = self.sought - np.log(np.diag(spread) * np.diag(self.precision)) / 2
         for n, own in self.kinds:
             out[own] += presence_cost(n, len(own)) - presence_cost(n, len(own) - 1)
         return out
@@ -254,6 +252,14 @@ class SumOfComponents:
     def spans(self) -> tuple[slice, ...]:
         return spans_of([c.width for c in self.components], len(self.products.z))
 
+    @cached_property
+    def by_size(self) -> Array:
+        """How the logarithms of all prior variances (p + Σ k, K) grow with those of sizes."""
+        grown = np.zeros((len(self.products.z), len(self.components)))
+        for k, span in enumerate(self.spans):
+            grown[span, k] = 2.0
+        return grown
+
     def scaled(self, factor: float) -> SumOfComponents:
         """The same under e^factor times the noise."""
         own, a = self.products, float(np.exp(factor))
@@ -319,9 +325,10 @@ class SumOfComponents:
         parameters that change the logarithms of prior variances by s and t share sᵀb(1 − A⁻¹)bt.
         """
         K, at = len(self.components), Sizes.of(theta)
-        grown = np.zeros((len(self.products.z), 2 * K))  # the logarithms of prior variances
+        by_length = np.zeros_like(self.by_size)
         for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
-            grown[span, k], grown[span, K + k] = 2.0, c.shares(at.length[k])[1]
+            by_length[span, k] = c.shares(at.length[k])[1]
+        grown = np.hstack([self.by_size, by_length])
         value, slope, information = self.products.objective(self.variances(at), grown, at.factor)
         prior, of_sizes = self.pool.penalty(at.size)
         value += self.constant + prior
@@ -333,11 +340,10 @@ class SumOfComponents:
             information[0, 0] += 2 / 0.25
         return value, slope, information
 
-    def spread(self, at: Sizes) -> Array:
+    def spread(self, found: Standardised) -> Array:
         """Covariance (K, K) of the logarithms of the sizes, all else as it is."""
-        own = slice(1, len(self.components) + 1)
-        theta = np.concatenate([[at.factor], at.size, at.length])
-        return np.asarray(np.linalg.inv(self.objective(theta)[2][own, own] / 2))
+        known = found.information(self.by_size)[0] / 2 + self.pool.precision
+        return np.asarray(np.linalg.inv(known))
 
     def climbed(self, at: Sizes, enough: float = SETTLED, factor_alone: bool = False) -> Sizes:
         """The sizes after steps by the average information until one promises less than `enough` of
@@ -403,16 +409,16 @@ def _rows(columns: Array) -> Array:
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
 
-    `earned` (K,) nats of each; `sums` are those over the rows of the data, which are without their
-    columns, `variances` (Σ k,) their coefficients' prior.  `complete` are the components whose
-    kinds have been tried at all their places beside it.
+    `earned` (K,) nats of each, `spread` (K, K) the covariance of the logarithms of their sizes;
+    `sums` are those over the rows of the data, which are without their columns, `variances` (Σ k,)
+    their coefficients' prior.  `complete` are the components whose kinds have been tried at all
+    their places beside it.
     """
 
     sizes: Sizes
     noise: NoiseValues
     earned: Array
-    costs: Array
-    cost: float
+    spread: Array
     score: float
     sums: SumOfComponents
     variances: Array
@@ -494,15 +500,12 @@ def fit_sum(
 
 def at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     found, value = problem.factored(at)
-    spread = problem.spread(at)
-    cost, costs = problem.pool.cost(spread), problem.pool.costs(spread)
-    score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - cost
+    spread = problem.spread(found)
+    score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost(spread)
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)
     earned, within = problem.earned(found)
     own = problem.variances(at)[len(problem.data.precision) :]
-    return FittedSum(
-        at, problem.noise, earned, costs, cost, score + float(within.sum()), problem, own
-    )
+    return FittedSum(at, problem.noise, earned, spread, score + float(within.sum()), problem, own)
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
@@ -510,9 +513,10 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     next to nothing; only these go where not `strict`, since under a noise that does not suit them
     the others may earn too little."""
     prior = problem.pool.precision  # −log prior falls where a component is left out
-    earned = problem.earned(problem.factored(at)[0])[0]
-    earned = earned - (prior @ at.size) ** 2 / np.diag(prior) / 2
-    spare = earned - (problem.pool.costs_of(problem.spread(at), earned) if strict else MOST_AT_ONCE)
+    found, _ = problem.factored(at)
+    earned = problem.earned(found)[0] - (prior @ at.size) ** 2 / np.diag(prior) / 2
+    costs = problem.pool.costs_of(problem.spread(found), earned) if strict else MOST_AT_ONCE
+    spare = earned - costs
     stays = np.array([c.given for c in problem.components], dtype=bool)
     poor = (spare < 0) & ~stays
     if not poor.any():

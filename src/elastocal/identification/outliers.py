@@ -250,7 +250,7 @@ def drops(
 ) -> bool:  # fmt: skip
     """Whether the `faulty` observations (N,) are left out of the fit: in auto, where they are
     accidents, or but for those `explained` by one common shift each, whose cause is known, few."""
-    if options.faulty != "auto" or not faulty.any() or are_accidents(observed, faulty):
+    if options.faulty != "auto" or are_accidents(observed, faulty):
         return bool(faulty.any()) and options.faulty != "keep"
     return explained is not None and bool((faulty & ~explained()).mean() <= FEW)
 
