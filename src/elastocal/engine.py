@@ -37,7 +37,6 @@ class Parts:
     loading: Array
 
     def add(self, V: Array, theta: Array) -> None:
-        """Σ θ K (C, m, m) onto V, θ (C, k)."""
         own = self.loading * np.sqrt(theta)[:, :, None, None]
         own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
         V += own @ own.swapaxes(1, 2)
@@ -52,7 +51,6 @@ class Parts:
         return np.asarray(((P[:, None] @ self.loading) * self.loading).sum(axis=(2, 3)))
 
     def turned(self, root: Array) -> Array:
-        """root K rootᵀ (C, k, m, m)."""
         own = root[:, None] @ self.loading
         return np.asarray(own @ own.swapaxes(2, 3))
 
@@ -60,9 +58,7 @@ class Parts:
 @dataclass(frozen=True)
 class Pack:
     """C clusters of m rows: B (C, m, p), p = 0 where they hold nothing of x; e (C, m); parts of V.
-
-    Rows that are `absent` (C, m) do not count: padding, or readings that only are to be judged.
-    """
+    Rows that are `absent` (C, m) do not count: padding, or readings that only are to be judged."""
 
     B: Array
     e: Array
@@ -71,7 +67,6 @@ class Pack:
 
     @cached_property
     def of(self) -> IntArray:
-        """Numbers (C, k) of the variances of all parts."""
         return np.concatenate([part.of for part in self.parts], axis=1)
 
     def added(self, values: Array, K: int) -> Array:
@@ -81,7 +76,6 @@ class Pack:
         return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
 
     def pairs(self, values: Array, K: int) -> Array:
-        """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
         at = (self.of[:, :, None] * K + self.of[:, None, :]).ravel()
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
@@ -126,7 +120,6 @@ class State:
 
     @cached_property
     def inverse(self) -> Array:
-        """L⁻¹ (p, p)."""
         return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
 
     @property
@@ -161,7 +154,6 @@ class LogPrior:
         return float(off @ slope), 2 * slope
 
     def curved(self, information: Array) -> Array:
-        """Information (K, K) with that of the prior."""
         out, k = information.copy(), len(self.mean)
         out[:k, :k] += self.precision
         return out
@@ -181,8 +173,8 @@ class Mixed:
         return int(sum((~pack.absent).sum() for pack in self.packs))
 
     def state(self, theta: Array) -> State:
-        """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
-        without a prior depend on each other."""
+        """LinAlgError where V is not positive definite, InsufficientDataError where columns without
+        a prior depend on each other."""
         packs = tuple(Whitened(pack, theta) for pack in self.packs)
         p = len(self.precision)
         known = self.precision > 0
@@ -313,10 +305,8 @@ FLAT, NEAR = 1.0, 0.1  # curvature and slope in it below which it may be none
 class MixedFit:
     """θ (K,) at the maximum of the restricted likelihood (times the prior of log θ), searched from
     `start` (K,) until a step promises less than `enough` of −2ℓ, and whether the search ended.
-
     Variances that `may_vanish` are zero where the likelihood does not miss them.  `log_likelihood`
-    is the restricted one, with a prior the marginal one by Laplace's method.
-    """
+    is the restricted one, with a prior the marginal one by Laplace's method."""
 
     def __init__(
         self, model: Mixed, start: Array, may_vanish: Sequence[int] = (), enough: float = ENOUGH
@@ -416,11 +406,9 @@ def climb(
     evaluate: Objective, theta: Array, lower: Array, upper: Array, enough: float, steps: int
 ) -> tuple[Array, bool]:
     """Where −2ℓ is least, and whether it ended there.  What has no room between its limits stays.
-
     A step that promises less than `enough`, or than rounding, is not taken any more; none is longer
     than STRIDE in any logarithm.  What the curvature exceeds the information by is learned from the
-    steps.
-    """
+    steps."""
     value, slope, information = evaluate(theta)
     free = np.flatnonzero(lower < upper)
     lower, upper = lower[free], upper[free]
@@ -452,12 +440,10 @@ def climb(
 
 
 def step_within(H: Array, slope: Array, low: Array, high: Array) -> Array:
-    """s (k,) in its box where sᵀslope + ½sᵀHs is least, H positive definite.
-
-    What is held at its bounds is exchanged, all at once, for what then passes them or is drawn off
-    them, until that stays (Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865).  Where it
-    goes round in circles, by bounded least squares, whose module takes as long to load as a fit.
-    """
+    """s (k,) in its box where sᵀslope + ½sᵀHs is least, H positive definite.  What is held at its
+    bounds is exchanged, all at once, for what then passes them or is drawn off them, until that
+    stays (Hintermüller, Ito and Kunisch 2002, SIAM J. Optim. 13, 865).  Where it goes round in
+    circles, by bounded least squares, whose module takes as long to load as a fit."""
     below = above = np.zeros(len(slope), dtype=bool)
     for _ in range(EXCHANGES):
         step, inside = np.where(below, low, np.where(above, high, 0.0)), ~(below | above)
@@ -502,7 +488,6 @@ class Products:
         return Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
 
     def value(self, at: Standardised) -> float:
-        """−2ℓ but for n log 2π."""
         a = at.noise
         return 2 * self.rows * float(np.log(a)) + self.squares / a**2 + at.log_det - at.explained
 
@@ -556,16 +541,13 @@ class Standardised:
 
     @cached_property
     def inverse(self) -> Array:
-        """L⁻¹ (k, k)."""
         return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
 
     def information(self, grown: Array) -> tuple[Array, Array]:
         """Average information (m, m) of parameters that let the logarithms of prior variances grow
-        by `grown` (k, m), and L⁻¹ of b so grown (k, m).
-
-        Of two that let them grow by s and t the mean of observed and expected curvature of −2ℓ
-        (Gilmour, Thompson and Cullis 1995, Biometrics 51, 1440) is sᵀb(1 − A⁻¹)bt.
-        """
+        by `grown` (k, m), and L⁻¹ of b so grown (k, m).  Of two that let them grow by s and t the
+        mean of observed and expected curvature of −2ℓ (Gilmour, Thompson and Cullis 1995,
+        Biometrics 51, 1440) is sᵀb(1 − A⁻¹)bt."""
         moved = grown * self.b[:, None]
         half = linalg.blas.dtrmm(1.0, self.inverse, moved, lower=1)
         return moved.T @ moved - half.T @ half, half
@@ -604,12 +586,10 @@ def beside(M: Array, z: Array, prior: Array, others: IntArray, own: slice) -> tu
 
 def least_norm(A: Array, b: Array, cond: float | None = None) -> Array:
     """x (k, …) of least norm among those that minimise |A x − b|, by singular values; those below
-    `cond` of the largest count as zero, by default what the rounding of so many rows makes.
-
-    By LAPACK's divide and conquer.  That may fail to converge on finite numbers (a matrix of
-    condition 3e6 did, by AVX-512 kernels, where it does not a rounding away); the slower
-    iteration then converges.
-    """
+    `cond` of the largest count as zero, by default what the rounding of so many rows makes.  By
+    LAPACK's divide and conquer, which may fail to converge on finite numbers (a matrix of condition
+    3e6 did, by AVX-512 kernels, where it does not a rounding away); the slower iteration then
+    converges."""
     if cond is None:
         cond = np.finfo(np.float64).eps * max(A.shape)
     try:

@@ -105,18 +105,14 @@ class OutlierReport:
         return [f for f in common if 2 * f.beyond >= len(f.readings)]
 
     def to_json(self) -> dict[str, Any]:
-        """Its fields, but for how many readings were used instead of which."""
         told = {k: v for k, v in vars(self).items() if k != "good"}
         return told | {"readings_used": int(self.good.sum())}
 
 
 class Group(NamedTuple):
-    """Observations `members` (n,) that may share an error, and whether that may be one shift,
-    common to all.
-
-    A marker whose position is fitted has none: what its readings then have in common is an error
-    of the arm, which they see as the others do.
-    """
+    """Observations `members` (n,) that may share an error.  A marker whose position is fitted may
+    not shift: what its readings then have in common is an error of the arm, which they see as the
+    others do."""
 
     level: Level
     name: str
@@ -127,13 +123,13 @@ class Group(NamedTuple):
 def group_test(
     fit: FitToGood, used: BoolArray, may_shift: bool
 ) -> tuple[float, float, Array | None, float]:
-    """The smaller p-value of two F-tests of the `used` (n,) members of a group, of one common
-    error, where there may be one, and of any, 1 where neither can be made; what telling the group
-    apart takes off the sum of squares beyond what noise would; and the error (size,) common to its
-    readings, None where they err in different directions; and the p-value of what that leaves.
+    """The smaller p-value of two F-tests of the `used` (n,) members of a group, 1 where neither can
+    be made; by how much more than by noise the sum of squares falls where they are told apart; the
+    error (size,) common to them, None where they err in different directions; the p-value of what
+    it leaves.
 
-    With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with
-    them (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
+    With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with them
+    (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
 
         F_common = (gain/size)/((rss₁ − gain)/dof),   F_any = ((rss₁ − rss₀)/m)/(rss₀/dof₀)
 
@@ -180,10 +176,7 @@ def _changed(fit: FitToGood, members: BoolArray, sign: int) -> tuple[float, floa
 
 class _Judged:
     """Readings y (n, size) ≈ B z, whitened, B (n, size, p) per prior deviation of the parameters
-    `names`; `off` (n, …) are their errors in m, `good` (n,) those to rely on.
-
-    `groups` are those by name; for each of the `lines` (n,) there is a `marker`.
-    """
+    `names`; `off` (n, …) are their errors in m, `good` (n,) those to rely on."""
 
     def __init__(
         self, whole: Solution, clean: Solution, noise: NoiseFit | None, good: BoolArray,
@@ -221,7 +214,6 @@ class _Judged:
 
     @cached_property
     def tests(self) -> dict[Level, int]:
-        """How many are made per level."""
         lengths = (len(run) for _, run in self._ordered(self.marker))
         blocks: dict[Level, int] = {"block": sum(k * (k + 1) // 2 for k in lengths)}
         return {"reading": len(self.y), **Counter(g.level for g in self.groups), **blocks}
@@ -230,8 +222,8 @@ class _Judged:
         return min(1.0, p * self.tests[level] * len(self.tests))
 
     def _ordered(self, markers: NDArray[Any]) -> Iterator[tuple[str, IntArray]]:
-        """Readings in the order of their lines: all, and where there are several markers those of
-        each of `markers`."""
+        """In the order of the lines: all, and where there are several markers, each of
+        `markers`."""
         order = np.argsort(self.lines, kind="stable")
         yield "", order
         if (self.marker != self.marker[0]).any():
@@ -239,8 +231,8 @@ class _Judged:
                 yield f" of {m}", order[self.marker[order] == m]
 
     def _runs(self, beyond: BoolArray, active: BoolArray) -> Iterator[Group]:
-        """Runs of active lines, of all markers and of each, at least half of whose readings lie
-        `beyond` the noise, and three or more."""
+        """Runs of active lines, of all markers and of each, at least half of them `beyond` the
+        noise."""
         for of, order in self._ordered(self.marker[beyond]):
             for first, last in blocks(np.flatnonzero(beyond[order]).tolist()):
                 run = np.zeros_like(active)
@@ -252,10 +244,8 @@ class _Judged:
 
     def blamed(self, fit: FitToGood, active: BoolArray) -> tuple[Group, float] | None:
         """The group that explains most, with its adjusted p-value; None where none is beyond noise.
-
-        Tested is all that is active of a group where most of it is beyond the noise and that is no
-        chance, else what is not.
-        """
+        Where most of a group is beyond the noise, and that is no chance, all of it that is active
+        is tested, else what is not beyond."""
         beyond, found = active & ~fit.good, []
         for group in (*self.groups, *self._runs(beyond, active)):
             present = active & group.members
@@ -274,7 +264,6 @@ class _Judged:
         return max(found, key=lambda one: one[0])[1:] if found else None
 
     def finding(self, fit: FitToGood, group: Group, p: float, beyond: int) -> FaultyGroup:
-        """The group as it errs under the fit without any of the others."""
         # Change (p,) of the parameters in their standard deviations if the members were fitted
         # along as read; infinite of one that the good ones leave undetermined.
         _, _, G, c = _changed(fit, group.members & ~fit.good, 1)
@@ -312,17 +301,14 @@ def report_faulty(
 ) -> OutlierReport | None:
     """The report of the readings that are not `good` (N,), under the `noise` of the method: alone
     or as groups, and groups of good ones that err together; one at a time, the one that explains
-    most first, as long as a majority is left.
+    most first, as long as a majority is left.  None for a table too large for B.
 
     Readings are linearised at a fit that faulty ones do not bend (`clean`), B and residual whitened
     by the noise of single readings, D.  Where a configuration's readings share a deviation, what is
     looked at is D V⁻¹ e, the residual less that deviation's best prediction, and configurations are
-    not tested: that they deviate is part of the noise.
-
-    Where smooth functions were fitted, `residual` (N, size) is free of their part in it, and the
-    ordinary parameters alone may follow a group's error.
-
-    None for a table too large for B.
+    not tested: that they deviate is part of the noise.  Where smooth functions were fitted,
+    `residual` (N, size) is free of their part in it, and the ordinary parameters alone may follow a
+    group's error.
     """
     if whole.problem.large:
         return None
@@ -351,7 +337,6 @@ def report_faulty(
 def _groups(
     level: Level, labels: NDArray[Any], without_shift: Collection[str] = ()
 ) -> Iterator[Group]:
-    """Every group with more than one reading and less than half of them."""
     names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
     for k in np.flatnonzero((count > 1) & (2 * count < len(labels))):
         yield Group(level, str(names[k]), code == k, names[k] not in without_shift)

@@ -79,10 +79,8 @@ _good, _note, _care, _poor = (partial(made, s) for s in ("good", "note", "care",
 def judged(
     result: Calibration, solution: Solution | None = None, whole: Measurements | None = None
 ) -> Calibration:
-    """The same result with its findings, the overall one ("trust") first.
-
-    Some only the `solution` and the `whole` table can tell; without them those of the result stay.
-    """
+    """The same result with its findings, the overall one ("trust") first.  Without `solution` and
+    `whole` table those findings stay that only these can tell."""
     of_solution = list(result.findings)
     if solution is not None and whole is not None:
         of_solution = [*_conditioning(result, solution), *_exchanged(result, whole)]
@@ -91,7 +89,6 @@ def judged(
 
 
 def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]:
-    """All but the overall one, in the order in which they are told."""
     compared = list(_against_stated_noise(result))
     fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
     noise = [*compared, *_repeats(result, fits)]
@@ -152,10 +149,8 @@ KNOWN_NOISE = {
 
 
 def _explained(result: Calibration, noise: list[Finding]) -> bool:
-    """Whether the noise explains what is left, by the findings on it, and held-out poses agree.
-
-    Of n equations for p parameters the held-out error is that of the fit times n / (n - p) or more.
-    """
+    """Whether the noise explains what is left, by the findings on it, and held-out poses agree: of
+    n equations for p parameters the held-out error is that of the fit times n / (n - p) or more."""
     told = {f.kind for f in noise}
     lacking = any(f.kind == "lack_of_fit" and f.severity == "care" for f in noise)
     agrees = bool(told & KNOWN_NOISE) or {"noise_not_compared", "repeats_agree"} <= told
@@ -171,11 +166,9 @@ def _overfitted(result: Calibration) -> float:
 
 
 def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
-    """Residuals of visits that follow each other, by a permutation test.
-
-    Where the noise explains the residual, what they share is a small part of it, for which the
-    error at new poses has room.
-    """
+    """Residuals of visits that follow each other, by a permutation test.  Where the noise
+    explains the residual, what they share is a small part of it, for which the error at new
+    poses has room."""
     found = result.autocorrelation
     if found is None or found.p >= SCATTERS:
         return
@@ -241,7 +234,6 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
 
 
 def _named(result: Calibration) -> list[str]:
-    """Effects of the cell such as diagnose finds, which asked again would find no more."""
     effects = dict.fromkeys(p.effect for p in result.model.parameters)
     usual = [e for e in effects if e in STATED_BY_FILE or effect_of(e).registered]
     return [e.replace("_", " ") for e in effects if e not in usual]
@@ -278,10 +270,8 @@ def _lacks_fit(result: Calibration) -> bool:
 
 
 def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
-    """Do configurations scatter more than their repeats, and does anything count with it?
-
-    Where the residual `fits` a stated noise of which readings share some, nothing is missing.
-    """
+    """Do configurations scatter more than their repeats?  Where the residual `fits` a stated noise
+    of which readings share some, nothing is missing."""
     noise, test = result.noise, result.noise.lack_of_fit
     sizes = [s for s in noise.sizes or () if s.part == CONFIGURATION]
     shared = {s.name: s.sigma for s in sizes if s.sigma is not None}
@@ -304,8 +294,7 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
 
 def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     """Joints that settle anew at each visit, and a drift: what a test of false-alarm rate SCATTERS
-    finds, whether the noise model has it or not.  `fits`: the residual agrees with the stated
-    noise."""
+    finds, whether the noise model has it or not."""
     noise, stated = result.noise, result.model.cell.noise
     ask = "Ask what the model lacks (elastocal diagnose)"
     ask = "Repeat some poses" if _named(result) else ask
@@ -412,11 +401,8 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
 
 
 def spare_equations(result: Calibration) -> int:
-    """Equations that configurations give beyond the parameters fitted.
-
-    A rigid body's place is six numbers in each load state, however many markers it has and however
-    often they are read.
-    """
+    """Equations beyond the parameters fitted.  A rigid body's place is six numbers in each load
+    state, however many markers it has and however often they are read."""
     observed = result.observations
     table, lead = observed.table, observed.lead
     code = numbered(observed.configuration, *np.round(table.force[lead], 3).T)
@@ -449,7 +435,6 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
-    """What these poses do not show, and what no pose shows: only the first is to be measured."""
     all_of_them = standings(result)
     lacking = [e.name for e in result.ordinary if all_of_them[e.name] in (INVISIBLE, ABSORBED)]
     redundant = () if result.left is None else result.left.redundant
@@ -521,8 +506,8 @@ def shape_of(summary: ResidualSummary) -> Finding:
 
 
 def _test(result: Calibration) -> Iterator[Finding]:
-    """Test data against held-out poses, by an F-test of the two mean squares; the components of a
-    reading count as one."""
+    """Test data against held-out poses, by an F-test of the two mean squares; a reading's
+    components count as one."""
     test, held = result.test, result.heldout_rms
     if test is None:
         yield _note("untested")
@@ -580,8 +565,8 @@ def _bounds(result: Calibration) -> Iterator[Finding]:
 
 
 def only_placed(result: Calibration) -> bool:
-    """Whether nothing but base, markers and their like was fitted, as in a calibration of a tool
-    or of hand and eye: then the nominal arm is placed by the same fit and no rival to it."""
+    """Whether nothing but base, markers and their like was fitted: then the nominal arm is placed
+    by the same fit and no rival to it."""
     return all(
         effect_of(p.effect).registered or e.note.startswith("fixed")
         for p, e in zip(result.model.parameters, result.estimates, strict=True)
@@ -647,8 +632,8 @@ OF_SEVERAL = {
 
 
 def warning_sentences(result: Calibration) -> dict[str, str]:
-    """The findings that call for attention as sentences that name the remedy, each with the kind of
-    finding that it tells; of those that are alike one sentence."""
+    """The findings that call for attention as sentences, with the kind of each; of those alike one
+    sentence."""
     groups: dict[Any, list[Finding]] = {}
     for k, f in enumerate(result.findings):
         alike = (f.kind, f.numbers["bound"], f.numbers["unit"]) if f.kind in OF_SEVERAL else k
@@ -698,7 +683,6 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
 
 
 def _shown(f: Finding) -> dict[str, str]:
-    """Value, standard deviation and bound of a parameter in the unit that people think in."""
     unit = str(f.numbers["unit"])
     digits = {"value": 3, "std": 2, "bound": 3}
     sizes = {k: rounded(display(f.number(k), unit)[0], n) for k, n in digits.items()}
@@ -718,8 +702,7 @@ SLIGHT = 0.1  # of the error at new poses: what is open by less raises it by hal
 
 
 def next_steps(result: Calibration) -> list[Finding]:
-    """Findings whose remedy is still to be told, each remedy once, the worthiest first: what speaks
-    against the result, what is worth knowing, what to do with it, and last what hardly matters."""
+    """Findings whose remedy is still to be told, each remedy once, the worthiest first."""
     steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in TOLD_ELSEWHERE}
     # One that begins with another says that too.
     whole = {r for r in steps if r and not any(s != r and s.startswith(r) for s in steps)}

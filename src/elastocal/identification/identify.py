@@ -127,8 +127,8 @@ def identify(
 def _doubts(
     model: Model, table: Measurements, test: Measurements | None, x: Array
 ) -> Iterator[str]:
-    """Moves out of order, where any effect follows the last one, an arm that lies, and a test of
-    what was fitted."""
+    """Moves out of order where an effect follows the last one, an arm that lies, a test of what was
+    fitted."""
     if test is not None:
         read = [np.asarray(t.distance if t.position is None else t.position) for t in (table, test)]
         fitted, kept = (
@@ -196,8 +196,8 @@ def _course(
 
 
 def _of_readings(covariance: Array | None, good: BoolArray, size: int) -> Array | None:
-    """The given covariance, that of the good readings (N,) alone; a matrix of another shape stays
-    as it is, to be refused where it becomes weights."""
+    """The covariance of the good readings (N,) alone; a matrix of another shape stays as it is, to
+    be refused where it becomes weights."""
     rows = np.repeat(good, size)
     if covariance is None or covariance.shape != (len(rows), len(rows)):
         return covariance
@@ -233,10 +233,7 @@ def summarise(
     course: Course, found: MethodResult, new_poses: NewPoses | None, copies: tuple[int, ...],
     test: Measurements | None,
 ) -> Calibration:  # fmt: skip
-    """The result of a method: estimates with intervals, what is combined, noise, warnings.
-
-    `new_poses`: where the arm will be used, by default the workspace.
-    """
+    """The result of a method; `new_poses`: where the arm will be used, by default the workspace."""
     every, solution, covariance = course.every, found.solution, found.spread.matrix
     final = solution.fit
     kept, problem = solution.reduction.kept, solution.problem
@@ -289,7 +286,6 @@ def summarise(
 
 
 def _unchecked(result: Calibration) -> Array | None:
-    """What single configurations alone hold (`told_by_one`); None where it is not to be had."""
     observed, kept, weights = result.observations, result.columns, result.weights
     lone = ~np.isfinite(result.held_out)
     if not lone.any():
@@ -308,11 +304,9 @@ def uncertainty_of(
     observed: Observations, B: Array, covariance: Array, left: Array | float = 1.0
 ) -> Array:
     """Standard deviation (configurations,) in m that the fit's own uncertainty gives a predicted
-    position, mean square over a configuration's readings; B (rows, determined).
-
-    A row that the fit holds with leverage h is known with variance v there, with v/(1 − h) by the
-    fit to the others; `left` (rows,) are 1 − h.
-    """
+    position, mean square over a configuration's readings; B (rows, determined).  A row that the fit
+    holds with leverage h is known with variance v there, with v/(1 − h) by the fit to the others;
+    `left` (rows,) are 1 − h."""
     B = (B.T / np.sqrt(left)).T.reshape(-1, observed.size, B.shape[1])
     each = variance_of(B[:, :3], covariance)
     code = numbered(observed.configuration)
@@ -397,7 +391,6 @@ def _not_stated(p: Parameter, held: float, limits: tuple[float, float]) -> str:
 def _correlations(
     rho: Array, names: tuple[str, ...], told: BoolArray
 ) -> tuple[tuple[str, str, float], ...]:
-    """Pairs with |ρ| over 0.9 of those that are `told`, strongest first."""
     i, j = np.nonzero(np.triu(np.abs(rho) > CORRELATED, k=1) & np.outer(told, told))
     strongest = np.argsort(-np.abs(rho[i, j]), kind="stable")
     return tuple((names[a], names[b], float(rho[a, b]))
@@ -419,14 +412,15 @@ def _adapted(
     course: Course, start: Solution, good: BoolArray, kind: str, *,
     visits: bool = True, judging: bool = True,
 ) -> Adapted:  # fmt: skip
-    """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
+    """Fit with weights that the residuals tell, from `start`, the fit to the `good` (N,)
+    observations, which faulty readings do not bend.
 
-    `start` is the fit to the `good` (N,) observations.  Noise and good readings are settled at its
-    values and the kept parameters fitted anew with these weights, until neither changes.  Then the
-    parameters are chosen again by what is there now, if other readings are good or the weights show
-    more, and with them, as whenever the good readings have changed, the kind of noise.  Noise that
-    knows the arm's `visits` counts, and readings are judged, unless told otherwise.  More
-    parameters that do not settle are none: the fit without them stays.
+    Noise and good readings are settled at its values and the kept parameters fitted anew with these
+    weights, until neither changes.  Then the parameters are chosen again by what is there now, if
+    other readings are good or the weights show more, and with them, as whenever the good readings
+    have changed, the kind of noise.  Noise that knows the arm's `visits` counts, and readings are
+    judged, unless told otherwise.  More parameters that do not settle are none: the fit without
+    them stays.
     """
     every, same = course.every, True
     noise: NoiseFit | None = None
@@ -489,15 +483,13 @@ ENOUGH = 10
 
 
 def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Covariance:
-    """Covariance and intervals of the solution's fitted parameters.
+    """Covariance and intervals of the fitted parameters; InsufficientDataError where the data
+    cannot give it.
 
-    auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in
-    a large table with several readings per configuration cr1;
-    classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations,
-    or rows by themselves, in passes over the parts of the table;
-    profile: {v: S(v) − Ŝ ≤ t² s²} of the nonlinear sum of squares.
-
-    Raises InsufficientDataError where the data cannot give it.
+    auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in a
+    large table with several readings per configuration cr1; classical: s²(BᵀW²B)⁻¹ with t (eq. 7,
+    13); hc…, cr…: sandwich, clusters being configurations, or rows by themselves, in passes over
+    the parts of the table; profile: {v: S(v) − Ŝ ≤ t² s²} of the nonlinear sum of squares.
     """
     fit, problem = solution.fit, solution.problem
     if kind == "auto" and noise is not None:
@@ -542,8 +534,8 @@ COMPUTED = (
 
 
 def run_method(course: Course) -> MethodResult:
-    """Carry out `options.method`; constraints and prior come last, on the weights and the readings
-    that the method ends with."""
+    """Constraints and prior come last, on the weights and the readings that the method ends
+    with."""
     options, smooth = course.options, course.every.problem.model.shrunk[course.free].any()
     if smooth:
         from elastocal.identification.smooth_fit import fit_smooth  # few models have any
@@ -590,13 +582,12 @@ def _by_method(course: Course) -> MethodResult:
 
 
 def with_limits(every: Solution, found: MethodResult, options: Options) -> MethodResult:
-    """The result with the parameters that the readings hardly show held, and the others fitted
-    anew with the weights and the kind of noise found.
+    """The result with the parameters that the readings hardly show held, and the others fitted anew
+    with the weights and the kind of noise found.
 
-    One that lies beyond its bound by more than its interval contradicts the model and stays
-    fitted: whoever reads it has to see that.  Of methods other than generalised and ordinary least
-    squares all stay fitted; where bounds or knowledge were given, these say what the readings do
-    not, and nothing is held.
+    One that lies beyond its bound by more than its interval contradicts the model and stays fitted:
+    whoever reads it has to see that.  Of methods other than generalised and ordinary least squares
+    all stay fitted, and where bounds or knowledge say what the readings do not.
     """
     fitted = found.method in ("reml", "wls", "ols")
     limits: dict[int, tuple[float, float]] = {}  # held ones keep what was found of them
@@ -623,7 +614,6 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
 def _holding(
     every: Solution, found: MethodResult, held: dict[int, float], options: Options
 ) -> MethodResult | None:
-    """The result of a fit that holds some of its parameters; None where there is none."""
     solution, noise = found.solution, found.noise
     x0, lost = solution.problem.x0.copy(), np.isin(solution.reduction.kept, list(held))
     if lost.all():
@@ -678,7 +668,6 @@ def _reml(course: Course) -> MethodResult:
 def _explained(
     every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
 ) -> BoolArray:
-    """Readings (N,) that are not `good`, of groups which one common shift each explains."""
     report = report_faulty(every, fitted, noise, good)
     known = [] if report is None else [f.readings for f in report.shifted]
     return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))

@@ -95,10 +95,8 @@ class System:
         )  # fmt: skip
 
     def restricted(self, columns: IntArray, x: Array) -> System:
-        """The constraints on x[columns], all other parameters held at x (p,).
-
-        Raises InputError where the held values alone break a constraint.
-        """
+        """The constraints on x[columns], all other parameters held at x (p,); InputError where the
+        held values alone break one."""
         rest = x.astype(float)
         rest[columns] = 0.0
         held = np.ones(len(x), dtype=bool)
@@ -275,7 +273,6 @@ class Constraints:
 
 
 def combination(entry: Entry) -> dict[str, float]:
-    """An entry as {name: coefficient}, its constant under the empty name; zeros left out."""
     if isinstance(entry, str):
         return {entry: 1.0}
     terms = dict(entry) if isinstance(entry, Mapping) else {"": float(entry)}
@@ -394,7 +391,6 @@ class GaussianPrior:
         return P, root @ self.mean
 
     def _root(self) -> Array:
-        """L⁻¹ of the Cholesky factor; by standardised parameters, whose units are alike."""
         std = np.sqrt(np.abs(np.diag(self.covariance)))
         try:
             require(bool((std > 0).all()), "")
@@ -511,8 +507,7 @@ RANK = 1e-10  # of unit rows or columns: what is smaller is taken for round-off
 
 def equality_space(A: Array, b: Array) -> tuple[Array, Array, Array]:
     """All x with A x = b (k, p), or the least-squares ones where the rows contradict each other:
-    the shortest (p,), an orthonormal basis (p, q) of the way to the others, and b − A x (k,), of
-    unit rows."""
+    the shortest (p,), an orthonormal basis (p, q) of the way to the others, and b − A x (k,)."""
     norms = np.linalg.norm(A, axis=1)
     unit = np.where(norms > 0, norms, 1.0)
     # With a row of zeros, which leaves every way open: LAPACK takes no matrix without rows.
@@ -533,10 +528,8 @@ MATTERS = 1e-6  # of the largest multiplier
 
 @dataclass(frozen=True)
 class Minimum:
-    """Minimiser x (p,) of |t − J x|² under constraints, the objective there, what is active.
-
-    In the coordinates of `Reduced` it is u (q,), and does not move along `holding` (·, q).
-    """
+    """Minimiser x (p,) of |t − J x|² under constraints, the objective there, what is active.  In
+    the coordinates of `Reduced` it is u (q,), and does not move along `holding` (·, q)."""
 
     x: Array
     objective: float
@@ -589,7 +582,7 @@ class Reduced:
 
     def nearest(self, target: Array) -> tuple[Array, Array]:
         """The point (q,) of the region nearest to the target, which is target + Σ prices · rows,
-        and the prices.  Raises InputError where constraints contradict each other."""
+        and the prices; InputError where constraints contradict each other."""
         for _ in range(MOST_CUTS):
             u, prices = self._nearest_of_rows(target)
             known = len(self.cuts)
@@ -652,10 +645,8 @@ class Reduced:
     def minimum(self, stated: System | None = None) -> Minimum:
         """The minimum under all constraints; `active` in the terms of `stated`, if given, where x
         is a step and `stated` the constraints on the parameters themselves: equalities, then
-        bounds, then matrices, with prices in the units of x.
-
-        Raises InputError where constraints contradict each other, which it names.
-        """
+        bounds, then matrices, with prices in the units of x.  InputError names constraints that
+        contradict each other."""
         u, prices = self.nearest(np.zeros(self.T.shape[1]))
         bounds, matrices, pull = self._told(prices)
         limits, stated, n = self.limits, stated or self.system, len(self.sides)
@@ -702,18 +693,15 @@ class Reduced:
         return Minimum(x, float(left @ left), tuple(active), u, np.vstack(holding))
 
     def face(self, at: Minimum) -> Array:
-        """Orthonormal directions (q, ·) in which the constraints that the point lies on let u go:
-        of a matrix those with Nᵀ dM N = 0."""
+        """Orthonormal directions (q, ·) in which the constraints that the point lies on let u
+        go."""
         return equality_space(at.holding, np.zeros(len(at.holding)))[1]
 
     def farthest(self, index: int, found: Minimum, rise: float, side: int) -> Array:
         """x (p,) with the least (side −1) or largest (1) x[index] where the objective is at most
-        `rise` above its minimum `found`.
-
-        These are the ends of the profile interval {v: S(v) − Ŝ ≤ rise}, S(v) the least objective
-        with the parameter at v.  They are nearest to a target in that direction, whose distance
-        decides how far the objective rises.
-        """
+        `rise` above its minimum `found`: the ends of the profile interval {v: S(v) − Ŝ ≤ rise},
+        S(v) the least objective with the parameter at v.  They are nearest to a target in that
+        direction, whose distance decides how far the objective rises."""
         c, s = side * self.T[index], float(np.sqrt(rise))
         length = float(np.linalg.norm(c))
         if s == 0 or length <= RANK * float(np.max(np.linalg.norm(self.T, axis=1), initial=0.0)):
@@ -739,8 +727,8 @@ class Reduced:
 
 
 def _refuse(labels: Sequence[str], prices: Sequence[float] | Array) -> NoReturn:
-    """Raise InputError that names the constraints which no x satisfies together: those with a
-    multiplier prove it (Farkas); the others could be dropped and it would remain."""
+    """InputError that names the constraints which no x satisfies together: those with a multiplier
+    prove it (Farkas); the others could be dropped and it would remain."""
     matter = MATTERS * np.abs(prices).max()
     guilty = [f"'{k}'" for k, p in zip(labels, prices, strict=True) if abs(p) > matter]
     raise InputError(

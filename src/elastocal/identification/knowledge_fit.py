@@ -93,9 +93,9 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
     nonlinear objective at most `rise` above its minimum; infinite where there is no end.
 
-    Each step goes to that end of the model linearised where the last one ended, and is halved
-    until the objective there is near what is allowed.  An end may also be where poses have no
-    equilibrium any more.  Steps that do not settle lead to none.
+    Each step goes to that end of the model linearised where the last one ended, and is halved until
+    the objective there is near what is allowed.  An end may also be where poses have no equilibrium
+    any more.  Steps that do not settle lead to none.
     """
     fit, limit, size = found.fit, found.objective + rise, found.fit.problem.sizes[found.fit.columns]
     objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
@@ -226,13 +226,11 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
     """Minimise |W (y − h(X))|² + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
     W and the readings are those that the method ended with `before`, σ the noise of a whitened row
-    under it.  `fitted_columns` says what is fitted, `intervals_with_knowledge` what the intervals
-    are; t intervals have the method's own degrees of freedom.  The prior of smooth functions joins
-    the stated one, which counts where both name a parameter.
+    under it; t intervals have the method's own degrees of freedom.  The prior of smooth functions
+    joins the stated one, which counts where both name a parameter.
 
     Raises InputError for constraints that contradict each other or held values and names that are
-    no parameters; InsufficientDataError where an equality names a parameter that readings, prior
-    and equalities do not determine.
+    no parameters; InsufficientDataError as `fitted_columns`.
     """
     solution, names = before.solution, before.solution.problem.model.names
     fit, own, prior = solution.fit, solution.fit.known, options.prior
@@ -285,12 +283,9 @@ def fit_with_knowledge(before: MethodResult, options: Options, progress: Progres
 
 
 def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[str, ...]:
-    """A sentence where the objective grew by more than noise explains (F-test).
-
-    The stated prior's `rows` and active constraints count as degrees of freedom, less the
-    parameters they made estimable.  At active bounds the true distribution is smaller (χ̄²): the
-    test is cautious.
-    """
+    """A sentence where the objective grew by more than noise explains (F-test).  The stated prior's
+    `rows` and active constraints count as degrees of freedom, less the parameters they made
+    estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious."""
     fit, own = before.solution.fit, before.solution.fit.known
     stated = rows + len(found.best.active) - (len(found.names) - len(fit.columns))
     if stated < 1:
@@ -312,10 +307,8 @@ def _contradiction(before: MethodResult, found: KnownFit, rows: int) -> tuple[st
 
 
 def _reduction(solution: Solution, found: KnownFit) -> Reduction:
-    """What is fitted, what is held, and how a held parameter's error would move the estimates.
-
-    A parameter that an active constraint holds back does not move: it stands for itself.
-    """
+    """What is fitted, what is held, and how a held parameter's error would move the estimates.  A
+    parameter that an active constraint holds back does not move: it stands for itself."""
     before, problem = solution.reduction, solution.problem
     columns, k = found.fit.columns, len(found.fit.columns)
     dropped = np.setdiff1d(before.dropped, columns)

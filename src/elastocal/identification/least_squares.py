@@ -47,7 +47,6 @@ class Covariance:
 
     @property
     def correlation(self) -> Array:
-        """ρ (p, p), zeros for a value that equalities fix."""
         return correlations(self.matrix)[0]
 
     def tails(self, rows: Array) -> tuple[Array, Array]:
@@ -68,8 +67,8 @@ class Covariance:
         return dof, (1 + 2 * x) / (1 + 4 * x)
 
     def interval(self, x: Array, level: float = LEVEL) -> Array:
-        """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,); std_j by the
-        share of `tails`.  At 95 % the `ends` where there are any."""
+        """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), std_j by the share of `tails`; at 95 %
+        the `ends` where there are any."""
         if self.ends is not None and level == LEVEL:
             return self.ends
         share = self.tails(np.eye(len(x))[:, None])[1] if self.among else 1.0
@@ -105,8 +104,7 @@ def drawing_root(covariance: Array) -> Array:
 
 
 def t_quantile(level: float, dof: Array) -> Array:
-    """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level; infinite at
-    dof 0."""
+    """P(|t| ≤ quantile) = level with `dof`, at any shape; infinite at dof 0."""
     p, few = (1 + level) / 2, np.where((dof > 0) & np.isfinite(dof), dof, 1.0)
     t = np.where(np.isinf(dof), special.ndtri(p), special.stdtrit(few, p))
     return np.where(dof > 0, t, np.inf)
@@ -118,14 +116,12 @@ EPS = float(np.finfo(np.float64).eps)
 
 
 def orthogonal(B: Array) -> tuple[Array, Array]:
-    """Of the whitened B (rows, p) Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and
-    V Vᵀ = (BᵀB)⁻¹.
+    """Of the whitened B (rows, p) Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and V Vᵀ =
+    (BᵀB)⁻¹.
 
-    Any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ: BᵀB, whose condition is that of B squared,
-    is never formed.  Row j of V is the coefficient of parameter j on the columns of Q.
-
-    Raises InputError where the columns depend on each other, InsufficientDataError where there are
-    no more rows than parameters.
+    Any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ: BᵀB, whose condition is that of B squared, is
+    never formed.  Raises InputError where the columns depend on each other, InsufficientDataError
+    where there are no more rows than parameters.
     """
     rows, p = B.shape
     if rows <= p:
@@ -201,14 +197,13 @@ Rows = tuple[Array, Array, IntArray]  # Q_c and e_c of whole clusters, and the c
 
 def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     """Covariance of x̂ that allows any correlation within a cluster (equations above), of rows in
-    parts, Q = B V with V Vᵀ = (BᵀB)⁻¹ and e = y − B x̂ the least-squares residual, whitened; HC0
-    to HC3 are the CR where every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
+    parts, Q = B V with V Vᵀ = (BᵀB)⁻¹ and e = y − B x̂ the least-squares residual, whitened; HC0 to
+    HC3 are the CR where every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
 
-    Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the
-    generalised inverse square root, which leaves parameters outside that direction unbiased
-    (there, Theorem 1).  A parameter that depends on it has no cluster-robust variance: its dof
-    is 0 and its interval unbounded.  CR3 does not exist then: InsufficientDataError, as for a
-    single cluster.
+    Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the generalised
+    inverse square root, which leaves parameters outside that direction unbiased (there, Theorem 1).
+    A parameter that depends on it has no cluster-robust variance: its dof is 0 and its interval
+    unbounded.  CR3 does not exist then: InsufficientDataError, as for a single cluster.
 
     Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
 
@@ -269,10 +264,8 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
 
 
 def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
-    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.
-
-    For g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) the smaller of the two is decomposed.
-    """
+    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.  For g(I −
+    Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) the smaller of the two is decomposed."""
     by_row = Qc.shape[1] < Qc.shape[2]
     gram = Qc @ Qc.transpose(0, 2, 1) if by_row else Qc.transpose(0, 2, 1) @ Qc
     values, U = np.linalg.eigh(gram)
@@ -358,8 +351,8 @@ def growth(B: Array, Q: Array, e: Array, configuration: IntArray) -> Array:
 def left_out(
     Q: Array, e: Array, configuration: IntArray
 ) -> Iterator[tuple[IntArray, Array, BoolArray]]:
-    """Rows (g, m) of configurations of one size, Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c (g, columns), and which
-    are alone in some direction: there the latter is meaningless."""
+    """Rows (g, m) of configurations of one size, Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c (g, columns),
+    meaningless where a configuration is alone in some direction, and which are."""
     for rows in same_size(configuration):
         Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
         # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
@@ -425,7 +418,6 @@ def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
 
 
 def rms_3d(residual: Array, size: int) -> float:
-    """Root mean square length in m of the position part of the residual (rows,)."""
     parts = residual.reshape(-1, size)[:, :3]
     return float(np.sqrt((parts**2).sum(axis=1).mean()))
 

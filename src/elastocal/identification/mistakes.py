@@ -77,10 +77,8 @@ def nominal_fit(
     chain: Chain, cell: Cell, table: Measurements, spherical: bool = False
 ) -> NominalFit | None:
     """How well readings fit the nominal arm, and which mistake undone would mend it; None where
-    they hold no positions, too few poses, or numbers beyond all measure.
-
-    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
-    """
+    they hold no positions, too few poses, or numbers beyond all measure.  `spherical`: positions
+    were read as distance and angles, which invites mistakes of their own."""
     poses = len(np.unique(table.q, axis=0))
     if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
         return None
@@ -123,7 +121,6 @@ def _some(table: Measurements) -> Measurements:
 
 
 def _errors(model: Model, table: Measurements) -> tuple[float, float]:
-    """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
     table = _some(table)
     found = Registration.of(model, table)
     place = found.places(model.rigid.flange_poses(table), table.marker)
@@ -132,8 +129,8 @@ def _errors(model: Model, table: Measurements) -> tuple[float, float]:
 
 
 def _turns(model: Model, table: Measurements) -> Array:
-    """Angles (n,) in rad of the rotations from the nominal arm's, each target mounted as it is on
-    average; none where there are no rotations."""
+    """Angles (n,) in rad of the rotations from the nominal arm's, each target mounted as on
+    average."""
     if table.rotation is None:
         return np.zeros(0)
     table = _some(table)
@@ -145,8 +142,7 @@ def _turns(model: Model, table: Measurements) -> Array:
 
 
 def rotations_off(angles: Array, of: str) -> str:
-    """What rotations that are these angles in rad from those `of` an arm let suspect; "" where they
-    are its own."""
+    """What rotations that are these angles in rad from those `of` an arm let suspect."""
     angle = float(np.median(angles)) if len(angles) else 0.0
     if angle <= POOREST:
         return ""
@@ -263,7 +259,6 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
 def _of_positions(
     position: Array, fits: LinearFits, k: int, spherical: bool
 ) -> tuple[Array, list[str]]:
-    """The positions as the k-th fit asks for: in which unit, in a right-handed frame."""
     words, scale = [], float(fits.scale[k])
     # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
     if fits.determinant[k] < 0:
@@ -429,9 +424,9 @@ def refuse_nonsense(
 ) -> None:  # fmt: skip
     """Raise InsufficientDataError, with the likely cause, where a fit is none of this robot.
 
-    `x` (parameters,) and `residual` (N·size,) of the fit in SI units, `apart` what it left out;
-    `every` reading is looked at for the cause, since few may be left in `observed`.  Deflections
-    are small whatever the mistake: there positions that a mistake undone makes fit are enough.
+    `apart` are the readings that it left out; `every` reading is looked at for the cause, since few
+    may be left in `observed`.  Deflections are small whatever the mistake: there positions that a
+    mistake undone makes fit are enough.
     """
     left, n = [residual], len(observed.lead)
     if apart is not None:
@@ -516,8 +511,8 @@ SHOWN = 6  # runs of lines, and configurations, that are named
 
 @dataclass(frozen=True)
 class Exchanged:
-    """Rows (k,) of a table with the name of another marker, the `markers` that are mixed up, and in
-    `words` which and what to do."""
+    """Rows (k,) of a table with the name of another marker, the `markers` mixed up, and what to
+    do."""
 
     rows: IntArray
     markers: tuple[str, ...]
@@ -595,10 +590,10 @@ _note, _care, _poor = (partial(made, s) for s in ("note", "care", "poor"))
 def load_unit(result: Calibration) -> Iterator[Finding]:
     """Are all compliances about as much too large as kilograms for newtons make them, or too small?
 
-    Without a load there is no unit of one.  What they should be about is what the cell states, else
-    what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
-    The median of the ratios has to be that factor to within what arms differ from what is expected
-    of them (EXPECTED_TO).  By the links' weights, a rule of thumb, it is worth a look, and no more.
+    What they should be about is what the cell states, else what winds each revolute joint up by
+    RATED_WIND_UP at its rated torque, by the links' weights.  The median of the ratios has to be
+    that factor to within what arms differ from what is expected of them (EXPECTED_TO).  By the
+    links' weights, a rule of thumb, it is worth a look, and no more.
     """
     model, chain = result.model, result.model.chain
     known = {e.name: e.value for e in result.ordinary if e.value is not None}
@@ -636,8 +631,6 @@ def load_unit(result: Calibration) -> Iterator[Finding]:
 
 
 def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
-    """Those more than SURELY standard deviations beyond a physical bound (of the interval of 95 %,
-    half is 1.96 of them or more)."""
     return [
         (p, e)
         for p, e in zip(result.model.parameters, result.estimates, strict=True)
@@ -647,8 +640,8 @@ def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
 
 
 def impossible_values(result: Calibration) -> Iterator[Finding]:
-    """Values that no arm has.  Where most compliances are among them, no missing effect explains
-    it, but loads in the opposite direction do, and no load is compensated rightly."""
+    """Where most compliances are among them, no missing effect explains it, but loads in the
+    opposite direction do, and no load is compensated rightly."""
     if not (found := impossible(result)):
         return
     springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
@@ -686,8 +679,8 @@ STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
 
 def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[Finding]:
     """Values whose whole interval lies more than FAR typical deviations from nominal, of a
-    combination all that it may hold; doubted unless the noise explains the residual, and held-out
-    poses agree (`explained`)."""
+    combination all that it may hold; doubted unless the noise explains the residual
+    (`explained`)."""
     ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
     typical = {p.name: p.typical or 0.0 for p in result.model.parameters}
     for c in result.combinations:

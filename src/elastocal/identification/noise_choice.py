@@ -80,9 +80,7 @@ class Sets:
 
 class NoisyReadings:
     """Readings under a kind of noise, where what drifts is `lasting` so long, as a mixed model.
-
-    Variances θ: those of single readings, then one for each of the `deviations` that they share.
-    """
+    Variances θ: those of single readings, then one for each of the `deviations` that they share."""
 
     def __init__(self, readings: Readings, kind: Kind, lasting: float | None = None) -> None:
         self.readings, self.kind, self.lasting = readings, kind, lasting
@@ -156,8 +154,8 @@ class NoisyReadings:
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
 
     def start(self, like: Fitted | None = None) -> Array:
-        """Variances (K,) to start from: of `like` where it has them; else own ones from the scatter
-        of repeats where there is any, or from all residuals, and shared ones a tenth of these."""
+        """Variances (K,) of `like` where it has them; else own ones from the scatter of repeats
+        where there is any, or from all residuals, and shared ones a tenth of these."""
         sets, size, e2 = self.sets, self.readings.size, (self.sets.e**2).mean(axis=1)
         # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
         unit = np.trace(self.structure.matrix.sum(axis=1), axis1=1, axis2=2)[sets.first] / size
@@ -202,7 +200,6 @@ class Fitted(MixedFit):
 
     @property
     def found(self) -> list[tuple[Deviation, float]]:
-        """The deviations that are not none, and their variances."""
         each = zip(self.noisy.deviations, self.common.tolist(), strict=True)
         return [(d, v) for d, v in each if v > 0 or d.waves is not None]
 
@@ -218,7 +215,6 @@ class Fitted(MixedFit):
         return rows @ self.state.x, *self.expected.kenward_roger(self.covariance, rows)
 
     def of(self, readings: Readings) -> list[tuple[Deviation, float]]:
-        """The deviations that these readings share, be they those fitted or others."""
         known = {d.name: v for d, v in self.found}
         others = self.kind.deviations(readings, self.lasting, every=True)
         return [(d, known[d.name]) for d in others if d.name in known]
@@ -228,10 +224,8 @@ def fitted(
     readings: Readings, kind: Kind, like: Fitted | None = None, lasting: float | None = None,
     enough: float = ENOUGH,
 ) -> Fitted:  # fmt: skip
-    """A model's fit; the search starts from the variances of `like` where it has the same.
-
-    What drifts is `lasting` so long, as in `like`, or as is the most likely.
-    """
+    """A model's fit; the search starts from the variances of `like` where it has the same.  What
+    drifts is `lasting` so long, as in `like`, or as is the most likely."""
     if TIME not in kind.parts:
         lasting = None
     elif (record := readings.visits) is not None:
@@ -266,10 +260,7 @@ NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
 
 def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
     """Prior of the group variances from the scatter of a group's sets about their own mean, less a
-    fit with the plain mean of repeats.  What all sets of a group share is taken out with the mean.
-
-    Raises InsufficientDataError where the groups hold too few readings.
-    """
+    fit with the plain mean of repeats; InsufficientDataError where groups hold too few readings."""
     sets, size, K = noisy.sets, noisy.readings.size, noisy.own
     group = noisy.structure.index[sets.first]
     B, e = sets.B.reshape(-1, sets.B.shape[2]), sets.e.ravel()
@@ -332,8 +323,6 @@ FEWEST_VISITS, SEVERAL = 8, 2
 
 @dataclass(frozen=True)
 class Trial:
-    """One noise model that was tried: how many variances it has, and its criterion."""
-
     kind: str
     variances: int
     criterion: float
@@ -352,9 +341,9 @@ class NoiseTest:
 class NoiseFit:
     """The noise model that was chosen, the estimate under it, and what else was tried.
 
-    `kind` is the name of a `Kind`.  `fit` is in orthonormal parameters, B T with T (p, p), which
-    shifts all its log-likelihoods by one constant.  Neither the units of the parameters nor their
-    correlation then cost digits, and columns that depend on each other are found out.
+    `fit` is in orthonormal parameters, B T with T (p, p), which shifts all its log-likelihoods by
+    one constant.  Neither the units of the parameters nor their correlation then cost digits, and
+    columns that depend on each other are found out.
     """
 
     kind: str
@@ -377,7 +366,6 @@ class NoiseFit:
 
     @property
     def covariance(self) -> Covariance:
-        """That of Kenward and Roger."""
         if self.over_times is not None:
             return self.over_times
         text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
@@ -406,8 +394,6 @@ def estimate_noise(
     readings for, each with what a configuration may share, and then changes by one part what makes
     the criterion smaller, until nothing does; scatter of the joints and drift are tried where a
     test finds a trace of them.
-
-    Raises InputError for an unknown kind, or one of a plug-in that lacks something in the readings.
     """
     Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
     basis = replace(readings, B=Q.reshape(readings.B.shape))
@@ -427,8 +413,7 @@ def estimate_noise(
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:
-    """The model with the smallest criterion; of many readings a sample chooses it, and all of them
-    tell its variances."""
+    """The model with the smallest criterion; of many readings a sample chooses it."""
     some = readings.sample(max(CHOSEN_FROM, PER_PARAMETER * readings.n_parameters))
     if some is readings:
         return _Choice(readings).result(T)
@@ -607,7 +592,6 @@ def linearised(model: Model, observed: Observations, x: Array, columns: IntArray
 
 def weights_of(noise: NoiseFit, readings: Readings, more: Array | float = 0.0) -> Weights:
     """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1.
-
     `more` (N, size, size) comes to the covariance of single readings."""
     whiten = block_diagonal(inverse_factor(own_noise(noise.fit, readings)[0] + more))
     weights = Weights(noise.kind, whiten, True, noise.description)

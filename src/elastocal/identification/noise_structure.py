@@ -87,8 +87,6 @@ class VisitRecord:
 
 
 def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord | None:
-    """The visits of the observations of a fit at x (parameters,); None for an arm that no joint
-    moves."""
     table, n = observed.table, len(observed.lead)
     if not model.chain.n_joints:
         return None
@@ -253,11 +251,9 @@ Terms = Iterable[tuple[IntArray | int, Array]]
 
 
 class Structure:
-    """Covariance of reading i alone: Σ_l θ[index[i, l]] · matrix[i, l].
-
-    `index` (N, L) into the `names` of the variances θ, in m² (rad²); `matrix` (N, L, size, size).
-    Each of the L `terms` is which variance a reading has, and S, for each reading or all.
-    """
+    """Covariance of reading i alone: Σ_l θ[index[i, l]] · matrix[i, l], `index` (N, L) into the
+    `names` of the variances θ, in m² (rad²); `matrix` (N, L, size, size).  Each of the L `terms` is
+    which variance a reading has, and S, for each reading or all."""
 
     def __init__(self, readings: Readings, names: Iterable[str], terms: Terms) -> None:
         n, size = readings.e.shape
@@ -455,11 +451,8 @@ TURNED = ("rx", "ry", "rz", "rotation", "angular")
 
 
 def register(model: NoiseModel) -> None:
-    """Add a noise model to STRUCTURES.
-
-    Raises InputError where it is none, says too little, or has the name of another one; the same
-    class takes the place of its former self.
-    """
+    """Add a noise model to STRUCTURES; the same class takes the place of its former self.
+    InputError where it is none, says too little, or has the name of another one."""
     check_registered(model, NoiseModel, "a noise model", "by_day")
     kind, name, text = type(model), model.name, getattr(model, "description", None)
     require(isinstance(text, str) and bool(text), f"{kind.__name__}.description takes a short text")
@@ -477,13 +470,14 @@ def register(model: NoiseModel) -> None:
 
 @dataclass(frozen=True)
 class Deviation:
-    """A deviation common to all readings of one `unit` (N, m): covariance τ² Σ ℓ ℓᵀ of those that
-    share it, with the loadings ℓ of each reading on its units, `loading` (N, m, size, r).
+    """A deviation common to all readings of one `unit` (N, m), −1 for none: covariance τ² Σ ℓ ℓᵀ of
+    those that share it, with the loadings ℓ of each reading on its units, `loading` (N, m, size,
+    r).
 
-    At an unit of −1 there is nothing.  A joint that settles elsewhere at each visit is the
-    deviation of a visit with ℓ = ∂(reading)/∂q of the `joints`.  What all readings have in common,
-    as a drift, are loadings on coefficients of the same variance besides, the `waves` (N, size, k).
-    `part` names what it is one of; τ is in rad where it `turns`, else in m.
+    A joint that settles elsewhere at each visit is the deviation of a visit with ℓ = ∂(reading)/∂q
+    of the `joints`.  What all readings have in common, as a drift, are loadings on coefficients of
+    the same variance besides, the `waves` (N, size, k).  `part` names what it is one of; τ is in
+    rad where it `turns`, else in m.
     """
 
     part: str
@@ -547,9 +541,8 @@ def of_configurations(readings: Readings, every: bool) -> Iterator[Deviation]:
     """Deviations that these readings can tell apart; or `every` one that there may be.
 
     An arm does not come back to quite the same place: a deviation per configuration; per
-    configuration and load; per configuration and marker; and per set, common to its repeats.
-    One is left out where it would coincide with another or with the noise of single readings.
-    Rotations, in rad, have variances of their own.
+    configuration and load; per configuration and marker; and per set, common to its repeats. One is
+    left out where it would coincide with another or with the noise of single readings.
     """
     kept: dict[tuple[str, ...], IntArray] = {}
     for by in PARTITIONS:
@@ -665,7 +658,6 @@ class Kind(NamedTuple):
         return "+".join((self.own, *self.parts))
 
     def having(self, *parts: str) -> Kind:
-        """With these parts alone; the joints' scatter either way."""
         return self._replace(parts=tuple(part for part in PARTS if part in parts))
 
     def with_part(self, part: str) -> Kind:
@@ -676,7 +668,6 @@ class Kind(NamedTuple):
         return self._replace(parts=tuple(p for p in self.parts if p != part))
 
     def with_stated(self, noise: Unsteadiness) -> Kind:
-        """With what `[noise]` of a cell states of visits."""
         found = self if EACH in self.parts or not noise.joints.any() else self.with_part(JOINTS)
         return found.with_part(TIME) if noise.drift > 0 else found
 
@@ -697,8 +688,8 @@ class Kind(NamedTuple):
     def deviations(
         self, readings: Readings, lasting: float | None, every: bool = False
     ) -> list[Deviation]:
-        """What these readings share, where a drift is `lasting` so long; `every` one that there
-        may be, or those that the readings tell apart."""
+        """What these readings share, where a drift is `lasting` so long; `every` one that there may
+        be, or those that the readings tell apart."""
         found: list[Deviation] = []
         for part in self.parts:
             if part == CONFIGURATION:
@@ -711,10 +702,7 @@ class Kind(NamedTuple):
 
 
 def noise_models() -> tuple[str, ...]:
-    """Every name that `noise` takes: auto, the structures, and those with shared deviations.
-
-    Those but auto may have the scatter of the joints (JOINTS or EACH) and a course in TIME added.
-    """
+    """Every name that `noise` takes: auto, the structures, and those with shared deviations."""
     return ("auto", *STRUCTURES, *(f"{name}+{CONFIGURATION}" for name in STRUCTURES))
 
 
@@ -722,10 +710,7 @@ def stated_deviations(
     model: Model, observed: Observations, x: Array, parts: Sequence[str] = tuple(PARTS)
 ) -> list[Deviation]:
     """What `[noise]` of the cell says that the readings share, of the `parts` asked for, each with
-    τ = 1: joints that settle anew at each visit, configurations that are off as a whole, a drift.
-
-    Without times a visit takes as long as the arm stands still, as in a simulation.
-    """
+    τ = 1.  Without times a visit takes as long as the arm stands still, as in a simulation."""
     noise, size, found = model.cell.noise, observed.size, list[Deviation]()
     scatters = JOINTS in parts and bool(noise.joints.any())
     drifts = TIME in parts and noise.drift > 0 and size > 1

@@ -121,11 +121,9 @@ TOO_LARGE_IN_COMMON = (
 
 
 def less_in_common(observed: Observations, residual: Array, cell: Cell, spent: int) -> float | None:
-    """Scatter of the mean residual of each configuration in units of what the cell states of it;
-    None where chance makes it as little, or what is stated is mostly that of single readings.
-
-    The `spent` parameters are taken to have followed these means alone.
-    """
+    """Scatter of the mean residual of each configuration, which the `spent` parameters are taken to
+    have followed alone, in units of what the cell states of it; None where chance makes it as
+    little, or what is stated is mostly that of single readings."""
     common, stated = cell.noise.configuration, stated_by_observation(observed, cell.tracker)
     if stated is None or not common or observed.kind not in ("position", "pose"):
         return None
@@ -156,13 +154,10 @@ class LackOfFit:
 
 
 def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> LackOfFit | None:
-    """F-test of the residual between configurations against pure error from repeats.
-
-    Repeats are observations of the same configuration, marker and force.  Within them the
-    whitened residual (rows,) scatters by pure error, SS_pure with Σ (repeats − 1) · size degrees
-    of freedom; what is left of the residual sum of squares lies between them (Draper and Smith
-    1998, section 2.1).  None where nothing is repeated, or no degree of freedom is left.
-    """
+    """F-test of the residual between configurations against pure error from repeats, observations
+    of the same configuration, marker and force (Draper and Smith 1998, section 2.1).  Within them
+    the whitened residual (rows,) scatters by pure error, SS_pure with Σ (repeats − 1) · size
+    degrees of freedom. None where nothing is repeated, or no degree of freedom is left."""
     residual = whitened.reshape(-1, observed.size)
     pure, dof_pure = pure_error(observed.place, residual)
     dof_between = len(whitened) - n_parameters - dof_pure
@@ -273,7 +268,6 @@ class Noise:
         return "configurations" if self.drift is None else "blocks in time"
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-ready: lengths in µm, and only what is known of a noise that was not estimated."""
         known = {
             "single_readings": self.single,
             "reason": self.reason,
@@ -296,10 +290,8 @@ class Noise:
 
 def noise_of(found: MethodResult, sigma: float) -> tuple[Noise, dict[str, float]]:
     """The noise that a method found, and its parts: mean square 3-D noise (m²) of single
-    "readings", and what readings of "visits" share; `sigma` is that of a whitened row.
-
-    Where no noise was estimated, all of the residual is taken for that of single readings.
-    """
+    "readings", and what readings of "visits" share; `sigma` is that of a whitened row.  Where no
+    noise was estimated, all of the residual is taken for that of single readings."""
     solution, estimated = found.solution, found.noise
     problem, residual = solution.problem, solution.fit.residual
     observed, cell, weights = problem.observations, problem.model.cell, problem.weights
@@ -426,10 +418,8 @@ class NormalScores:
 
 
 def normal_scores(z: Array, most: int) -> NormalScores:
-    """Normal scores of z (n,), at least 8 that should be standard normal, at most `most` of them.
-
-    Points are chosen evenly over the expected values, so both tails keep their single values.
-    """
+    """Normal scores of z (n,), at least 8 that should be standard normal, at most `most` of them,
+    chosen evenly over the expected values, so that both tails keep their single values."""
     n = z.size
     rank = np.arange(1, n + 1)
     if n > most:
@@ -627,7 +617,6 @@ class _Table:
         self.held, self.dof = held, dof
 
     def judged(self, code: IntArray, names: NDArray[np.object_]) -> Array:
-        """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
         total, f = (np.bincount(code, v, len(names)) for v in (self.squared, self.spare))
         return np.where(np.bincount(code) >= FEWEST_VALUES, _two_sided(total, f), np.nan)
 
@@ -648,10 +637,8 @@ class _Table:
         )  # fmt: skip
 
     def edges(self, n: int) -> Array:
-        """Bin edges about 0 by Freedman and Diaconis, width 2 IQR n^(−1/3) for n values each.
-
-        They reach to the largest value, or to 6 robust deviations where some lie far beyond.
-        """
+        """Bin edges about 0 by Freedman and Diaconis, width 2 IQR n^(−1/3) for n values each, to
+        the largest value, or to 6 robust deviations where some lie far beyond."""
         low, high = np.quantile(self.z, [0.25, 0.75])
         largest = float(np.abs(self.z).max())
         spread = float(high - low) or largest

@@ -36,10 +36,7 @@ TINY = np.finfo(float).tiny
 
 
 def median_scale(length: Array, size: int) -> float:
-    """σ = med|e_i| / median of χ(size): the MAD about zero for size 1; breakdown 50 %.
-
-    `length` (n,) of the observations' residuals.
-    """
+    """σ = med|e_i| / median of χ(size): the MAD about zero for size 1; breakdown 50 %."""
     return float(np.median(length) / np.sqrt(special.chdtri(size, 0.5)))
 
 
@@ -60,11 +57,9 @@ INSIDE = 0.01  # chance of a clean observation to lie outside
 
 def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
     """Observations (n,) that agree with the fit of the majority to e (n, size) ≈ B z, z ~ N(0, 1),
-    and the variance of their rows; B (n, size, p).
-
-    Up to one in a hundred clean observations is left outside, so this is a suspicion, not a
-    verdict; nobody is, where none lies farther out than chance would have it of the whole table.
-    """
+    and the variance of their rows; B (n, size, p).  Up to one in a hundred clean observations is
+    left outside: this is a suspicion, not a verdict.  Nobody is, where none lies farther out than
+    chance would have it of the whole table."""
     n, size, p = B.shape
     rng, half = np.random.default_rng(seed), special.chdtri(size, 0.5)
     # So many tell where the majority lies; all of them then have their say.
@@ -74,7 +69,6 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
     products = products.reshape(m, p * (p + 1))
 
     def squares(weight: Array, variance: Array) -> Array:
-        """Squared lengths (starts, m) beside the fits with these weights (starts, m)."""
         summed = (weight @ products).reshape(len(weight), p, p + 1)
         summed[:, np.arange(p), np.arange(p)] += variance[:, None]
         z = np.linalg.solve(summed[..., :p], summed[..., p:])[..., 0]
@@ -113,8 +107,6 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A reading whose residual lies beyond what the noise explains."""
-
     line: int
     configuration: str
     marker: str
@@ -164,17 +156,13 @@ class FitToGood:
         return max(self.rss / max(self.dof, 1.0), TINY)
 
     def coordinates(self, B: Array) -> Array:
-        """T of further observations."""
         flat = B.reshape(len(B) * B.shape[1], B.shape[2])
         return np.asarray(linalg.solve_triangular(self.R, flat.T, trans="T").T).reshape(B.shape)
 
     def p_values(self, T: Array, e: Array, good: BoolArray) -> Array:
         """p-value (n,) of each error e (n, size), as if its observation had been left out of the
-        fit.
-
-        A good one has eᵀ(I − TTᵀ)⁻¹e, any other eᵀ(I + TTᵀ)⁻¹e; both over size · s², s² without
-        the observation, follow F.
-        """
+        fit.  A good one has eᵀ(I − TTᵀ)⁻¹e, any other eᵀ(I + TTᵀ)⁻¹e; both over size · s², s²
+        without the observation, follow F."""
         size = e.shape[1]
         sign = np.where(good, -1.0, 1.0)[:, None, None]
         spread = (1 + ALONE) * np.eye(size) + sign * (T @ T.transpose(0, 2, 1))
@@ -212,13 +200,11 @@ def until_it_stands(
     """Fit and good observations (n,) that agree with each other, starting from `good`.
 
     `judged` fits to the good ones and says the squared lengths of all errors, the fit's degrees of
-    freedom, and which observations it does not contradict.  A set
-    that comes back after others ends the search: those good at any time of that round are kept.  So
-    does a fit that no majority agrees with: it cannot judge.  Observations that are taken back bend
-    the fit, so that more of them seem to fit: where the better half of all is left worse explained
-    than by an earlier set, beyond what chance allows, that set stands.
-
-    Raises ElastocalError where the first fit fails.
+    freedom, and which observations it does not contradict.  A set that comes back after others ends
+    the search: those good at any time of that round are kept.  So does a fit that no majority
+    agrees with: it cannot judge.  Observations that are taken back bend the fit, so that more of
+    them seem to fit: where the better half of all is left worse explained than by an earlier set,
+    beyond what chance allows, that set stands.  Raises ElastocalError where the first fit fails.
     """
     ended, visited = False, list[Stand[Found]]()
     for _ in range(ROUNDS):
@@ -256,7 +242,6 @@ def drops(
 
 
 def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
-    """Whether the `faulty` observations (N,) are few, or a matter of time."""
     return bool(faulty.mean() <= FEW or _by_chance(observed, faulty) < FALSE_ALARM)
 
 
@@ -299,10 +284,8 @@ SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at 
 
 def find_faulty(solution: Solution) -> BoolArray:
     """Which observations (N,) are faulty, by all free parameters, tied weakly to the start, and
-    noise of one variance; at a Bonferroni limit for the whole table.
-
-    Of a large table a sample is judged so, and its fit judges the others.
-    """
+    noise of one variance; at a Bonferroni limit for the whole table, of which, where it is large, a
+    sample is judged so, and its fit judges the others."""
     problem, n = solution.problem, len(solution.problem.observations.lead)
     part = problem.sample(SAMPLE) if problem.large else problem.part(np.arange(n))
     width = prior_widths(problem)[problem.free]
@@ -361,7 +344,6 @@ def prior_widths(problem: Problem) -> Array:
 
 
 def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
-    """B (n, size, free) and residual (n, size) of a part at x, whitened."""
     at, shape = problem.regressor(part, x, problem.free), (len(part.index), -1)
     B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
     return B.reshape(len(part.index), part.observations.size, -1), e.reshape(shape)
@@ -369,10 +351,8 @@ def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
 
 def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) -> BoolArray:
     """Observations (N,) of a large table, but those of the part that the fit is of, which it
-    contradicts.
-
-    B is evaluated in those parts alone that hold errors too large were the fit exact.
-    """
+    contradicts. B is evaluated in those parts alone that hold errors too large were the fit
+    exact."""
     x, n, size = problem.x0.copy(), len(problem.observations.lead), problem.observations.size
     x[problem.free] += width * fit.z
     e = problem.weights.apply(problem.residual(x)).reshape(n, size)
@@ -392,7 +372,6 @@ def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) 
 
 
 def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[Outlier, ...]:
-    """The faulty observations with their error under the fit to the others, in table order."""
     if not faulty.any():
         return ()
     observed, error = solution.problem.observations, solution.problem.residual(fitted.fit.x)
@@ -502,13 +481,12 @@ def settle(
     readings: Readings, kind: str = "auto", good: BoolArray | None = None,
     noise: NoiseFit | None = None,
 ) -> tuple[NoiseFit, BoolArray]:  # fmt: skip
-    """Noise and good readings (N,) that agree with each other, starting from `good` (default all).
+    """Noise and good readings (N,) that agree with each other, starting from `good` (default all),
+    and from the `noise` given, whose kind is kept.
 
     The noise model is fitted to the good readings, and every reading judged by the error of its
     prediction from them (false-alarm rate 1 % for the whole table), in turn.  Starting from all,
     errors that hide each other may stay: start from the majority.
-
-    The search begins with the `noise` given, and keeps the kind of noise that it begins with.
     """
     every = np.ones(len(readings), dtype=bool)
     good = every if good is None else good
@@ -601,15 +579,14 @@ class HuberFit:
         return self.V @ self.z
 
     def weights(self, c: float) -> Array:
-        """ψ(d)/d (n,)."""
         return c / np.maximum(self.distance, c)
 
     def covariance(self, cluster: IntArray | None = None) -> Covariance:
         """Covariance (p, p) of x̂.
 
-        Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
-        small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less p
-        as dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of
+        Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and
+        his small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less
+        p as dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of
         (σ/a) Ψ.
 
         Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster
@@ -654,13 +631,9 @@ def robust_result(
     """The robust fit of all readings in the parameters that the `good` ones (N,) determine.
 
     Minimises Σ ρ(|W (y − h(X))_i|/σ) over X[kept] by Gauss–Newton steps from the fit to the good
-    ones: each is the robust linear fit of the whitened residual to the whitened B at X.
-
-    Whitening by a covariance that couples observations (deflections that share an unloaded
-    reading) mixes them: a bad reading then also shows in those whitened after it.
-
-    Raises InputError for a large table, other intervals and dependent columns, ElastocalError where
-    the start has poses without equilibrium.
+    ones: each is the robust linear fit of the whitened residual to the whitened B at X.  Whitening
+    by a covariance that couples observations (deflections that share an unloaded reading) mixes
+    them: a bad reading then also shows in those whitened after it.
     """
     problem, kept, x, steps = every.problem, sound.reduction.kept, sound.fit.x.copy(), 0
     if problem.large:

@@ -76,10 +76,8 @@ class Uncertainty:
 
 
 def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncertainty:
-    """Σ_p = A_K Σ A_Kᵀ and O S at commanded joints q (n, joints) under the inputs `rows`.
-
-    NaN where the result determined nothing.
-    """
+    """Σ_p = A_K Σ A_Kᵀ and O S at commanded joints q (n, joints) under the inputs `rows`; NaN where
+    the result determined nothing."""
     arm, known, off = tool.calibrated, [], []
     for first in range(0, len(q), SENSITIVITIES):
         some = slice(first, first + SENSITIVITIES)
@@ -121,8 +119,6 @@ def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]
 
 
 def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
-    """Parameters that do harm (D,), the worst first; of those alike but for rounding, as they are
-    ordered in the model."""
     size = np.round(harm / max(float(harm.max(initial=0.0)), 1e-300), 9)
     return tuple(left.names[int(i)] for i in np.argsort(-size, kind="stable") if harm[i] > 0)
 
@@ -130,10 +126,8 @@ def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
 def left_open(
     solution: Solution, limits: Mapping[int, tuple[float, float]] | None = None
 ) -> OpenParameters:
-    """What a fit left open, from its weighted B_K and B_D at the values found.
-
-    A parameter held at its bound is no more open than its 95 % `limits`, by parameter, leave it.
-    """
+    """What a fit left open, from its weighted B_K and B_D at the values found.  A parameter held at
+    its bound is no more open than its 95 % `limits`, by parameter, leave it."""
     model, reduction = solution.problem.model, solution.reduction
     free, x = solution.problem.free, solution.fit.x
     kept = reduction.kept
@@ -155,12 +149,10 @@ def left_open(
 
 
 def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str, ...]:
-    """Which of the parameters left open no pose tells from the rest.
-
-    At poses over the whole joint range, their columns of B lie in the span of those determined and
-    of the others left open, but for so little that as many readings as these would show a typical
-    deviation by less than NEVER_SHOWN standard deviations.
-    """
+    """Which of the parameters left open no pose tells from the rest: at poses over the whole joint
+    range, their columns of B lie in the span of those determined and of the others left open, but
+    for so little that as many readings as these would show a typical deviation by less than
+    NEVER_SHOWN standard deviations."""
     problem, kept = solution.problem, solution.reduction.kept
     model, observed = problem.model, problem.observations
     if not len(open_) or model.shrunk[kept].all():
@@ -187,7 +179,7 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
 
 
 def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:
-    """Places "marker:M2" of the markers whose position is a parameter and that no row reads."""
+    """Places "marker:M2" of the markers that no row reads."""
     read = {f"marker:{table.marker_names[m]}" for m in np.unique(table.marker)}
     places = dict.fromkeys(p.where for p in model.parameters if p.where.startswith("marker:"))
     return tuple(place for place in places if place not in read)
@@ -256,11 +248,8 @@ def half_axes(covariance: Array, level: float = 0.95) -> Array:
 def position_at(
     tool: CalibratedTool, table: Measurements, noise: Noise, spread: Covariance
 ) -> Position:
-    """The tool's position at the joints and in the circumstances of the table (n,); `spread` is the
-    covariance of what was determined.
-
-    NaN where there is no static equilibrium.
-    """
+    """The tool's position at the joints and in the circumstances of the table (n,), NaN without an
+    equilibrium; `spread` is the covariance of what was determined."""
     rows, q = tool.rows(table), table.q
     joints, common = noise.scatter(q.shape[1])
     found = uncertainty_at(tool, rows, q)
@@ -319,7 +308,6 @@ def _loads(force: Array, observe: str) -> Array:
 
 
 def measured_loads(observed: Observations) -> Array:
-    """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
     return _evenly(_loads(observed.table.force, observed.kind), MOST_LOADS)
 
 
@@ -360,7 +348,6 @@ class PredictedError:
     sure: float = np.inf
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-ready, in µm."""
         low, high = self.ci95
         return {
             "rms": self.rms * 1e6, "ci95": [low * 1e6, high * 1e6],
@@ -381,7 +368,6 @@ class Excess:
     inflated: Array
 
     def with_chance(self, chance: float, rng: np.random.Generator) -> Excess:
-        """As it is in that share of the draws; in the others nothing is missing."""
         there = rng.random(DRAWS) < chance
         return Excess(np.where(there, self.squared, 0.0), np.where(there, self.inflated, 1.0))
 
@@ -389,11 +375,9 @@ class Excess:
 def excess_of(
     observed: Observations, residual: Array, dof: int, noise: Noise, rng: np.random.Generator
 ) -> Excess | None:
-    """From repeats where there are enough, else from the stated noise; None without either.
-
-    Mean squares are drawn as s² ν/χ²_ν.  Between configurations it is σ² + n τ² with n readings
-    in a cell of configuration, marker and load; within them σ².
-    """
+    """From repeats where there are enough, else from the stated noise; None without either.  Mean
+    squares are drawn as s² ν/χ²_ν.  Between configurations it is σ² + n τ² with n readings in a
+    cell of configuration, marker and load; within them σ²."""
     rows, spent = len(residual), len(residual) / max(dof, 1)
     scatter = rms_3d(residual, observed.size) ** 2 * spent
     test = noise.lack_of_fit
@@ -419,7 +403,6 @@ def excess_of(
 
 
 def _chi2(dof: int, rng: np.random.Generator) -> Array:
-    """Draws (DRAWS,) of ν/χ²_ν: by what factor a mean square may be off."""
     dof = max(dof, 1)
     return np.asarray(dof / rng.chisquare(dof, DRAWS))
 
@@ -481,10 +464,8 @@ def readings_at(
     model: Model, x: Array, observed: Observations, poses: NewPoses
 ) -> tuple[Array, Array]:
     """B (R, size, parameters) of readings at new poses, one for each pose and marker, and their
-    weight (R,) of sum 1; without those that have no static equilibrium, if any has one.
-
-    Whatever else the model asks for, as times and temperatures, is that of the readings in turn.
-    """
+    weight (R,) of sum 1; without those that have no static equilibrium, if any has one.  Whatever
+    else the model asks for, as times and temperatures, is that of the readings in turn."""
     table = observed.table
     markers = np.unique(table.marker[observed.lead])
     states = 2 if model.observe == "deflection" else 1

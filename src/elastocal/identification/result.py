@@ -762,7 +762,6 @@ def _estimate_json(e: Estimate) -> dict[str, Any]:
 
 
 def _endless(ci95: tuple[float, float] | None) -> str:
-    """Why an end of the interval is null; "" where both are numbers."""
     if ci95 is None:
         return ""
     ends = [name for name, v in zip(("lower", "upper"), ci95, strict=True) if not np.isfinite(v)]

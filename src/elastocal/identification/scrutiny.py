@@ -143,12 +143,9 @@ class Autocorrelation:
 
 def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation | None:
     """The correlation of residuals (rows,) from visit to visit of a configuration; None for fewer
-    than 12 visits.
-
-    The p-value is that of a permutation test, whatever the distribution of the noise: the sum of
-    products of neighbours is nearly normal over all orders, with an exact mean and variance (after
-    Wald and Wolfowitz 1943).
-    """
+    than 12 visits.  The p-value is that of a permutation test, whatever the distribution of the
+    noise: the sum of products of neighbours is nearly normal over all orders, with an exact mean
+    and variance (after Wald and Wolfowitz 1943)."""
     parts = residual.reshape(-1, observed.size)[:, :3]
     spread = np.sqrt((parts**2).mean(axis=0))
     table, lead = observed.table, observed.lead
@@ -281,7 +278,6 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
 
 
 def _refitted(fit: FoundFit, y: Array, columns: IntArray, weights: Weights) -> tuple[Array, Array]:
-    """Residual (rows,) of y by these columns, and of each configuration by a fit to the others."""
     B, observed = fit.B[:, columns], fit.observations
     left = y - B @ least_norm(weights.apply(B), weights.apply(y))
     return left, held_out_residual(B, left, weights, observed.configuration, observed.size)
@@ -382,14 +378,14 @@ class ErrorBudget:
 
 def gap_budget(result: FoundFit) -> ErrorBudget | None:
     """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
-    functions.
+    functions; None where some configuration cannot be left out, and for tables too large to do it
+    in passing.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
-    at nominal, on the model linearised at the whole fit; each configuration is predicted by
-    the fit to the others (`held_out_residual`), the last step as the result has it.  The first
-    step is "nominal_arm", with base and markers placed by the other configurations.  Intervals are
-    by resampling configurations.  None where some configuration cannot be left out, and for tables
-    too large to do it in passing.
+    at nominal, on the model linearised at the whole fit; each configuration is predicted by the fit
+    to the others (`held_out_residual`), the last step as the result has it.  The first step is
+    "nominal_arm", with base and markers placed by the other configurations.  Intervals are by
+    resampling configurations.
     """
     model = result.model
     large = len(result.residual) * len(result.determined) > MOST_BUDGETED

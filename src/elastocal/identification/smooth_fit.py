@@ -109,7 +109,6 @@ class LinearRows:
 
     @cached_property
     def products(self) -> Products:
-        """Those of B_s and e with the ordinary columns projected out."""
         rest = self.factor.augmented[self.ordinary :, self.ordinary :]
         S, left = rest[:, :-1], rest[:, -1]
         spare = max(self.factor.rows - self.ordinary, 1)
@@ -125,7 +124,6 @@ class LinearRows:
             return np.exp(2 * theta[1:])[self.group] * self.std**2
 
         def objective(theta: Array) -> tuple[float, Array, Array]:
-            """In log σ and the ½ log λ of the groups."""
             value, slope, information = products.objective(variances(theta), 2.0 * own, theta[0])
             over = 2 * theta[1:] / PRICE
             over[: self.functions] = np.maximum(over[: self.functions], 0.0)
@@ -173,7 +171,6 @@ class Posterior:
 
     @property
     def step(self) -> Array:
-        """α and b (columns,)."""
         return self.half @ self.r_factor.projected
 
     @property
@@ -190,13 +187,11 @@ class Posterior:
 
     @property
     def prior_share(self) -> Array:
-        """Share of each estimate's information that is the prior's, 0 to 1."""
         return share_of_prior(self.cofactor, self.P)
 
     @cached_property
     def effective(self) -> Array:
-        """How many parameters' worth of each (columns,) the readings determine, 0 to 1: their sum
-        is the trace of the hat matrix."""
+        """How many parameters' worth of each (columns,) the readings determine, 0 to 1."""
         return np.asarray(1 - (self.P**2).sum(axis=0) * np.diag(self.cofactor))
 
 
@@ -241,10 +236,8 @@ class Functions:
     def as_large_as(self, fit: JointFit) -> bool:
         """Whether this arm's errors beside the functions are larger than typical (`own_size`): then
         parameters of known size are so from here on, `unsure` (shrunk,) the variance of log size.
-
         An estimate varies by its prior variance less what is left of that: by the share that the
-        readings determine.
-        """
+        readings determine."""
         sized = self.group >= len(self.groups)
         told = fit.posterior.effective[len(fit.reduction.kept) :][sized]
         away = ((fit.found.x[self.columns] - self.nominal) / self.std)[sized]
@@ -276,8 +269,8 @@ class JointFit:
 
     def standardised(self, others: Part | None = None) -> Array:
         """Residuals (N, size) free of the fit's part in them, in m or rad: of the fit's own
-        readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of
-        1 − QQᵀ."""
+        readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1
+        − QQᵀ."""
         problem, side = self.found.problem, -1
         if others is not None:
             own, side = others.observations, 1
@@ -313,7 +306,6 @@ def fit_smooth(course: Course) -> MethodResult:
 
 
 def _followed(observed: Observations, group: SmoothGroup) -> Array:
-    """What a function follows, in every observation (N,)."""
     if group.basis is None:
         return np.zeros(0)
     table = observed.table
@@ -342,7 +334,6 @@ class _Search:
         self.alike = np.zeros(len(bare), dtype=bool)  # as readings of other configurations
 
     def chosen(self, noise: NoiseFit | None, good: BoolArray) -> Part:
-        """The good readings, weighted by the noise, or as they are without one."""
         part = self.every.problem.part(np.flatnonzero(good))
         if noise is not None:
             part = replace(part, weights=weights_of(noise, self.readings.take(good)))
@@ -352,12 +343,10 @@ class _Search:
         self, problem: Problem, x: Array, reduction: Reduction, scales: Scales | None = None, *,
         choosing: bool = True,
     ) -> JointFit:  # fmt: skip
-        """The fit to readings and prior from x.
-
-        The sizes of the functions are estimated there, from `scales` on, and which ordinary
-        parameters are fitted is chosen beside them, instead of `reduction`, unless `choosing` is
-        False.  Raises ElastocalError where the start has poses without equilibrium.
-        """
+        """The fit to readings and prior from x.  The sizes of the functions are estimated there,
+        from `scales` on, and unless `choosing` is False the ordinary parameters are chosen
+        beside them, instead of `reduction`.  ElastocalError where the start has poses without
+        equilibrium."""
         f, own = self.functions, self.sound.problem
         problem = replace(problem, free=np.append(own.free, f.columns))
         x = reduction.shifted(x, own.x0)
@@ -390,9 +379,9 @@ class _Search:
         return LinearRows(RFactor(rows, factor.rows), f.std, f.group, len(f.groups))
 
     def crossed(self, fit: JointFit, scales: Scales) -> tuple[Array, Array]:
-        """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite
-        where there is none), and leverage (rows,) of each, by the model linearised at the fit with
-        functions of these `scales`."""
+        """Residual (rows,) of each configuration under a fit to the others, in m or rad, infinite
+        where there is none, and leverage (rows,), by the model linearised with functions of these
+        `scales`."""
         found, f, posterior = fit.found, self.functions, Posterior(fit.linear, scales)
         columns, x = np.append(fit.reduction.kept, f.columns[posterior.own]), found.x.copy()
         x[f.columns] = f.nominal
@@ -430,8 +419,6 @@ class _Search:
     def judged(
         self, noise: NoiseFit | None, good: BoolArray, k: int
     ) -> tuple[NoiseFit | None, BoolArray]:
-        """The noise of the standardised residuals in the k-th round, and which readings it
-        explains."""
         if self.estimating:
             # From the second round on, whose fit has such weights, the kind of noise is known.
             known = noise if k > 1 else None
@@ -447,11 +434,8 @@ class _Search:
         self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray, good: BoolArray
     ) -> BoolArray:
         """The good readings (N,) and those outside the fit of which another configuration says the
-        same.
-
-        Two readings at nearly the same pose that err alike, beside a fit without them, are no
-        errors of reading: the model lacks something there, and what it has corrects part of it.
-        """
+        same: two readings at nearly the same pose that err alike, beside a fit without them, are no
+        errors of reading.  The model lacks something there, and what it has corrects part of it."""
         suspects = np.flatnonzero(~good & ~fitted)
         if len(suspects) < 2:
             return good | self.alike

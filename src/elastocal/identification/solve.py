@@ -89,7 +89,6 @@ class Reduction:
         )  # fmt: skip
 
     def among(self, free: IntArray) -> Reduction:
-        """Of these parameters alone."""
         kept, dropped = np.isin(self.kept, free), np.isin(self.dropped, free)
         return replace(
             self, kept=self.kept[kept], dropped=self.dropped[dropped],
@@ -97,7 +96,6 @@ class Reduction:
         )  # fmt: skip
 
     def shifted(self, x: Array, x0: Array) -> Array:
-        """x (parameters,) with the dropped parameters at x0, their share moved to the kept ones."""
         out = x.copy()
         out[self.kept] += self.mixing @ (x - x0)[self.dropped]
         out[self.dropped] = x0[self.dropped]
@@ -188,10 +186,8 @@ def residual_sigma(found: Fit, n_parameters: int) -> float:
 
 
 def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) -> Reduction:
-    """A minimal complete set of the free columns, as indices into all parameters.
-
-    Raises InsufficientDataError where no column is worth keeping.
-    """
+    """A minimal complete set of the free columns, as indices into all parameters;
+    InsufficientDataError where no column is worth keeping."""
     free = problem.free
     parameters = tuple(problem.model.parameters[c] for c in free)
     local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
@@ -225,9 +221,7 @@ def looked_at(found: Fit) -> tuple[Array, Array]:
 
 def fits_better(narrow: RFactor, wide: RFactor) -> bool:
     """Does the wider set fit the readings better than chance alone in CHANCE of all cases (F)?
-
-    Beside the held-out residuals, which a few configurations of weight can sway.
-    """
+    Beside the held-out residuals, which a few configurations of weight can sway."""
     more, dof = wide.columns - narrow.columns, wide.rows - wide.columns
     return bool(f_test(narrow.rest**2 - wide.rest**2, more, wide.rest**2, max(dof, 1))[1] < CHANCE)
 
@@ -304,13 +298,12 @@ class Solution:
 
     @property
     def exact(self) -> bool:
-        """Whether the readings are computed: what is left is rounding."""
         return rms_3d(self.fit.residual, self.problem.observations.size) < EXACT
 
     @cached_property
     def crossed(self) -> tuple[Array, Array]:
-        """Residual (rows,) of each configuration under a fit to the others, and leverage (rows,),
-        how much each row draws the fit to itself, 0 to 1."""
+        """Residual (rows,) of each configuration under a fit to the others, and leverage
+        (rows,)."""
         if self.held is not None:
             return self.held
         held, leverage = looked_at(self.fit)
@@ -318,11 +311,9 @@ class Solution:
 
     def _no_farther(self, held: Array, leverage: Array) -> Array:
         """`held` (rows,) where the fit to the others leaves a direction open by more than FAR: with
-        typical deviations of what is kept, and of what that stands for, beside it.
-
-        No arm that works is off by as much.  Without the pose that shows it the direction would
-        have no column; fitted all the same it takes the pose metres away.
-        """
+        typical deviations of what is kept, and of what that stands for, beside it.  No arm that
+        works is off by as much.  Without the pose that shows it the direction would have no column;
+        fitted all the same it takes the pose metres away."""
         fit, kept, sizes = self.fit, self.reduction.kept, self.problem.sizes
         weights, observed = self.problem.weights, self.problem.observations
         shares = self.reduction.mixing * sizes[self.reduction.dropped]
@@ -351,10 +342,7 @@ def solve(
     problem: Problem, progress: Progress = lambda message: None, try_wider: bool = True
 ) -> Solution:
     """Place base and markers, choose a minimal complete set of parameters and fit it; `try_wider`
-    False skips the comparison with wider sets.  The fit's problem has base and markers placed.
-
-    Raises InsufficientDataError where the data determine nothing.
-    """
+    False skips the comparison with wider sets.  The fit's problem has base and markers placed."""
     started, exact = problem, False
     problem, nominal = with_placed(problem, CHOOSING)
     progress("first fit, tied weakly to the start")
@@ -422,11 +410,8 @@ SIZE_STEPS = 100
 def own_size(square: Array, told: Array) -> tuple[float, float]:
     """Size of an arm's errors in typical ones, 1 where they are not certainly larger, and the
     variance of its logarithm: of the `square` (n,) of each, in that of its typical size, whose mean
-    is `told` (n,) where errors are typical.
-
-    It resists a joint that lost its zero: squares count up to CLIP² of it (Huber 1964, Ann. Math.
-    Statist. 35, proposal 2).
-    """
+    is `told` (n,) where errors are typical.  It resists a joint that lost its zero: squares count
+    up to CLIP² of it (Huber 1964, Ann. Math. Statist. 35, proposal 2)."""
     count = float(told.sum())
     most = CLIPPED_MEAN + special.ndtri(CERTAIN) * np.sqrt(CLIPPED_VARIANCE / max(count, 1))
     if np.minimum(square, CLIP**2 * told).sum() <= most * count:
@@ -439,11 +424,9 @@ def own_size(square: Array, told: Array) -> tuple[float, float]:
 
 def of_this_arm(solution: Solution, std: Array) -> tuple[Solution, float]:
     """The same with the sizes of what is held as large as the errors of this arm, where those are
-    larger than typical; `std` (kept,) of the estimates.  And the variance of that size's logarithm.
-
+    larger than typical, and the variance of that size's logarithm; `std` (kept,) of the estimates.
     Of every kept parameter that `deviates`, |X − nominal| over the deviation that typical errors,
-    its own and of those it stands for, and the noise give it.
-    """
+    its own and of those it stands for, and the noise give it."""
     fit, problem, chosen = solution.fit, solution.problem, solution.reduction
     kept, sizes, known = chosen.kept, problem.sizes, deviates(problem.model)
     shares = chosen.mixing * sizes[chosen.dropped]
@@ -540,10 +523,8 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
 
 
 def tied_fit(problem: Problem, tolerance: float) -> Fit:
-    """Fit of all free parameters with weak ties, scaled by a noise level found on the way.
-
-    Many readings start where such a fit to a sample of them ends.
-    """
+    """Fit of all free parameters with weak ties, scaled by a noise level found on the way.  Many
+    readings start where such a fit to a sample of them ends."""
     if (rough := _sampled(problem)) is not problem:
         found = _tied_from(rough, problem.x0, tolerance)
         with suppress(ElastocalError):  # it may lead where other readings have no equilibrium
@@ -743,8 +724,7 @@ class MethodResult:
 class Course:
     """What a method starts from: fits to all observations, and to those that are not `faulty` (N,);
     `refit` makes another such, of those it is given.  They know nothing of smooth functions among
-    the parameters `free`.
-    """
+    the parameters `free`."""
 
     every: Solution
     sound: Solution

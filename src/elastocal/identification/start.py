@@ -119,7 +119,6 @@ class Options:
             self._refuse(ROBUST, WITH_KNOWLEDGE, "neither constraints nor a prior", remedy)
 
     def check_functions(self) -> None:
-        """Raise InputError for methods and intervals that take no prior, as functions have."""
         without = (*ROBUST, "eq14", "eq14-residual")
         what = "no prior, which smooth functions have"
         self._refuse(without, ("auto", "classical"), what, "leave it away")
@@ -207,10 +206,9 @@ class Registration:
 
     `flange` (n, 4, 4): nominal flange poses in the base frame; `points` (n, 3) readings; `marker`
     (n,) codes into `markers` (M, 3), of which `free` (M,), by default all, are unknown; `base`,
-    rotation and translation, where it is known.
-
-    Starts: the base turned as the linear (non-orthogonal) solution says, as a fit with the
-    start markers says, and as the 24 rotations of a cube, so that any attitude is near one.
+    rotation and translation, where it is known.  Starts: the base turned as the linear
+    (non-orthogonal) solution says, as a fit with the start markers says, and as the 24 rotations of
+    a cube, so that any attitude is near one.
     """
 
     def __init__(
@@ -244,12 +242,10 @@ class Registration:
 
     @classmethod
     def of(cls, model: Model, table: Measurements) -> Registration:
-        """All of a table's markers, wherever they are."""
         flange, start = model.rigid.flange_poses(table), np.zeros((len(table.marker_names), 3))
         return cls(flange, np.asarray(table.position), table.marker, start)
 
     def places(self, flange: Array, marker: IntArray) -> Array:
-        """Where flanges (n, 4, 4) have each `marker` (n,)."""
         body = np.einsum("nij,nj->ni", flange[:, :3, :3], self.markers[marker]) + flange[:, :3, 3]
         return np.asarray(body @ self.rotation.T + self.translation)
 
@@ -257,11 +253,9 @@ class Registration:
         self, rotation: Array, weight: Array, sweeps: int
     ) -> tuple[Array, Array, Array, Array, Array]:
         """Rotations, weights, median distances, translations and markers after `sweeps` from every
-        `rotation` (s, 3, 3) and `weight` (s, n), all of them together.
-
-        Translation and markers (linear) and rotation (Kabsch) in turn, reweighted by distance so
-        that a share of wrong readings does not pull the start.
-        """
+        `rotation` (s, 3, 3) and `weight` (s, n), all of them together: translation and markers
+        (linear) and rotation (Kabsch) in turn, reweighted by distance so that a share of wrong
+        readings does not pull the start."""
         error = np.full(len(rotation), np.inf)
         translation, markers = self._linear_parts(rotation, weight)
         for _ in range(sweeps):
@@ -277,12 +271,9 @@ class Registration:
         return rotation, weight, error, translation, markers
 
     def _linear_parts(self, R: Array, weight: Array) -> tuple[Array, Array]:
-        """Translation (s, 3) and markers (s, M, 3) for every rotation R (s, 3, 3) and weight
-        (s, n).
-
-        With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations.  Its
-        normal equations cost half the digits, which a start can spare.
-        """
+        """Translation (s, 3) and markers (s, M, 3) for every rotation R (s, 3, 3) and weight (s,
+        n).  With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations.
+        Its normal equations cost half the digits, which a start can spare."""
         n, known = len(self._points), np.zeros(3) if self._base is None else self._base[1]
         y = (self._points - known) @ R - self._body(self._fixed)
         own = (self._marker[:, None] == self._free)[:, None, :, None]
@@ -300,7 +291,6 @@ class Registration:
         return known + (R @ x[:, :3, None])[..., 0], markers
 
     def _body(self, markers: Array) -> Array:
-        """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
         turned = self._flange[:, :3, :3] @ markers[..., self._marker, :, None]
         return np.asarray(turned[..., 0] + self._flange[:, :3, 3])
 
@@ -320,11 +310,9 @@ def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
 def start_values(
     model: Model, table: Measurements, seed: int = 0, free: IntArray | None = None
 ) -> Array:
-    """Parameter values (parameters,) near the data: nominal, but base, markers and cable placed.
-
-    Only parameters that are active in the model and among `free` (default all) are moved.
-    Positions are registered to the nominal arm; distances are fitted by a robust multi-start.
-    """
+    """Parameter values (parameters,) near the data: nominal, but base, markers and cable placed,
+    where they are active and among `free` (default all).  Positions are registered to the nominal
+    arm; distances are fitted by a robust multi-start."""
     x = model.nominal.copy()
     movable = set(range(len(x)) if free is None else free.tolist())
     if model.observe == "distance":
@@ -443,11 +431,7 @@ SOME = 2**14  # readings that are enough to tell their unit
 
 
 def check_table(model: Model, table: Measurements) -> None:
-    """A table to fit: as any table, and more than one pose.
-
-    Raises InputError that names file, line, joint and remedy; InsufficientDataError where all
-    rows hold the same pose.
-    """
+    """A table to fit: as any table, and more than one pose (InsufficientDataError)."""
     check_rows(model, table)
     if (table.q == table.q[:1]).all():
         raise InsufficientDataError(
@@ -457,7 +441,6 @@ def check_table(model: Model, table: Measurements) -> None:
 
 
 def check_rows(model: Model, table: Measurements) -> None:
-    """Any table: finite numbers, joint count, joint limits, units; InputError otherwise."""
     n = model.chain.n_joints
     if table.q.shape[1] != n:
         raise InputError(
@@ -546,15 +529,12 @@ def nothing_shown(observed: Observations, residual: Array) -> InsufficientDataEr
 
 
 def _reach(model: Model, table: Measurements) -> float:
-    """Diagonal of the box in m that the nominal arm's flange moves in."""
     return float(np.linalg.norm(np.ptp(model.rigid.flange_poses(table)[:, :3, 3], axis=0)))
 
 
 def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
     """Indices of the parameters to fit; `fixed` names parameters, places or effects to hold.
-
-    Raises InputError for a name that is none of these, or when nothing is left.
-    """
+    InputError for a name that is none of these, or when nothing is left."""
     held = set()
     for name in fixed:
         if not (match := model.meant_by(name)):
@@ -573,10 +553,8 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
 
 
 def ordinary(model: Model, free: IntArray) -> IntArray:
-    """Those of the parameters `free` that no smooth function consists of.
-
-    Raises InputError where there are none.
-    """
+    """Those of the parameters `free` that no smooth function consists of; InputError where none
+    are."""
     found = free[~model.shrunk[free]]
     if not len(found):
         raise InputError(
@@ -693,7 +671,6 @@ def solved_body(table: Measurements, error: float) -> str | None:
 
 
 def _by_visit(table: Measurements) -> Array:
-    """Positions (visits, markers, 3) of the first reading of each; NaN where there is none."""
     assert table.position is not None
     visit = visits(table)
     out = np.full((int(visit.max(initial=-1)) + 1, len(table.marker_names), 3), np.nan)
@@ -729,13 +706,11 @@ class Fallen:
 
     @property
     def axis(self) -> str | None:
-        """The axis that points up, "−y" say; None where none does within FALLEN."""
         near = np.arccos(min(np.abs(self.up).max(), 1.0)) <= FALLEN
         return self.columns[2] if near else None
 
     @property
     def columns(self) -> list[str]:
-        """What the table's x, y, z would have to be: "x", "−z", "y"."""
         return [("−" if row.sum() < 0 else "") + AXES[int(np.argmax(np.abs(row)))]
                 for row in self.turn]  # fmt: skip
 

@@ -38,10 +38,9 @@ WeightKind = Literal["auto", "none", "rows", "axis", "polar", "covariance"]
 
 @dataclass(frozen=True)
 class Weights:
-    """`whiten` (rows, rows) with whiten · Σ · whitenᵀ = I, or None for unit weights.
-
-    `absolute` says whether Σ is stated in m² (then a whitened residual has expected size 1)
-    or holds only up to a common factor, which the residual must tell.
+    """`whiten` (rows, rows) with whiten · Σ · whitenᵀ = I, or None for unit weights.  `absolute`
+    says whether Σ is stated in m² (then a whitened residual has expected size 1) or holds only up
+    to a common factor, which the residual must tell.
 
     Where all readings have some noise in common, as a drift in time, Σ = Σ₀ + FFᵀ with few columns
     F, `common` (rows, k), and W = (I − low lowᵀ) W₀; `whiten` is then W₀.  What readings far from
@@ -57,7 +56,6 @@ class Weights:
     together: IntArray | None = None
 
     def apply(self, rows: Array) -> Array:
-        """Whiten a vector (rows,) or matrix (rows, k)."""
         return self.beside(rows if self.whiten is None else self.whiten @ rows)
 
     def beside(self, own: Array) -> Array:
@@ -88,11 +86,9 @@ def weights_for(
     covariance: Array | None = None,
 ) -> Weights:
     """Weights for the observations; "auto" takes the table's sigmas, else the cell's, else none.
-
     "rows" uses the table's sigma columns (Cartesian or polar), "axis" the cell's `sigma_um`,
     "polar" the cell's range and transverse noise, "covariance" the matrix (rows, rows) given.
-    Raises InputError where the noise that `kind` names is not there.
-    """
+    InputError where the noise that `kind` names is not there."""
     chosen = _available(observed, tracker) if kind == "auto" and covariance is None else kind
     if covariance is not None or chosen == "covariance":
         need(covariance is not None, f"weights 'covariance' need a matrix ({option('covariance')})")
@@ -118,10 +114,8 @@ def weights_for(
 
 
 def stated_covariance(observed: Observations, tracker: Tracker, kind: str) -> tuple[Array, str]:
-    """Stated covariance (n_rows, size, size) of every table row, and where it comes from.
-
-    Raises InputError where the cell or the table does not state what this needs.
-    """
+    """Stated covariance (n_rows, size, size) of every table row, and where it comes from;
+    InputError where the cell or the table does not state what this needs."""
     if observed.kind == "distance":
         need(tracker.distance_sigma is not None, "distances need [tracker] distance_um")
         sigma = float(tracker.distance_sigma or 1.0)
@@ -139,9 +133,7 @@ def stated_covariance(observed: Observations, tracker: Tracker, kind: str) -> tu
 
 def stated_by_observation(observed: Observations, tracker: Tracker) -> Array | None:
     """Stated covariance (N, size, size) of each observation, None where none is stated.
-
-    Observations that share a reading are correlated; here each stands for itself.
-    """
+    Observations that share a reading are correlated; here each stands for itself."""
     kind = _available(observed, tracker)
     if kind == "none":
         return None
@@ -159,7 +151,6 @@ def _available(observed: Observations, tracker: Tracker) -> str:
 
 
 def block_diagonal(blocks: Array) -> sparse.csr_array:
-    """Blocks (n, d, d) along the diagonal; their zeros are not stored."""
     n, d, _ = blocks.shape
     places = np.arange(n), np.arange(n + 1)
     out = sparse.bsr_array((np.ascontiguousarray(blocks), *places), shape=(n * d, n * d)).tocsr()
@@ -239,7 +230,6 @@ class RFactor:
         return RFactor(_factor(stacked), self.rows + other.rows)
 
     def of_columns(self, chosen: NDArray[np.integer]) -> RFactor:
-        """The R factor of the columns `chosen` of B and the same e."""
         return RFactor(_factor(self.augmented[:, [*chosen, self.columns]]), self.rows)
 
     @property
@@ -266,12 +256,10 @@ class RFactor:
         return float(self.augmented[:, -1] @ self.augmented[:, -1])
 
     def scaled(self, scale: Array) -> RFactor:
-        """The R factor of B with its columns multiplied by `scale` (p,)."""
         return RFactor(self.augmented * np.append(scale, 1.0), self.rows)
 
     @property
     def half(self) -> Array:
-        """R⁻¹ (p, p)."""
         return np.asarray(linalg.solve_triangular(self.R, np.eye(self.columns)))
 
 
@@ -304,10 +292,8 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class Part:
-    """The observations `index` (n,) of a table, whitened by `weights` on their own.
-
-    `rows` (n·size,) are their rows among those of all observations.
-    """
+    """The observations `index` (n,) of a table, whitened by `weights` on their own; `rows`
+    (n·size,) are their rows among those of all observations."""
 
     index: IntArray
     rows: IntArray
@@ -329,17 +315,14 @@ class Problem:
 
     @property
     def large(self) -> bool:
-        """Whether B of all parameters is too large to be formed at once."""
         return len(self.observations.value) * int((~self.model.shrunk).sum()) > LARGE
 
     @cached_property
     def parts(self) -> tuple[IntArray, ...]:
-        """The observations (n,) of each part, whose B has at most PART numbers.
-
-        Those of one configuration share a part, and with them what shares an unloaded reading.  A
-        table that is not large is one part, and so is one whose covariance was given, where
-        anything may be correlated.
-        """
+        """The observations (n,) of each part, whose B has at most PART numbers.  Those of one
+        configuration share a part, and with them what shares an unloaded reading.  A table that is
+        not large is one part, and so is one whose covariance was given, where anything may be
+        correlated."""
         observed, n = self.observations, len(self.observations.lead)
         columns = max(int((~self.model.shrunk).sum()), len(self.free))
         if len(observed.value) * columns <= LARGE or self.weights.kind == "covariance":
@@ -380,21 +363,17 @@ class Problem:
         return self.part(chosen)
 
     def each(self, work: Callable[[Part], Result]) -> Iterator[Result]:
-        """`work` on every part, AT_ONCE at a time; results in the order of the parts.
-
-        What the results add up to so does not depend on which part is done first.  The first one is
-        done alone: it builds what the others share (the model's compiled functions).
-        """
+        """`work` on every part, AT_ONCE at a time; results in the order of the parts, so that their
+        sum does not depend on which is done first.  The first one is done alone: it builds what the
+        others share (the model's compiled functions)."""
         first, *others = self.parts
         yield work(self.part(first))
         with ThreadPoolExecutor(AT_ONCE) as pool:
             yield from pool.map(lambda index: work(self.part(index)), others)
 
     def evaluate(self, x: Array, columns: NDArray[np.integer]) -> tuple[Array, RFactor]:
-        """The raw residual (rows,) at x, and with B of the `columns`, whitened, their R factor.
-
-        Raises ElastocalError where a reading has no static equilibrium at x.
-        """
+        """The raw residual (rows,) at x, and with B of the `columns`, whitened, their R factor;
+        ElastocalError where a reading has no static equilibrium at x."""
         residual = np.empty(len(self.observations.value))
 
         def reduced(part: Part) -> RFactor:
@@ -415,7 +394,6 @@ class Problem:
         return residual
 
     def residual_of(self, part: Part, x: Array) -> Array:
-        """The same of a part, or (k, rows) at several x."""
         observed = part.observations
         return np.asarray(observed.value - self.model.predict(observed.table, x, observed))
 
@@ -457,8 +435,8 @@ class PriorRows:
         return cls(np.diag(1 / width), centre / width)
 
     def restricted(self, columns: IntArray, x: Array) -> PriorRows:
-        """What it says of the `columns`, the others held at x.  Raises InputError where these alone
-        break a constraint."""
+        """What it says of the `columns`, the others held at x; InputError where these break a
+        constraint."""
         held = moved(x, columns, -x[columns])
         system = None if self.system is None else self.system.restricted(columns, x)
         return PriorRows(self.P[:, columns], self.target - self.P @ held, system)
@@ -466,10 +444,8 @@ class PriorRows:
 
 @dataclass(frozen=True)
 class Fit:
-    """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual.
-
-    `columns` (fitted,) index the parameters; `known` is what the fit knew of them.
-    """
+    """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual; `columns`
+    (fitted,) index the parameters; `known` is what the fit knew of them."""
 
     x: Array
     residual: Array
@@ -488,12 +464,10 @@ class Fit:
 
     @cached_property
     def whitened(self) -> Array:
-        """The whitened residual (rows,)."""
         return self.problem.weights.apply(self.residual)
 
     @cached_property
     def of_free(self) -> RFactor:
-        """The R factor of all free columns at x."""
         problem = self.problem
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
@@ -560,7 +534,6 @@ class Objective:
         return values
 
     def step(self, u: Array, at: Linearised, damping: float) -> Array:
-        """Minimiser of the linearised cost + damping · |step|²."""
         p = len(u)
         A, b = np.vstack([at.A, np.sqrt(damping) * np.eye(p)]), np.append(at.b, np.zeros(p))
         if self.limits is not None:
@@ -569,13 +542,10 @@ class Objective:
 
     def descend(self, u: Array, tolerance: float, most: int) -> tuple[Array, Linearised, str]:
         """Full Gauss–Newton steps while they lower the cost, damped ones where they do not: where
-        they end, and why.
-
-        Ends where the linearised cost promises less than `tolerance` of itself: that last step is
-        still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
-        converges.  Steps are judged by the cost itself, so no rounding of it can keep it from
-        ending.
-        """
+        they end, and why.  They end where the linearised cost promises less than `tolerance` of
+        itself: that last step is still taken, and leaves an error smaller than itself by the factor
+        with which Gauss–Newton converges.  Steps are judged by the cost itself, so no rounding of
+        it can keep it from ending."""
         at, damping = self.evaluate(u), 0.0
         failed = -1.0  # the damping that was too little a step ago
         for _ in range(most - 1):

@@ -103,7 +103,6 @@ class MeasuredVisits:
     force: Triples = keyed("forces, three numbers for each visit", "force_N", required=True)
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-ready; joints to a µrad or µm, forces to a mN."""
         return {
             "q": [[round(float(v), 6) + 0.0 for v in row] for row in self.q],
             "force_N": [[round(float(v), 3) + 0.0 for v in row] for row in self.force],
@@ -129,7 +128,6 @@ class Valued:
 
     @cached_property
     def values(self) -> dict[str, float]:
-        """Name → value in SI units."""
         return dict(zip(self.model.names, map(float, self.x), strict=True))
 
     def x_of(self, other: Model) -> Array:
@@ -147,7 +145,6 @@ class Valued:
 
     @property
     def elastic(self) -> bool:
-        """Whether loads deflect it."""
         return any(CATALOGUE[name].elastic for name in self.effects)
 
 
@@ -377,11 +374,8 @@ class _Result(Table, extra="ignore"):
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:
-    """Upper rows (3, 4) of T_base_flange of the nominal arm, all joints at 0.5 rad or 0.5 m.
-
-    It stands in every result, so that one is told apart from that of another robot, whose
-    parameters have the same names.
-    """
+    """Upper rows (3, 4) of T_base_flange of the nominal arm, all joints at 0.5 rad or 0.5 m: it
+    tells a result from that of another robot whose parameters have the same names."""
     (T,) = rigid.nominal_flanges(chain, np.full((1, chain.n_joints), 0.5))
     return [[round(float(v), 9) + 0.0 for v in row] for row in T[:3]]
 
@@ -412,7 +406,6 @@ def _check_same(
     model: Model, held: Mapping[str, float], stated: Array | None, cell: str | Path,
     result: str | Path,
 ) -> None:  # fmt: skip
-    """Results that state no nominal flange, as older ones, are believed."""
     absent = [name for name in model.names if name not in held]
     surplus = [name for name in held if name not in set(model.names)]
     told = [
@@ -445,8 +438,8 @@ RECORDED = {"torque": "recorded torques"}  # what an effect needs and only a tab
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the arm is compared under: force (3,) N in the tracker frame at the load point, time
-    in s and temperature in °C of the table's columns (None: not stated).  With `visits` poses are
+    """What the arm is compared under: force (3,) N in the tracker frame at the load point, time in
+    s and temperature in °C of the table's columns (None: not stated).  With `visits` poses are
     those within their joints' ranges, and forces theirs."""
 
     force: Array = field(default_factory=lambda: np.zeros(3))
@@ -499,7 +492,7 @@ def table_at(
     model: Model, conditions: Conditions, q: Array, force: Array, rng: np.random.Generator
 ) -> Measurements:
     """The poses q (poses, joints) under `force` (3,) or (poses, 3) N; the last motions are drawn,
-    each pose's of its own, in whatever order they stand."""
+    whatever the order of the poses."""
     cell, poses, side = model.cell, len(q), rng.choice([-1.0, 1.0], q.shape)
     stated = {"time": conditions.time, "temperature": conditions.temperature}
     more: dict[str, Any] = {k: np.full(poses, v) for k, v in stated.items() if v is not None}
@@ -522,10 +515,8 @@ class ToolPoint:
 
 
 def tool_point(cell: Cell, text: str | None) -> ToolPoint:
-    """The point that `text` names: a marker, or "x,y,z" in m in the flange frame.
-
-    Without a text the cell's `load_point_m`, or where that is not stated its only marker.
-    """
+    """The point that `text` names: a marker, or "x,y,z" in m in the flange frame; without a text
+    the cell's `load_point_m`, else its only marker."""
     markers = cell.tool.markers
     if text is None:
         if cell.tool.load_point.any():
@@ -565,23 +556,19 @@ def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array
 
 
 def share_of_levels(angle: Array, levels: Array) -> Array:
-    """Shares (n, levels) of each level's compliance at joint values `angle` (n,), sum 1.
-
-    Linear between neighbouring levels, the outermost one's beyond them.  A level stands for a
-    gravity compensator's effect, which is a smooth function of the joint (Klimchik et al. 2013,
-    section 5), so that neighbours say what lies between them.
-    """
+    """Shares (n, levels) of each level's compliance at joint values `angle` (n,), sum 1: linear
+    between neighbouring levels, the outermost one's beyond them.  A level stands for a gravity
+    compensator's effect, which is a smooth function of the joint (Klimchik et al. 2013, section
+    5)."""
     order = np.argsort(levels)
     hats = (np.interp(angle, levels[order], hat[order]) for hat in np.eye(len(levels)))
     return np.column_stack(list(hats))
 
 
 class CalibratedTool:
-    """p(q) and R(q) of the tool's point in the data's frame, at the static equilibrium.
-
-    `arm` is the calibrated arm, `point` the place on its tool.  What the instrument itself
-    distorts (`tracker_distortion`) is no part of where the tool is.
-    """
+    """p(q) and R(q) of the tool's point, at `point` on the tool of the calibrated arm, in the
+    data's frame, at the static equilibrium.  What the instrument itself distorts
+    (`tracker_distortion`) is no part of where the tool is."""
 
     def __init__(self, arm: CalibratedArm, point: ToolPoint) -> None:
         self.calibrated, self.point = arm, point
@@ -645,10 +632,8 @@ class CalibratedTool:
     def errors(
         self, rows: list[NDArray], q: Array, position: Array, rotation: Array | None
     ) -> tuple[Array, Array]:
-        """r (n, 3 or 6) in m and dr/dq: p(q) − p*, and rotation vector of R*ᵀR(q) × ARM_LENGTH.
-
-        `position` (n, 3) m and `rotation` (n, 3, 3), or None for any, are in the data's frame.
-        """
+        """r (n, 3 or 6) in m and dr/dq: p(q) − p*, and rotation vector of R*ᵀR(q) × ARM_LENGTH, of
+        `position` (n, 3) m and `rotation` (n, 3, 3), or None for any, in the data's frame."""
         if rotation is None:
             r, slope = self._placing(self._at(rows, q), self.x)
         else:

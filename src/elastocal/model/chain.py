@@ -25,10 +25,10 @@ MAX_LENGTH, MAX_MASS = 50.0, 1e5  # m, kg: beyond them a unit is wrong, no arm i
 class Joint:
     """One moving joint of the chain.
 
-    `placement` (4, 4) takes coordinates of this joint's frame at zero motion to
-    the previous joint's frame (to the base frame for the first joint); `axis`
-    (3,) is the unit joint axis in this joint's frame.  `lower` and `upper` are
-    in rad (revolute) or m (prismatic), infinite where the source has no limit.
+    `placement` (4, 4) takes coordinates of this joint's frame at zero motion to the previous
+    joint's frame (to the base frame for the first joint); `axis` (3,) is the unit joint axis in
+    this joint's frame.  `lower` and `upper` are in rad (revolute) or m (prismatic), infinite where
+    the source has no limit.
     """
 
     name: str
@@ -68,8 +68,7 @@ class Chain:
 
     @property
     def link_ends(self) -> list[Array]:
-        """Per link the placement (4, 4) of its distal frame in its joint's frame at zero motion:
-        the next joint's, the flange's for the last link."""
+        """Per link the placement (4, 4) of its distal frame in its joint's frame at zero motion."""
         return [*(joint.placement for joint in self.joints[1:]), self.flange_placement]
 
     @property
@@ -157,7 +156,6 @@ def check_numbers(chain: Chain, key: str, found: Sized, degrees: bool, one: bool
 
 
 def joint_index(name: str) -> int:
-    """0-based index of "joint3", as of "link3"."""
     return int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
 
 
@@ -238,17 +236,13 @@ def jaw_told(chain: Chain, moved: str = "") -> list[str]:
 
 
 def extent(chain: Chain) -> float:
-    """Length in m from joint to joint and on to the flange."""
     return float(sum(np.linalg.norm(T[:3, 3]) for T in chain.link_ends))
 
 
 def near_the_arm(chain: Chain) -> Chain:
     """The same motion with every joint's frame slid along its axis to the foot of the perpendicular
-    from the frame before it.
-
-    With s_i the shift along axis i, X_i ← s_{i−1}⁻¹ X_i s_i, which the motions about and along the
-    axes commute with.
-    """
+    from the frame before it: with s_i the shift along axis i, X_i ← s_{i−1}⁻¹ X_i s_i, which the
+    motions about and along the axes commute with."""
     joints: list[Joint] = []
     masses: list[LinkMass] = []
     slid: Array = np.zeros(3)  # of the joint before, in its frame
@@ -319,13 +313,11 @@ Value = TypeVar("Value")
 
 
 def file_names(chain: Chain) -> dict[str, str]:
-    """jointN → the file's name, of those joints that the file calls otherwise."""
     both = ((f"joint{i}", joint.name) for i, joint in enumerate(chain.joints, start=1))
     return {number: name for number, name in both if name != number}
 
 
 def clashing(chain: Chain) -> list[str]:
-    """Names jointN that the file gives to another than its Nth joint."""
     numbers = {f"joint{i}" for i in range(1, chain.n_joints + 1)}
     return sorted(numbers.intersection(file_names(chain).values()))
 
@@ -355,11 +347,9 @@ def _meanings(chain: Chain, meant: str | None) -> tuple[dict[str, str], list[str
 
 
 def numbered(cell: Cell, chain: Chain) -> Cell:
-    """The cell with every joint that it names as jointN, N its place in the chain.
-
-    A joint may be named as in the robot's file wherever jointN may stand.  Where the file calls
-    another than the Nth joint jointN, `[robot] joint_names` says which is meant.
-    """
+    """The cell with every joint that it names as jointN, N its place in the chain; it may be named
+    as in the robot's file.  Where the file calls another than the Nth joint jointN, `[robot]
+    joint_names` says which is meant."""
     known, clash = _meanings(chain, cell.robot.joint_names)
     at = f"{cell.source}: "
 

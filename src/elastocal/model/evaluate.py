@@ -63,13 +63,12 @@ LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
 
 
 def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
-    """`_steps` of a function as five lists, and its number of registers: those that CasADi gave
-    the instructions, of which few are in use at a time.
+    """`_steps` of a function as five lists, and its number of registers: those that CasADi gave the
+    instructions, of which few are in use at a time.  NotImplementedError for a CasADi operation
+    that numpy has no counterpart for.
 
-    Raises NotImplementedError for a CasADi operation that numpy has no counterpart for.
-
-    Not a tuple for every step: thousands of these would have Python look for garbage in all that
-    is loaded, 0.07 s each time.
+    Not a tuple for every step: thousands of these would have Python look for garbage in all that is
+    loaded, 0.07 s each time.
     """
     columns = tuple([*column] for column in zip(*_steps(function), strict=True))
     return columns, int(function.sz_w())
@@ -112,7 +111,6 @@ Result = TypeVar("Result")
 
 
 def thread_count() -> int:
-    """OMP_NUM_THREADS where that is a positive number, else the cores this process may use."""
     asked = os.environ.get("OMP_NUM_THREADS", "").partition(",")[0].strip()
     if asked.isdigit() and int(asked) > 0:
         return int(asked)
@@ -122,21 +120,17 @@ def thread_count() -> int:
 
 
 def row_blocks(n: int, size: int) -> list[slice]:
-    """`n` rows as contiguous blocks of at most `size`, equal to within one row.
-
-    They depend on n and size alone, so no result can depend on the number of threads.
-    """
+    """`n` rows as contiguous blocks of at most `size`, equal to within one row.  They depend on n
+    and size alone, so no result can depend on the number of threads."""
     count = -(-n // max(size, 1))
     edges = [n * k // count for k in range(count + 1)] if count else [0]
     return [slice(a, b) for a, b in pairwise(edges)]
 
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """`work` on each of the items, results in order, while the next items are made.
-
-    All items are made one after the other in the caller's thread: what they count and keep does
-    not depend on which work is done first, nor does any result.
-    """
+    """`work` on each of the items, results in order, while the next items are made: one after the
+    other in the caller's thread, so that what they count and keep does not depend on which work is
+    done first, nor does any result."""
     if threads == 1:
         yield from map(work, items)
         return
@@ -194,14 +188,12 @@ CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead i
 class BatchFunction:
     """An `SX` expression list, evaluated row by row on arrays.
 
-    `inputs` and `outputs` are lists of SX vectors / matrices.  Calling it takes one array
-    per input: (n, size) for a quantity that varies by row, (size,) for one that is the same in
-    every row; it returns one array (n, rows, columns) per output, float64, or complex where an
-    input is.  `backend` is "auto" or "numpy"; None follows ELASTOCAL_BACKEND.  Complex numbers are
-    always evaluated by numpy; under "auto" few rows by CasADi.
-
-    By numpy a call raises NotImplementedError for an operation that it lacks, by both ValueError
-    for arrays of other shapes.
+    `inputs` and `outputs` are lists of SX vectors / matrices.  Calling it takes one array per
+    input: (n, size) for a quantity that varies by row, (size,) for one that is the same in every
+    row; it returns one array (n, rows, columns) per output, float64, or complex where an input is.
+    `backend` is "auto" or "numpy"; None follows ELASTOCAL_BACKEND.  Complex numbers are always
+    evaluated by numpy; under "auto" few rows by CasADi.  By numpy a call raises NotImplementedError
+    for an operation that it lacks, by both ValueError for arrays of other shapes.
     """
 
     def __init__(

@@ -45,11 +45,9 @@ SMALLEST_GRAVITY = 1e-3  # m/s²; below it there is none
 
 
 def read_mjcf(path: str | Path, base: str | None = None, flange: str | None = None) -> Chain:
-    """The serial chain of a MuJoCo model from the frame of `base` to that of `flange`.
-
-    base: a body, default the world; flange: a body or a site, default as of `MjcfArm.read`.  There
-    are no masses where the file leaves them to meshes that are not there.
-    """
+    """The serial chain of a MuJoCo model from the frame of `base`, a body, default the world, to
+    that of `flange`, a body or a site, default as of `MjcfArm.read`.  There are no masses where the
+    file leaves them to meshes that are not there."""
     return MjcfArm.read(path, base, flange).chain
 
 
@@ -75,10 +73,8 @@ class MjcfArm:
         cls, path: str | Path, base: str | None = None, flange: str | None = None,
         text: str | None = None,
     ) -> MjcfArm:  # fmt: skip
-        """The arm of an MJCF file, or of a `text` that is to stand in its place.
-
-        Without `flange` it is `Tree.last_link`.
-        """
+        """The arm of an MJCF file, or of a `text` in its place; without `flange` it is
+        `Tree.last_link`."""
         path = Path(path)
         if text is None:
             file = XmlFile.read(path, "MuJoCo model", "an MJCF file")
@@ -184,8 +180,8 @@ class MjcfArm:
         return found
 
     def check_open(self) -> None:
-        """Raise InputError, naming joints and constraints, where <equality> of the file makes
-        joints of the arm depend on each other: a chain of independent joints is read from it.
+        """InputError, naming joints and constraints, where <equality> of the file makes joints of
+        the arm depend on each other: a chain of independent joints is read from it.
 
         J of all constraints has columns of the arm's joints and of others, as those of free bodies
         and passive rods.  With N the left null space of J_others, N J_arm is what no motion of
@@ -218,8 +214,8 @@ class MjcfArm:
         )
 
     def _drags(self, e: int) -> bool:
-        """Whether a constraint holds what the last joint carries, or any body, to where people
-        drag it: a mocap body, and by a weld the world."""
+        """Whether a constraint holds what the last joint carries, or any body, to where people drag
+        it: a mocap body, and by a weld the world."""
         import mujoco
 
         model, kinds = self.model, mujoco.mjtEq
@@ -455,11 +451,9 @@ _UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
 
 
 def check_bounds(file: XmlFile) -> None:
-    """Raise InputError where an MJCF file asks for more than an arm needs.
-
+    """InputError, naming file and element, where an MJCF file asks for more than an arm needs.
     Counted are elements as often as they are replicated, included or attached, and sizes; included
-    models are regular files in its folder.  The message names file and element.
-    """
+    models are regular files in its folder."""
     weight = _Model(file.path).weight_of(file)
     require(
         weight <= MOST_ELEMENTS,

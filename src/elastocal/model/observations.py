@@ -52,7 +52,6 @@ class Observations:
 
     @property
     def load(self) -> IntArray:
-        """Number (N,) of the load state."""
         return load_states(self.table.force[self.lead])
 
     @property
@@ -70,11 +69,9 @@ class Observations:
 
 
 def observe(table: Measurements, kind: str) -> Observations:
-    """The observed values of a table for `kind` in position, deflection, pose, distance.
-
-    A pose's rotation is observed relative to the measured one, so its value is zero and the
-    prediction is the rotation vector of R_measuredᵀ R_model.
-    """
+    """The observed values of a table for `kind` in position, deflection, pose, distance.  A pose's
+    rotation is observed relative to the measured one, so its value is zero and the prediction is
+    the rotation vector of R_measuredᵀ R_model."""
     n = len(table)
     if kind == "deflection":
         lead, combine = pair_loaded_with_unloaded(table)
@@ -125,11 +122,9 @@ def _needed(column: Array | None, table: Measurements, names: str, kind: str) ->
 
 
 def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], sparse.csr_array]:
-    """Pair every loaded row with its unloaded partner: same configuration, repeat and marker.
-
-    Where that repeat was not measured unloaded, the mean of all unloaded repeats of the same
-    configuration and marker serves.  Returns the loaded rows (N,) and the combination (N, n).
-    """
+    """The loaded rows (N,), and the combination (N, n) that pairs each with its unloaded partner:
+    same configuration, repeat and marker.  Where that repeat was not measured unloaded, the mean of
+    all unloaded repeats of the same configuration and marker serves."""
     loaded = np.any(table.force != 0, axis=1)
     if not loaded.any():
         raise InputError(
@@ -177,10 +172,8 @@ def available_noise(table: Measurements, tracker: Tracker) -> str:
 
 def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tuple[Array, str]:
     """Covariance (n, 3, 3) in m² of each row's x, y, z, and a sentence on where it comes from.
-
-    `kind`: "rows", "axis" or "polar".  Polar noise lies along the line of sight and across it:
-    Σ = Σ_k s_k² e_k e_kᵀ over range, azimuth and elevation direction.
-    """
+    `kind`: "rows", "axis" or "polar".  Polar noise lies along the line of sight and across it: Σ =
+    Σ_k s_k² e_k e_kᵀ over range, azimuth and elevation direction."""
     n, noise = len(table), tracker.noise
     if kind == "axis":
         need(isinstance(noise, CartesianNoise), "the cell has no [tracker] sigma_um")

@@ -110,7 +110,6 @@ def nominal_frames(chain: Chain, q: ca.SX, base: ca.SX) -> list[ca.SX]:
 
 
 def nominal_flanges(chain: Chain, q: Array) -> Array:
-    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
     symbol = ca.SX.sym("q", chain.n_joints)
     flange = nominal_frames(chain, symbol, ca.SX.eye(4))[-1]
     return np.asarray(BatchFunction([symbol], [flange])(q)[0])
@@ -280,11 +279,9 @@ class Reaching(BoundedSearch):
         return np.linalg.norm(r[:, :3], axis=1), 2 * np.arcsin(np.minimum(sine, 1.0))
 
     def nearest(self, q: Array, target: IntArray, near: Array) -> Array:
-        """Postures (R, n) that still reach the targets, moved towards `near` (n,).
-
-        Steps along (I − J⁺J)(near − q), then back onto the target; a step counts only if the
-        distance falls, so that the result is never farther off than q.
-        """
+        """Postures (R, n) that still reach the targets, moved towards `near` (n,): steps along (I −
+        J⁺J)(near − q), then back onto the target; a step counts only if the distance falls, so that
+        the result is never farther off than q."""
         q, rate = q.copy(), np.ones(len(q))
         for _ in range(NULL_STEPS):
             rows = np.flatnonzero(rate > 1e-3)

@@ -69,7 +69,6 @@ class Tag:
         return next(iter(self.all(name)), None)
 
     def of(self, name: str, key: str) -> str | None:
-        """What the first tag of that name in it states."""
         inside = self.first(name)
         return None if inside is None else inside.stated.get(key)
 
@@ -150,7 +149,6 @@ class XmlFile:
             raise InputError(f"{self.path}: not XML: {reason}") from None
 
     def insert(self, at: int, text: str) -> None:
-        """Put text at an offset, behind what was put there before."""
         self._inserted.append((at, at, text.encode("utf-8")))
 
     def insert_in(self, tag: Tag, text: str) -> None:
@@ -204,7 +202,6 @@ def element(tag: str, stated: Mapping[str, str], *inside: str) -> str:
 
 
 def comment(text: str) -> str:
-    """A comment of this text, in which two hyphens would end it."""
     return f"<!-- {text.replace('--', '- -').rstrip('-')} -->"
 
 
@@ -267,10 +264,8 @@ TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
 class FileJoint:
     """A joint of the file: `origin` T (4, 4) from its frame at zero, which is its child's, to its
     parent link's; unit `axis`; `limit` None where none is stated, infinite where there is none.
-
     `follows`: the joint that it mimics; `rest`: where it stands when it is not part of the way;
-    `number` is MuJoCo's.
-    """
+    `number` is MuJoCo's."""
 
     name: str
     kind: str
@@ -387,11 +382,9 @@ class Tree:
         return name
 
     def ends(self, base: str | None, flange: str | None, choose: bool = True) -> tuple[str, str]:
-        """The first and the last link, None for those that are found.
-
-        `choose`: whether a flange is found among several links that it could be.  A cell that
-        leaves the choice open may have meant another frame.
-        """
+        """The first and the last link, None for those that are found.  `choose`: whether a flange
+        is found among several links that it could be: a cell that leaves the choice open may have
+        meant another frame."""
         base = self.root if base is None else self.find("base", base, self.root)
         if flange is None:
             found = self.last_link(base)
@@ -410,11 +403,9 @@ class Tree:
         return base, self.find("flange", flange, usual)
 
     def last_link(self, base: str) -> str:
-        """The link below `base` from which on fingers, or frames that none moves, branch off.
-
-        Of the links that no other hangs on, those with the most moving joints on their way have it
-        in common; among frames at its end one with a usual name is taken.
-        """
+        """The link below `base` from which on fingers, or frames that none moves, branch off.  Of
+        the links that no other hangs on, those with the most moving joints on their way have it in
+        common; among frames at its end one with a usual name is taken."""
         arms: dict[tuple[FileJoint, ...], list[str]] = {}
         for leaf in self._leaves(base):
             way = self._moving(base, leaf)
@@ -510,8 +501,8 @@ class Tree:
         return tuple(moving)
 
     def carriers(self, moving: Sequence[FileJoint]) -> dict[str, tuple[int, Array]]:
-        """Every link that one of the joints moves: number of the last of them, and the place
-        (4, 4) in its frame."""
+        """Every link that one of the joints moves: number of the last of them, and the place (4, 4)
+        in its frame."""
         own = {joint.child: k for k, joint in enumerate(moving)}
         at: dict[str, tuple[int, Array]] = {}
         for link in self._below(self.root):
@@ -559,11 +550,8 @@ NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def read_urdf(path: str | Path, base: str | None = None, flange: str | None = None) -> Chain:
-    """The serial chain between two links of a URDF.
-
-    base: link name, default the root link; the chain starts in its frame.
-    flange: link name, default the only leaf that at least four moving joints carry.
-    """
+    """The serial chain between two links of a URDF: from the frame of `base`, default the root
+    link, to `flange`, default the only leaf that at least four moving joints carry."""
     tree = check_urdf(path)
     return tree.chain(*tree.ends(base, flange, choose=False))
 

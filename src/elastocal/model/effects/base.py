@@ -82,7 +82,6 @@ class Parameter(ParameterSpec):
     where: str
 
     def beyond(self, interval: tuple[float, float]) -> bool:
-        """Whether all of an interval lies beyond a physical bound."""
         return interval[1] < self.lower or interval[0] > self.upper
 
 
@@ -91,10 +90,8 @@ UNSIZED_SIGNAL = 2e-4
 
 
 def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
-    """Prior standard deviation (k,) of each parameter: its typical size.
-
-    Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
-    """
+    """Prior standard deviation (k,) of each parameter: its typical size, else the value whose
+    signal in the columns (…, k) is UNSIZED_SIGNAL rms."""
     flat = columns.reshape(-1, columns.shape[-1])
     moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
     rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
@@ -341,12 +338,10 @@ class SmoothFunction:
 
     @property
     def lasting(self) -> bool:
-        """Whether it belongs to the arm, and not to the time of one campaign."""
         return self.follows != "time"
 
     @property
     def whole_turn(self) -> bool:
-        """Whether it was measured all the way round, so that no angle lies outside."""
         return self.lasting and self.high - self.low >= FULL_TURN * 2 * math.pi
 
 
@@ -559,10 +554,8 @@ SHORTEST = 1e-6  # m; a shorter link has neither a length to grow nor a directio
 
 
 def transverse_axes(axis: Array) -> tuple[Array, Array]:
-    """Two unit axes x, y with x × y = axis; the frame's own x and y where the axis is z.
-
-    x is the coordinate axis farthest from the joint axis that comes first, made orthogonal.
-    """
+    """Two unit axes x, y with x × y = axis; x is the coordinate axis farthest from the joint axis
+    that comes first, made orthogonal: the frame's own x and y where the axis is z."""
     start = np.eye(3)[int(np.argmin(np.abs(axis).round(9)))]
     x = start - axis * (axis @ start)
     x /= np.linalg.norm(x)

@@ -57,11 +57,9 @@ def effect_of(name: str) -> Effect:
 
 
 def register(effect: Effect) -> None:
-    """Add an effect to the catalogue, behind the last one of its stage.
-
-    Raises InputError where it is no effect, says too little, or has the name of another one; the
-    same class (in an edited notebook cell, say) takes the place of its former self.
-    """
+    """Add an effect to the catalogue, behind the last one of its stage; the same class (in an
+    edited notebook cell, say) takes the place of its former self.  InputError where it is no
+    effect, says too little, or has the name of another one."""
     check(effect)
     known = CATALOGUE.get(effect.name)
     if known is not None:
@@ -83,11 +81,8 @@ def register(effect: Effect) -> None:
 
 def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
     """The cell itself, or that of a cell file; its plug-ins run where `plugins` or the environment
-    allows it.
-
-    `plugins` None: they are done without where the catalogue has all effects of its model.  Raises
-    InputError where the file is wrong, or names plug-ins that may not run.
-    """
+    allows it.  `plugins` None: they are done without where the catalogue has all effects of its
+    model. InputError where the file is wrong, or names plug-ins that may not run."""
     fresh = not isinstance(cell, Cell)
     read = cell if isinstance(cell, Cell) else read_cell(cell)
     load_installed()
@@ -99,12 +94,10 @@ def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
 
 
 def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
-    """(effect, place) for everything active, in the catalogue's order.
-
-    The table's force always acts (`payload`); link weights act where `link_gravity` says so.
-    Raises InputError for an unknown effect, place or setting, with the nearest valid one, and
-    for an effect that has no place on this arm.
-    """
+    """(effect, place) for everything active, in the catalogue's order.  The table's force always
+    acts (`payload`); link weights act where `link_gravity` says so.  InputError for an unknown
+    effect, place or setting, with the nearest valid one, and for an effect that has no place on
+    this arm."""
     check_settings(chain, cell)
     wanted: dict[str, list[str | None]] = {
         name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
@@ -161,10 +154,8 @@ def sized_parameters(
 
 
 def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
-    """Values of the effect's settings at a place: the cell's, else their defaults.
-
-    Raises InputError where one has neither, or lies outside its range.
-    """
+    """Values of the effect's settings at a place: the cell's, else their defaults.  InputError
+    where one has neither, or lies outside its range."""
     given = cell.model.nominal.settings.get(place, {})
     values = {}
     for setting in effect.settings(place, chain, cell):
@@ -283,12 +274,10 @@ class SymbolicArm:
         return arm.theta - ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(arm.springs)])
 
     def explicit(self, expression: ca.SX, steps: int) -> ca.SX:
-        """`expression` of inputs, X and θ as one of inputs and X alone.
-
-        Deflections by eq. (3) where the model is linear, else after `steps` fixed-point steps
-        θ ← law(τ(θ)) from rest, each of which divides the error by the ratio of a joint's
-        stiffness to the change of the load's torque with its angle (a hundred and more).
-        """
+        """`expression` of inputs, X and θ as one of inputs and X alone: deflections by eq. (3)
+        where the model is linear, else after `steps` fixed-point steps θ ← law(τ(θ)) from rest,
+        each of which divides the error by the ratio of a joint's stiffness to the change of the
+        load's torque with its angle (a hundred and more)."""
         theta = self.arm.theta
         law, settled = theta - self.residual, ca.SX.zeros(theta.shape[0], 1)
         if self._linear:  # h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose
@@ -422,9 +411,7 @@ class Total:
         columns: tuple[int, ...] | None = None,
     ) -> tuple[Array, Array]:
         """y (n, m) and dy/dz (n, m, columns) of every row; y is NaN where there is no equilibrium.
-
-        `columns` are those of z, by default all.
-        """
+        `columns` are those of z, by default all."""
         asked = tuple(range(self._z.shape[0])) if columns is None else columns
         given = [*inputs, *extra, x]
         return self._recent(asked, given, lambda: self._evaluated(inputs, x, extra, asked))

@@ -83,8 +83,8 @@ class Waves:
 
     @classmethod
     def over(cls, low: float, high: float, length: float, turns: bool) -> Waves:
-        """Those of functions over [low, high] that vary over `length`; `turns` says whether x is
-        an angle, and the function periodic where it goes all the way round."""
+        """Those of functions over [low, high] that vary over `length`; `turns` says whether x is an
+        angle, and the function periodic where it goes all the way round."""
         span = max(high - low, 1e-9)
         period, fade = span + max(MARGIN * span, LENGTHS * length), length
         if turns and span >= FULL_TURN * 2 * math.pi:

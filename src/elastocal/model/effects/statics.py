@@ -471,7 +471,6 @@ def add_deflection(arm: Arm, i: int, name: str, law: Callable[[ca.SX], ca.SX]) -
 
 
 def nominal_compliance(chain: Chain, cell: Cell) -> tuple[float, ...] | None:
-    """The cell's nominal compliances, one per joint; InputError where their number is another."""
     given = cell.model.nominal.joint_compliance
     require(
         given is None or len(given) == chain.n_joints,
@@ -530,12 +529,10 @@ UNRATED = 1e3  # N m, where nothing tells
 
 
 def weight_torque(chain: Chain, i: int) -> float:
-    """Bound in N m on the torque of the links' weights about revolute joint i (0-based).
-
-    τ ≤ g Σ_j m_j r_j over the bodies j that the joint carries, r_j the length of the chain from
-    the joint's axis to the body's centre of mass; whatever the pose and the mounting.  0 where
-    masses are unknown.
-    """
+    """Bound in N m on the torque of the links' weights about revolute joint i (0-based), whatever
+    the pose and the mounting: τ ≤ g Σ_j m_j r_j over the bodies j that the joint carries, r_j the
+    length of the chain from the joint's axis to the body's centre of mass.  0 where masses are
+    unknown."""
     axis = chain.joints[i].axis
     ends = [T[:3, 3] for T in chain.link_ends]
     moment, reach = 0.0, 0.0
@@ -550,11 +547,9 @@ def weight_torque(chain: Chain, i: int) -> float:
 
 def rated_torque(chain: Chain, cell: Cell, i: int) -> float | None:
     """Size in N m of the largest torque on revolute joint i (0-based); None where nothing tells.
-
     The largest of the weights' torque on it, an eighth of that on the strongest joint, and the
     torque that winds the joint up by 3 mrad with its nominal compliance: payloads, which the cell
-    does not state, load a wrist far more than its own weight does.
-    """
+    does not state, load a wrist far more than its own weight does."""
     given = nominal_compliance(chain, cell)
     wound = RATED_WIND_UP / given[i] if given and given[i] > 0 else 0.0
     turning = [j for j, kind in enumerate(chain.kinds) if kind == "revolute"]
@@ -576,11 +571,9 @@ def usual_over_stated_mass(chain: Chain) -> float:
 
 
 def torque_scale(chain: Chain, cell: Cell, i: int) -> float:
-    """τ_s in N m: torques below it are so small that friction and play blur their sign.
-
-    A thousandth of the rated torque: a true dead zone turns over at once, and a wrist seldom sees
-    more than a few per cent of its rating.
-    """
+    """τ_s in N m, a thousandth of the rated torque: torques below it are so small that friction and
+    play blur their sign.  A true dead zone turns over at once, and a wrist seldom sees more than a
+    few per cent of its rating."""
     return 1e-3 * (rated_torque(chain, cell, i) or UNRATED)
 
 
