@@ -289,9 +289,6 @@ class _Judged:
         )  # fmt: skip
 
 
-# The readings of an identification, under the noise that its method found.
-
-
 def report_faulty(
     whole: Solution,
     clean: Solution,

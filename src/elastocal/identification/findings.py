@@ -162,9 +162,6 @@ def _overfitted(result: Calibration) -> float:
     return len(result.observations.value) / max(result.dof, 1)
 
 
-# Noise, repeats, and what changes with time.
-
-
 def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
     """Residuals of visits that follow each other, by a permutation test.  Where the noise
     explains the residual, what they share is a small part of it, for which the error at new
@@ -353,9 +350,6 @@ def _beside_stated(key: str, found: list[tuple[noise_summary.NoiseSize, float]],
     return f"Correct [noise] {key} of the cell ({said}) for design and simulate."
 
 
-# Poses that were not fitted.
-
-
 def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
     held, fitted, nominal = result.heldout_rms, result.residual_rms, result.nominal_rms
     placed = only_placed(result)
@@ -429,9 +423,6 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
         yield _note("faulty_readings", remedy, fitted=kept, **numbers)
     if kept > MANY * fitted:
         yield _care("many_faulty_readings", faulty=kept, fitted=fitted)
-
-
-# What the readings do not tell of the parameters.
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
@@ -521,9 +512,6 @@ def _test(result: Calibration) -> Iterator[Finding]:
             "test_data_far", far=test.far, configurations=test.configurations, p=test.p_far,
             predicted_std_um=test.std, fitted_std_um=test.most_fitted,
         )  # fmt: skip
-
-
-# What only the solver can tell.
 
 
 def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:

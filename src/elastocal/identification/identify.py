@@ -525,8 +525,6 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     return clustered(problem.each(rows), V, kind.upper())
 
 
-# The methods by name.
-
 COMPUTED = (
     "The readings agree with the model to rounding: they are computed, not measured, and tell "
     "nothing of the noise."

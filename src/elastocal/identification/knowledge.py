@@ -307,9 +307,6 @@ def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
     return Matrix(stated.label, constant, slopes, np.ones(n))
 
 
-# What a fit makes of them.
-
-
 @dataclass(frozen=True)
 class ActiveConstraint:
     """A constraint that holds with equality at the solution.
@@ -415,9 +412,6 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
     variance = np.diag(cofactor)
     share = np.full(len(variance), np.nan)
     return np.divide(passed, variance, out=share, where=variance > 0)
-
-
-# All of it, and the file (TOML) that states it.
 
 
 def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> GaussianPrior | None:

@@ -33,8 +33,6 @@ from elastocal.messages import (
 )
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# A fit with knowledge: where its constraints let it go, and how far.
-
 PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
 
 
@@ -121,9 +119,6 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
         if abs(size[index] * u[index]) > far:
             break
     return side * np.inf
-
-
-# Which parameters a fit with constraints and a prior has.
 
 
 def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntArray:
@@ -215,8 +210,6 @@ def intervals_with_knowledge(
     text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
     return Covariance("constrained profile", matrix, dof, text, ends=ends)
 
-
-# The fit of a method, its knowledge added: one more step on the weights that the method ends with.
 
 NO_PART = 1e-9  # factors below this share of a typical size are no combination
 CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user knows

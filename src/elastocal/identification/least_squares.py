@@ -16,8 +16,6 @@ from elastocal.measurements import numbered
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
 
-# An estimated covariance of a fit, and the t intervals that follow from it.
-
 LEVEL = 0.95
 
 
@@ -277,9 +275,6 @@ def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
     power = np.where(single, 1.0, gap) ** (-0.5 if kind[-1] == "2" else -1.0)
     A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
     return (A @ Qc if by_row else Qc @ A), determined
-
-
-# Held-out residuals: cross-validation over configurations in closed form.
 
 
 def held_out_residual(

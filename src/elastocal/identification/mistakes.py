@@ -218,8 +218,6 @@ def joint_maps(chain: Chain) -> list[JointMap]:
     return [none, *signs, *couplings, *others, *(b.after(a) for a, b in pairs)]
 
 
-# The linear map of positions onto the arm tells their unit, scale and handedness.
-
 UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
          (1 / 25.4, "mm read as inches"))  # fmt: skip
 OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
@@ -397,8 +395,6 @@ def _slipped_words(
     own = f"{what}{listed(fits)} fit the nominal arm to {{}}; " if fits else ""
     return f"{own}{listed(later)}"
 
-
-# What no arm can be.
 
 # What a fitted model may leave, over the length of the arm: the median and rms of the readings,
 # and all but one in five, those set apart among them.  Arms as they come from a factory err by a

@@ -571,9 +571,6 @@ def not_knowing_times(found: NoiseFit) -> NoiseFit:
     return replace(found, over_times=replace(mean, dof=dof), to_longest=short)
 
 
-# Between a fit and its noise: readings linearised at the fit, weights from an estimated noise.
-
-
 def linearised(model: Model, observed: Observations, x: Array, columns: IntArray) -> Readings:
     at = model.regressor(observed.table, x, columns, observed)
     n, size, table, sight, reach = len(observed.lead), observed.size, observed.table, None, None

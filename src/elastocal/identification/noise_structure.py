@@ -178,8 +178,6 @@ def _eigenfunctions(lasting: float) -> tuple[Array, Array]:
     return middles, vector[:, own] / np.sqrt(GRID * value[own])
 
 
-# Residuals and B per reading, with the labels that say what readings have in common.
-
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 
 

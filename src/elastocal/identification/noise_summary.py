@@ -140,9 +140,6 @@ def less_in_common(observed: Observations, residual: Array, cell: Cell, spent: i
     return math.sqrt(square / dof) if square < special.chdtri(dof, 1 - BEYOND) else None
 
 
-# Lack of fit: do configurations scatter more than repeats of one configuration?
-
-
 @dataclass(frozen=True)
 class LackOfFit:
     """F = (SS_between / dof_between) / (SS_pure / dof_pure), its p-value, and both dofs."""
@@ -167,8 +164,6 @@ def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> L
     F, p = f_test(between, dof_between, pure, dof_pure)
     return LackOfFit(float(F), float(p), dof_between, dof_pure)
 
-
-# The noise of a result: which model, its size, why, and whether repeats agree.
 
 NUMBERED = re.compile(r"^(marker|configuration) (\d+)")
 TOO_LARGE = (
@@ -447,9 +442,6 @@ def simultaneous_level(n: int) -> float:
     log = np.log(n)
     twice = np.log(log)
     return float(-np.log(0.95) / (2 * log * twice) * (1 - 1.3 * np.log(twice) / twice))
-
-
-# The rows of a table by component, marker, configuration and load state.
 
 
 def groupings(

@@ -126,8 +126,6 @@ def named_runs(lines: list[int]) -> list[str]:
     return [str(a) if a == b else f"{a}–{b}" for a, b in blocks(lines)]
 
 
-# What a linear fit to some of the readings says of all of them.
-
 ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
@@ -474,9 +472,6 @@ def prediction_errors(found: NoiseFit, readings: Readings, good: BoolArray, own:
     return np.divide(d, deviation, out=np.zeros_like(d), where=deviation > 0)
 
 
-# The default estimate: faulty readings set apart, noise model chosen, x by its weights.
-
-
 def settle(
     readings: Readings, kind: str = "auto", good: BoolArray | None = None,
     noise: NoiseFit | None = None,
@@ -618,8 +613,6 @@ class HuberFit:
         text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
         return Covariance("H1", variance * self.V @ self.V.T, np.full(p, float(rows - p)), text)
 
-
-# Robust fit of the nonlinear model: linear robust steps on the exact B.
 
 STILL = 1e-5  # |B δx| in units of the scale at which the steps have converged
 MOST_MOVES = 40

@@ -39,8 +39,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, BoolArray, IntArray, microns
 
-# What the identification knows of where the tool will be, and what it does not.
-
 OUTSIDE = 1e-6  # share of the tool's motion that may lie outside what is known: rounding
 NEVER_SHOWN = 0.1  # standard deviations; a hundred times as many readings would show one
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
@@ -200,9 +198,6 @@ def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -
     )
 
 
-# The position of the tool at a pose, with its region.
-
-
 @dataclass(frozen=True, eq=False)
 class Position(ByValue):
     """Where the tool is at n poses, and how sure that is; lengths in m, in the data's frame.
@@ -263,8 +258,6 @@ def position_at(
         moved = tool.sensitivity(rows, q)[..., known]
     return Position(place, found.total, visit, *spread.tails(moved))
 
-
-# The error to be expected at poses that nobody measured.
 
 MOST_LOADS, MOST_VISITS = 100, 400  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work

@@ -219,8 +219,6 @@ class Finding:
         return value if isinstance(value, float | int) else math.inf
 
 
-# What to do about a finding.
-
 AT_BOUND = (
     "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
 )

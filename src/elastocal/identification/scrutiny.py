@@ -120,8 +120,6 @@ def influence(fit: FoundFit) -> tuple[Influence, ...]:
     return tuple(found[row] for row in sorted(found))
 
 
-# Residuals from visit to visit.
-
 LAGS = 10
 FEWEST_VISITS = 12
 
@@ -303,9 +301,6 @@ def stage_of(effect: str) -> int:
     return 2 if known.stage in ("compliance", "load") else 1
 
 
-# What the uncertainty of a prediction is made of.
-
-
 @dataclass(frozen=True)
 class UncertaintyBudget:
     """3-D rms errors (m) of a reading that was not fitted, by source; the squares add up.
@@ -349,8 +344,6 @@ def uncertainty_budget(
     parameters, open_, shared, single, beyond = np.sqrt(squares).tolist()
     return UncertaintyBudget(parameters, open_, shared, single, beyond, at)
 
-
-# The error budget: where the error of the nominal arm goes, step by step.
 
 STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
 MOST_BUDGETED = 30_000_000  # numbers of a regressor held at once; larger tables get no budget

@@ -293,9 +293,6 @@ class JointFit:
         return standard.reshape(-1, problem.observations.size)
 
 
-# The course: fit, noise and faulty readings in turn, then what else may change.
-
-
 def fit_smooth(course: Course) -> MethodResult:
     """All free parameters fitted together, from fits of the ordinary ones alone."""
     course.progress("fitting smooth functions")

@@ -47,8 +47,6 @@ from elastocal.model.manipulator import Model, SmoothGroup
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# Which parameters the data determine: a minimal complete set, and what the rest combine with.
-
 # Below this share of its own length a column lies in the span of the kept ones: B is exact
 # to 1e-15, so this is a structural dependence and not rounding.
 STRUCTURAL = 1e-7
@@ -170,8 +168,6 @@ def _stood_for(R: Array, kept: IntArray) -> tuple[IntArray, Array]:
     return dropped, least_norm(R[:, kept], R[:, dropped]) if mixing.size else mixing
 
 
-# Which parameters are fitted: a minimal complete set, a wider one.
-
 # A typical deviation must move the data by this many standard deviations to earn a column:
 # at 1, the variance it adds equals the squared bias it removes.
 WORTH_A_COLUMN = 1.0
@@ -265,8 +261,6 @@ def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
             return prefer_wider(wide, wider) if lost else (wide, wider)
     return found, reduction
 
-
-# The course of a fit: place, tie weakly, choose the parameters, fit, compare.
 
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
@@ -555,8 +549,6 @@ def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None
         if sigma > 0.7 * previous or sigma <= 1e-12:
             return found
 
-
-# What an identification says of a smooth function: its size, and how sure.
 
 PLACES = 500
 DRAWS = 400

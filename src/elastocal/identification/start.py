@@ -33,8 +33,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray
 
-# How to identify: method, noise, what is held, what becomes of faulty readings, where it starts.
-
 IntervalKind = Literal[
     "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
     "profile",
@@ -189,8 +187,6 @@ class LinearFits:
         self.scale = np.cbrt(np.abs(self.determinant))
 
 
-# A start from nothing: where base and markers are, from the nominal arm and the readings.
-
 SAMPLE = 400  # readings used: a start needs no more
 ROUGH_SWEEPS, SWEEPS = 6, 60
 FINALISTS = 4
@@ -304,9 +300,6 @@ def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
     return np.asarray(U @ Vt, dtype=np.float64)
 
 
-# Starting values found from the data: base, markers and target orientation, or cable geometry.
-
-
 def start_values(
     model: Model, table: Measurements, seed: int = 0, free: IntArray | None = None
 ) -> Array:
@@ -418,8 +411,6 @@ def _distance_start(model: Model, table: Measurements, x: Array, movable: set[in
     ]  # fmt: skip
     return values(min(tried, key=lambda one: float(one.cost)).x)
 
-
-# Does the table fit the robot?  Checked once, before anything is fitted.
 
 # Readings and nominal arm may differ this much in extent (a long tool, few joints moving)
 # before a wrong unit is the likelier cause.
@@ -610,8 +601,6 @@ def copied(observed: Observations) -> BoolArray:
     chance = special.gammainc(int(found.sum()), float(alike_by_chance.sum()))
     return found & bool(chance < COPIED)
 
-
-# Markers that are no readings of their own: copies of another one, points of a solved body.
 
 FEWEST_VISITS = 3  # in which two markers have to agree: two may by chance of a fixed arm
 # Scatter of the distance of two markers (m) that no instrument is below which reads each for

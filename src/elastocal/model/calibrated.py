@@ -349,9 +349,6 @@ def mostly_prior(shares: Mapping[str, float | None]) -> tuple[str, ...]:
 NONE = np.zeros(0)
 
 
-# What a reader needs of the result; more may stand beside it.
-
-
 class _Entry(Table, extra="ignore"):
     name: str = key("a name", ...)
     held: float = key("a number", ...)
@@ -431,8 +428,6 @@ def _check_same(
     )
 
 
-# A calibrated arm cut down to some of its effects, what it is compared under, random poses.
-
 RECORDED = {"torque": "recorded torques"}  # what an effect needs and only a table has
 
 
@@ -500,9 +495,6 @@ def table_at(
         "random poses", q, force, marker_names=tuple(cell.tool.markers)[:1],
         approach=side, direction=side, move=side * rng.uniform(0.1, 1.0, q.shape), **more,
     )  # fmt: skip
-
-
-# The tool: which point of it is meant, and where the calibrated arm puts it.
 
 
 @dataclass(frozen=True)

@@ -307,8 +307,6 @@ def _doubts(chain: Chain) -> list[str]:
     return found
 
 
-# Joints by the names of the robot's file, beside joint1 … jointN in the order of the chain.
-
 Value = TypeVar("Value")
 
 

@@ -102,12 +102,8 @@ def _steps(f: ca.Function) -> Iterator[tuple[int, Any, int, int, int]]:
             raise NotImplementedError(f"CasADi operation {code} has no numpy counterpart")
 
 
-# Rows and threads, and the choice between CasADi and numpy.
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
-
-# Threads over blocks of rows, or over items one after the other: how many, and running them.
 
 
 def thread_count() -> int:

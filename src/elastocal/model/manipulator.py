@@ -528,9 +528,6 @@ def load_chain(cell: Cell) -> Chain:
     return plausible(chain, robot.masses or robot.mjcf or robot.urdf or robot.dh)
 
 
-# The shrunk parameters of a model in groups: one for each smooth function, whose size is one.
-
-
 @dataclass(frozen=True, kw_only=True)
 class SmoothGroup(SmoothFunction):
     """Shrunk parameters that have one scale: those of a smooth function, or of an effect's place.

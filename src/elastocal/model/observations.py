@@ -158,9 +158,6 @@ def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], s
     return lead, combine
 
 
-# Its noise: what the stated noise of the tracker means for a reading
-
-
 def available_noise(table: Measurements, tracker: Tracker) -> str:
     """Which noise is stated: "rows" (the table's sigmas win), "polar", "axis" or "none"."""
     if table.sigma is not None:

@@ -539,8 +539,6 @@ class Tree:
         return Chain(self.name, tuple(joints), end, masses if mass.any() else ())
 
 
-# URDF
-
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 MOST_LINKS = 2000
 ENDLESS_TEXT = re.compile(r"([+-]?)\.?inf(?:inity)?", re.IGNORECASE)

@@ -222,8 +222,6 @@ class Arm:
         return sum((chosen[k] * value for k, value in enumerate(choices.values())), ca.SX(0))
 
 
-# What the symbolic arm asks of a table row, as arrays.
-
 COLUMNS = {
     "q": "q1_deg …",
     "force": "force_x_N …",

@@ -76,9 +76,6 @@ def register(effect: Effect) -> None:
     CATALOGUE.update({each.name: each for each in order})
 
 
-# What a cell asks for of it: which effects, at which places, with which settings.
-
-
 def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
     """The cell itself, or that of a cell file; its plug-ins run where `plugins` or the environment
     allows it.  `plugins` None: they are done without where the catalogue has all effects of its
@@ -178,10 +175,6 @@ def _check_known(key: str, what: str, found: str, valid: Collection[str], cell: 
     told = f"{cell.source}: [model] {key}: unknown {what} '{found}'"
     check_known(found, valid, told, "valid:")
 
-
-# The symbolic arm.
-
-# Of the static equilibrium of all poses at once.
 
 MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
@@ -432,8 +425,6 @@ class Total:
         y[~np.isfinite(theta).all(axis=1)] = np.nan
         return y[..., 0], slope
 
-
-# B of one whole configuration as a CasADi expression of its joint angles, for optimisation.
 
 # Fixed-point steps to the equilibrium.  Under 280 kg on a KR 270 they leave 2·10⁻⁴ of a column.
 STEPS = 2

@@ -268,9 +268,6 @@ class ResidualField(AnyMotion, SmoothEffect):
         return replace(cell, model=replace(cell.model, nominal=nominal))
 
 
-# Steps in time, and responses to loads.
-
-
 class ResidualStep(AnyMotion, Jump):
     """A place moves by u for t ≥ T, and nobody knows why: a knock, a clamp that slipped.
 

@@ -693,9 +693,6 @@ class BaseCompliance(TiltingEffect):
         return {"x": np.eye(3)[0], "y": np.eye(3)[1]}
 
 
-# Couplings of joints by the torques that drive them.
-
-
 class TorqueDriven(DrivenEffect):
     """u = Σ_i k_i τ_i a_i with the recorded torques τ_i of some joints, along given a_i."""
 
