@@ -36,24 +36,6 @@ class Parts:
     of: IntArray
     loading: Array
 
-    def add(self, V: Array, theta: Array) -> None:
-        own = self.loading * np.sqrt(theta)[:, :, None, None]
-        own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
-        V += own @ own.swapaxes(1, 2)
-
-    def times(self, u: Array) -> Array:
-        """K u (C, k, m)."""
-        along = u[:, None, None] @ self.loading
-        return np.asarray((self.loading @ along.swapaxes(2, 3))[..., 0])
-
-    def trace(self, P: Array) -> Array:
-        """tr P K (C, k)."""
-        return np.asarray(((P[:, None] @ self.loading) * self.loading).sum(axis=(2, 3)))
-
-    def turned(self, root: Array) -> Array:
-        own = root[:, None] @ self.loading
-        return np.asarray(own @ own.swapaxes(2, 3))
-
 
 @dataclass(frozen=True)
 class Pack:
@@ -83,7 +65,9 @@ class Pack:
         """V (C, m, m) at θ (K,), absent rows of unit variance by themselves."""
         V, here = np.zeros((*self.e.shape, self.e.shape[1])), ~self.absent
         for part in self.parts:
-            part.add(V, theta[part.of])
+            own = part.loading * np.sqrt(theta[part.of])[:, :, None, None]
+            own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
+            V += own @ own.swapaxes(1, 2)
         if not here.all():
             V *= here[:, :, None] & here[:, None, :]
             np.einsum("cii->ci", V)[:] += self.absent
@@ -121,14 +105,6 @@ class State:
     @cached_property
     def inverse(self) -> Array:
         return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
-
-    @property
-    def Phi(self) -> Array:
-        return self.inverse.T @ self.inverse
-
-    @property
-    def log_likelihood(self) -> float:
-        return -0.5 * self.value
 
     def each(self) -> Iterator[tuple[Whitened, Array, Array]]:
         """The packs with H = R⁻¹BL⁻ᵀ (C, m, p), so that P = R⁻ᵀ(1 − HHᵀ)R⁻¹, and R⁻¹(e − Bx)."""
@@ -168,10 +144,6 @@ class Mixed:
     precision: Array
     prior: LogPrior | None = None
 
-    @property
-    def rows(self) -> int:
-        return int(sum((~pack.absent).sum() for pack in self.packs))
-
     def state(self, theta: Array) -> State:
         """LinAlgError where V is not positive definite, InsufficientDataError where columns without
         a prior depend on each other."""
@@ -194,7 +166,8 @@ class Mixed:
             ) from None
         x = linalg.cho_solve((L, True), z, check_finite=False)
         value += 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
-        value += (self.rows - int((~known).sum())) * LOG_2PI
+        rows = int(sum((~pack.absent).sum() for pack in self.packs))
+        value += (rows - int((~known).sum())) * LOG_2PI
         value -= float(np.log(self.precision[known]).sum())
         return State(theta, packs, x, L, value)
 
@@ -208,8 +181,10 @@ class Mixed:
         for w, H, z in state.each():
             pack, u, theta = w.pack, w.back(z[..., None])[..., 0], state.theta[w.pack.of]
             P = w.back((np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
-            trace = np.concatenate([part.trace(P) for part in pack.parts], axis=1)
-            Ku = np.concatenate([part.times(u) for part in pack.parts], axis=1)
+            loads, along = [part.loading for part in pack.parts], u[:, None, None]
+            traces = [((P[:, None] @ own) * own).sum(axis=(2, 3)) for own in loads]
+            products = [(own @ (along @ own).swapaxes(2, 3))[..., 0] for own in loads]
+            trace, Ku = np.concatenate(traces, axis=1), np.concatenate(products, axis=1)
             slope += pack.added(theta * (trace - (Ku @ u[..., None])[..., 0]), K)
             own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
             information += pack.pairs(own @ own.transpose(0, 2, 1), K)
@@ -234,11 +209,12 @@ class Expected:
 
     def __init__(self, state: State) -> None:
         K, p = len(state.theta), len(state.x)
-        Phi, half = state.Phi, state.inverse.T
+        Phi, half = state.inverse.T @ state.inverse, state.inverse.T
         C, pairs, known = np.zeros((K, p, p)), np.zeros((K, K)), np.zeros(K)
         turned: list[tuple[IntArray, Array]] = []
         for w in state.packs:
-            A = np.concatenate([part.turned(w.root) for part in w.pack.parts], axis=1)
+            turns = (w.root[:, None] @ part.loading for part in w.pack.parts)
+            A = np.concatenate([own @ own.swapaxes(2, 3) for own in turns], axis=1)
             flat, left = A.reshape(*A.shape[:2], -1), A  # (C, k, m, m)
             if w.B.shape[2]:
                 AB = A @ w.B[:, None]
@@ -253,11 +229,6 @@ class Expected:
         information = 0.5 * (pairs + rotated @ rotated.T)
         self.information = (information + information.T) / 2
         self.known, self.C, self.Phi, self.turned = known, C, Phi, turned
-
-    @property
-    def told(self) -> BoolArray:
-        """Which θ_k the readings say anything of: not those that x could explain all of."""
-        return np.diag(self.information) > LEAST_TOLD * 0.5 * self.known
 
     def kenward_roger(self, W: Array, rows: Array) -> tuple[Array, Array]:
         """Covariance (k, k) of combinations `rows` (k, p) of x, and degrees of freedom (k,).
@@ -367,9 +338,11 @@ class MixedFit:
     def covariance(self) -> Array:
         """W (K, K) of θ̂.  A variance that is none is taken for zero, not for uncertain (the
         convention of mixed-model software): counting it widens what is wide enough already."""
-        theta, H = self.theta, self._curvature
+        theta, H, expected = self.theta, self._curvature, self.expected
         out = np.zeros_like(H)
-        free = np.flatnonzero((np.diag(H) > UNSEEN) & self.expected.told)
+        # Of those that x could explain all of the readings say nothing.
+        told = np.diag(expected.information) > LEAST_TOLD * 0.5 * expected.known
+        free = np.flatnonzero((np.diag(H) > UNSEEN) & told)
         if len(free):
             scale = 1 / np.sqrt(np.diag(H)[free])
             own = H[np.ix_(free, free)] * np.outer(scale, scale)
@@ -382,7 +355,7 @@ class MixedFit:
 
     @cached_property
     def log_likelihood(self) -> float:
-        found, prior = self.state.log_likelihood, self.model.prior
+        found, prior = -0.5 * self.state.value, self.model.prior
         if prior is None:
             return found
         k = len(prior.mean)

@@ -85,7 +85,13 @@ def judged(
     if solution is not None and whole is not None:
         of_solution = [*_conditioning(result, solution), *_exchanged(result, whole)]
     found = tuple(_found(result, of_solution))
-    return replace(result, findings=(_trust(found), *found))
+    poor, care = (tuple(f.kind for f in found if f.severity == s) for s in ("poor", "care"))
+    use = (
+        "Use it (elastocal compensate, elastocal export) where poses and loads are like those "
+        "measured."
+    )
+    say, use = (_poor if poor else _care, "") if poor or care else (_good, use)
+    return replace(result, findings=(say("trust", use, because=poor or care), *found))
 
 
 def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]:
@@ -130,17 +136,6 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
     yield from _test(result)
 
 
-def _trust(found: tuple[Finding, ...]) -> Finding:
-    for say, severity in ((_poor, "poor"), (_care, "care")):
-        if doubts := tuple(f.kind for f in found if f.severity == severity):
-            return say("trust", "", because=doubts)
-    use = (
-        "Use it (elastocal compensate, elastocal export) where poses and loads are like those "
-        "measured."
-    )
-    return _good("trust", use, because=())
-
-
 # Of the residual: known noise explains it.
 KNOWN_NOISE = {
     "residual_agrees_with_stated_noise", "residual_below_stated_noise",
@@ -154,12 +149,8 @@ def _explained(result: Calibration, noise: list[Finding]) -> bool:
     told = {f.kind for f in noise}
     lacking = any(f.kind == "lack_of_fit" and f.severity == "care" for f in noise)
     agrees = bool(told & KNOWN_NOISE) or {"noise_not_compared", "repeats_agree"} <= told
-    expected = result.residual_rms * _overfitted(result)
+    expected = result.residual_rms * (len(result.observations.value) / max(result.dof, 1))
     return agrees and not lacking and result.heldout_rms <= FLATTERS * expected
-
-
-def _overfitted(result: Calibration) -> float:
-    return len(result.observations.value) / max(result.dof, 1)
 
 
 def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
@@ -193,7 +184,9 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
 
 def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     if (ratio := result.noise.ratio_to_stated) is None:
-        yield _note("noise_not_compared", "" if _lacks_fit(result) else _state_noise(result))
+        test = result.noise.lack_of_fit
+        lacking = test is not None and test.p < LACK_OF_FIT
+        yield _note("noise_not_compared", "" if lacking else _state_noise(result))
         return
     tails, size, kurtosis = result.model.cell.noise.tails, result.observations.size, 0.0
     if tails is not None:
@@ -261,11 +254,6 @@ def _lacking(result: Calibration) -> str:
     )
 
 
-def _lacks_fit(result: Calibration) -> bool:
-    found = result.noise.lack_of_fit
-    return found is not None and found.p < LACK_OF_FIT
-
-
 def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
     """Do configurations scatter more than their repeats?  Where the residual `fits` a stated noise
     of which readings share some, nothing is missing."""
@@ -279,7 +267,7 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
         if shared or noise.drift is not None:
             counted = "the noise model"
         say, kind, doing = _good, "repeats_agree", ""
-        if _lacks_fit(result):
+        if test.p < LACK_OF_FIT:
             known = fits and result.model.cell.noise.shared and counted == "the noise model"
             say, kind = _note if known else _care, "lack_of_fit"
             doing = "" if known else _lacking(result)
@@ -357,7 +345,7 @@ def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
     # Of base and tool alone, what each point takes of the fit is all that it can flatter by.
     # What n and p let expect decides, so that the noise of a campaign does not; and what exceeds
     # it: at 25 poses held / (fitted · expected) has a standard deviation of 0.04.
-    expected = _overfitted(result)
+    expected = len(result.observations.value) / max(result.dof, 1)
     flatters = expected > FLATTERS or held > FLATTERS * expected * fitted
     flatters = flatters and EXACT < held < math.inf and not (placed and explained)
     if flatters and result.noise.drift is None:
@@ -371,8 +359,15 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
     that is known, on parameters that the readings show?"""
     # Where base and tool alone are sought, as by a dozen touches of a tip, the stated noise judges
     # the fit, and no scatter has to be learnt from it: a coarser look is enough.
-    placed = explained and only_placed(result)
-    left, wanted = spare_equations(result), COARSE if placed else ENOUGH
+    wanted = COARSE if explained and only_placed(result) else ENOUGH
+    # A rigid body's place is six numbers in each load state, however many markers it has and
+    # however often they are read.
+    observed, table, lead = result.observations, result.observations.table, result.observations.lead
+    code = numbered(observed.configuration, *np.round(table.force[lead], 3).T)
+    seen = code[np.unique(numbered(code, table.marker[lead]), return_index=True)[1]]
+    size = 1 if observed.kind == "distance" else observed.size
+    equations = int(np.minimum(size * np.bincount(seen), 6).sum())
+    left = equations - int(np.sum(~result.model.shrunk[result.columns]))
     if left < wanted:
         yield _care(
             "few_configurations", configurations=result.observations.n_configurations,
@@ -392,19 +387,6 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
         yield _care("new_poses_not_shown", **numbers, parameters=found.blamed)
     if found.rms > result.nominal_rms / LITTLE and not only_placed(result):
         yield _care("new_poses_no_gain", rms_um=found.rms, nominal_rms_um=result.nominal_rms)
-
-
-def spare_equations(result: Calibration) -> int:
-    """Equations beyond the parameters fitted.  A rigid body's place is six numbers in each load
-    state, however many markers it has and however often they are read."""
-    observed = result.observations
-    table, lead = observed.table, observed.lead
-    code = numbered(observed.configuration, *np.round(table.force[lead], 3).T)
-    marked = numbered(code, table.marker[lead])
-    seen = code[np.unique(marked, return_index=True)[1]]
-    size = 1 if observed.kind == "distance" else observed.size
-    told = np.minimum(size * np.bincount(seen), 6)
-    return int(told.sum()) - int(np.sum(~result.model.shrunk[result.columns]))
 
 
 def _faulty(result: Calibration) -> Iterator[Finding]:

@@ -246,6 +246,9 @@ def summarise(
     sized = replace(found, solution=own_sizes)
     estimates, combinations = _estimates(sized, left_out, unsure)
     determined = tuple(model.names[c] for c in kept)
+    rho, told = found.spread.correlation, ~model.shrunk[kept]
+    i, j = np.nonzero(np.triu(np.abs(rho) > CORRELATED, k=1) & np.outer(told, told))
+    pairs = ((determined[a], determined[b], float(rho[a, b])) for a, b in zip(i, j, strict=True))
     faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage = solution.crossed
@@ -258,7 +261,7 @@ def summarise(
         model=model, method=found.method, noise=noise, weights=weights,
         noise_parts=parts, estimates=estimates, combinations=combinations, x=final.x,
         determined=determined, spread=found.spread,
-        correlations=_correlations(found.spread.correlation, determined, ~model.shrunk[kept]),
+        correlations=tuple(sorted(pairs, key=lambda pair: -abs(pair[2]))),
         observations=observed, residual=final.residual, held_out=heldout, sigma=sigma,
         dof=len(final.whitened) - spent, residual_rms=rms_3d(final.residual, observed.size),
         heldout_rms=rms_3d(heldout, observed.size), nominal_rms=solution.nominal_rms,
@@ -281,8 +284,8 @@ def summarise(
     result = replace(result, predicted=predicted, test=errors)
     result = judged(result, solution, every.problem.observations.table)
     result = replace(result, scatter=_scatter(result, solution, course.options))
-    told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
-    return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
+    notes = (f"The robot's file: {note}." for note in model.chain.notes)
+    return replace(result, warnings=(*found.warnings, *warning_sentences(result), *notes))
 
 
 def _unchecked(result: Calibration) -> Array | None:
@@ -388,15 +391,6 @@ def _not_stated(p: Parameter, held: float, limits: tuple[float, float]) -> str:
     return f"the readings do not tell it from {p.lower if held < p.upper else p.upper:g}"
 
 
-def _correlations(
-    rho: Array, names: tuple[str, ...], told: BoolArray
-) -> tuple[tuple[str, str, float], ...]:
-    i, j = np.nonzero(np.triu(np.abs(rho) > CORRELATED, k=1) & np.outer(told, told))
-    strongest = np.argsort(-np.abs(rho[i, j]), kind="stable")
-    return tuple((names[a], names[b], float(rho[a, b]))
-                 for a, b in zip(i[strongest], j[strongest], strict=True))  # fmt: skip
-
-
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
 
 ROUNDS, RESTARTS = 14, 2
@@ -474,8 +468,7 @@ def refined(
     observed = every.problem.observations
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
-    found = fit_kept(problem, x, start.reduction)
-    return replace(start, fit=found)
+    return replace(start, fit=fit_kept(problem, x, start.reduction))
 
 
 # Configurations per parameter from which the scatter of those of a large table counts.
@@ -495,10 +488,9 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     if kind == "auto" and noise is not None:
         return noise.covariance
     if kind == "auto" and problem.large:
-        readings, configurations = (
-            len(problem.observations.lead), problem.observations.n_configurations
-        )  # fmt: skip
-        kind = "cr1" if readings > configurations >= ENOUGH * len(fit.columns) else kind
+        observed = problem.observations
+        enough = len(observed.lead) > observed.n_configurations >= ENOUGH * len(fit.columns)
+        kind = "cr1" if enough else kind
     sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
     classical = Covariance(
         "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
@@ -566,9 +558,7 @@ def _by_method(course: Course) -> MethodResult:
         return _published(course, solution)
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
     spread = spread_of(solution, options.intervals, None)
-    return MethodResult(
-        kind, solution, spread, None, good, warnings=(COMPUTED,) if exact else ()
-    )  # fmt: skip
+    return MethodResult(kind, solution, spread, None, good, warnings=(COMPUTED,) * exact)
 
 
 # Parameters that the readings hardly show.
@@ -590,9 +580,10 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
     fitted = found.method in ("reml", "wls", "ols")
     limits: dict[int, tuple[float, float]] = {}  # held ones keep what was found of them
     while True:
-        held, fit = {}, found.solution.fit
-        for k, c in enumerate(found.solution.reduction.kept.tolist()):
-            p, (terms, *_, (low, high)) = fit.problem.model.parameters[c], found.told(k)
+        held, solution, noise = {}, found.solution, found.noise
+        fit, parameters = solution.fit, solution.problem.model.parameters
+        for k, c in enumerate(solution.reduction.kept.tolist()):
+            p, (terms, *_, (low, high)) = parameters[c], found.told(k)
             beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
             if beyond and not p.shrunk and not terms:
                 limits.setdefault(c, (low, high))
@@ -603,34 +594,24 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
                 held[c] = p.nominal
             elif not p.lower <= x <= p.upper and low < p.upper and p.lower < high:
                 held[c] = min(max(x, p.lower), p.upper)
-        again = _holding(every, found, held, options) if held else None
-        if again is None:
-            return replace(found, limits=limits)
-        found = again
-
-
-def _holding(
-    every: Solution, found: MethodResult, held: dict[int, float], options: Options
-) -> MethodResult | None:
-    solution, noise = found.solution, found.noise
-    x0, lost = solution.problem.x0.copy(), np.isin(solution.reduction.kept, list(held))
-    if lost.all():
-        return None
-    x0[list(held)] = list(held.values())
-    reduction = solution.reduction.without(lost)
-    problem = replace(solution.problem, x0=x0)
-    fit = fit_kept(problem, solution.fit.x, reduction)
-    if not fit.converged:
-        return None
-    solution = replace(solution, fit=fit, reduction=reduction)
-    if noise is not None:
-        observed = every.problem.observations
-        readings = linearised(problem.model, observed, fit.x, reduction.kept)
-        if len(problem.observations.lead) < len(found.good):
-            readings = readings.take(found.good)
-        noise = not_knowing_times(estimate_noise(readings, like=noise))
-    spread = spread_of(solution, options.intervals, noise)
-    return replace(found, solution=solution, spread=spread, noise=noise)
+        lost = np.isin(solution.reduction.kept, list(held))
+        if not held or lost.all():
+            break
+        x0, reduction = solution.problem.x0.copy(), solution.reduction.without(lost)
+        x0[list(held)] = list(held.values())
+        problem = replace(solution.problem, x0=x0)
+        fit = fit_kept(problem, solution.fit.x, reduction)
+        if not fit.converged:
+            break
+        solution = replace(solution, fit=fit, reduction=reduction)
+        if noise is not None:
+            readings = linearised(problem.model, every.problem.observations, fit.x, reduction.kept)
+            if len(problem.observations.lead) < len(found.good):
+                readings = readings.take(found.good)
+            noise = not_knowing_times(estimate_noise(readings, like=noise))
+        spread = spread_of(solution, options.intervals, noise)
+        found = replace(found, solution=solution, spread=spread, noise=noise)
+    return replace(found, limits=limits)
 
 
 def _reml(course: Course) -> MethodResult:

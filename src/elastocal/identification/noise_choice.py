@@ -99,21 +99,17 @@ class NoisyReadings:
         found = kind.deviations(readings, lasting)
         waves = [d.waves for d in found if d.waves is not None]
         self.sets = Sets(readings, np.concatenate([readings.B, *waves], axis=2), apart)
-        self.deviations = self._telling(found)
-
-    def _telling(self, found: list[Deviation]) -> list[Deviation]:
-        """Nothing but repeats tells a deviation of each set from the noise of single readings, and
-        a few of them may agree by chance."""
+        # Nothing but repeats tells a deviation of each set from the noise of single readings, and a
+        # few of them may agree by chance.
         own = [d for d in found if d.part == CONFIGURATION]
-        if CONFIGURATION in self.kind.parts and not own:
+        if CONFIGURATION in kind.parts and not own:
             raise InputError(
-                f"{option('noise', self.kind.name)} needs repeats or several markers in a "
+                f"{option('noise', kind.name)} needs repeats or several markers in a "
                 "configuration; this table has one reading in each"
             )
-        if len(self.sets.contrasts) * self.readings.size < FEWEST_TELLING:
-            fewer = [d for d in own if len(np.unique(d.unit)) < self.sets.n]
-            own = fewer or own
-        return [d for d in found if d.part != CONFIGURATION or d in own]
+        if len(self.sets.contrasts) * readings.size < FEWEST_TELLING:
+            own = [d for d in own if len(np.unique(d.unit)) < self.sets.n] or own
+        self.deviations = [d for d in found if d.part != CONFIGURATION or d in own]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -319,6 +315,7 @@ CHOSEN_FROM, PER_PARAMETER = 2000, 20
 TRACE = 0.05
 MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
 FEWEST_VISITS, SEVERAL = 8, 2
+ONLY = "the only model that the table supports"
 
 
 @dataclass(frozen=True)
@@ -459,7 +456,12 @@ class _Choice:
         trials, kind = tuple(self.trials.values()), best.kind.name
         again = fitted(self.readings, best.kind, best, best.lasting)
         tests = {test.part: test for test in self.tests.values()}  # the last one of each
-        return NoiseFit(kind, again, T, trials, _reason(kind, trials), tuple(tests.values()))
+        others = sorted((t for t in trials if t.kind != kind), key=lambda t: t.criterion)
+        mine = min(t.criterion for t in trials if t.kind == kind)
+        gaps = ", ".join(f"{t.kind} (+{t.criterion - mine:.1f})" for t in others)
+        reason = f"among the models that the table supports; others: {gaps}"
+        reason = f"smallest information criterion {reason}" if others else ONLY
+        return NoiseFit(kind, again, T, trials, reason, tuple(tests.values()))
 
     def attempt(
         self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
@@ -531,17 +533,6 @@ class _Choice:
             self.attempt(wanted, lasting[0], more)
             for each in lasting[1:]:
                 self.attempt(wanted, each)
-
-
-def _reason(label: str, trials: Sequence[Trial]) -> str:
-    others = sorted((t for t in trials if t.kind != label), key=lambda t: t.criterion)
-    mine = min(t.criterion for t in trials if t.kind == label)
-    if not others:
-        return "the only model that the table supports"
-    gaps = ", ".join(f"{t.kind} (+{t.criterion - mine:.1f})" for t in others)
-    return (
-        f"smallest information criterion among the models that the table supports; others: {gaps}"
-    )
 
 
 def not_knowing_times(found: NoiseFit) -> NoiseFit:

@@ -296,30 +296,28 @@ class NoiseModel:
         InputError where `components` are not as they should be, or readings lack what it needs."""
         found = self.components(readings)
         require(bool(found), f"the noise model '{self.name}' has no components")
-        each = [self._matrices(name, S, readings) for name, S in found.items()]
+        each, (n, size) = list[Array](), readings.e.shape
+        for name, stated in found.items():
+            S = np.asarray(stated, dtype=np.float64)
+            where = f"component '{name}' of the noise model '{self.name}'"
+            require(
+                S.shape in ((n,), (n, size, size)),
+                f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
+                f"({n}, {size}, {size}), is needed",
+            )
+            full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
+            same = np.isfinite(S).all() and np.allclose(full, full.transpose(0, 2, 1))
+            require(bool(same), f"{where} is not finite and symmetric")
+            smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
+            lower = (smallest < -1e-9 * largest).any()
+            require(not lower, f"{where} has a negative variance in some direction")
+            each.append(full)
         require(
             bool((np.linalg.eigvalsh(np.sum(each, axis=0))[:, 0] > 0).all()),
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
         return Structure(readings, found, enumerate(each))
-
-    def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
-        n, size = len(readings), readings.size
-        S = np.asarray(S, dtype=np.float64)
-        where = f"component '{name}' of the noise model '{self.name}'"
-        require(
-            S.shape in ((n,), (n, size, size)),
-            f"{where} is {S.shape}; a number per reading, ({n},), or a matrix, "
-            f"({n}, {size}, {size}), is needed",
-        )
-        full = S[:, None, None] * np.eye(size) if S.ndim == 1 else S
-        same = np.isfinite(S).all() and np.allclose(full, full.transpose(0, 2, 1))
-        require(bool(same), f"{where} is not finite and symmetric")
-        smallest, largest = np.linalg.eigvalsh(full)[:, [0, -1]].T
-        lower = (smallest < -1e-9 * largest).any()
-        require(not lower, f"{where} has a negative variance in some direction")
-        return full
 
 
 def _axes(size: int) -> Array:
@@ -590,14 +588,6 @@ def _settling(record: VisitRecord, part: str, who: str, joints: IntArray) -> Dev
     )  # fmt: skip
 
 
-def of_time(readings: Readings, lasting: float) -> Iterator[Deviation]:
-    assert readings.visits is not None
-    position = np.arange(readings.size) < 3
-    for name, along in ((DRIFT, position), (f"{DRIFT} (rotation)", ~position)):
-        if along.any():
-            yield _drift(readings.visits, name, lasting, along.astype(float))
-
-
 def _drift(record: VisitRecord, name: str, lasting: float, along: Array) -> Deviation:
     """A course in time of the deviations `along` (size,): its waves, and, common to a visit, what
     they leave of its variance."""
@@ -693,7 +683,12 @@ class Kind(NamedTuple):
             if part == CONFIGURATION:
                 found += of_configurations(readings, every)
             elif part == TIME:
-                found += of_time(readings, lasting or 0.0)
+                assert readings.visits is not None
+                position = np.arange(readings.size) < 3
+                for name, along in ((DRIFT, position), (f"{DRIFT} (rotation)", ~position)):
+                    if along.any():
+                        own = along.astype(float)
+                        found.append(_drift(readings.visits, name, lasting or 0.0, own))
             else:
                 found += of_joints(readings, part == EACH)
         return found

@@ -647,10 +647,12 @@ class _Table:
         p = float(_two_sided(total, f))
         unit = z / (np.abs(z).max() or 1.0)  # no power of it overflows
         same = np.ptp(unit) < 1e-10
-        shape = (0.0, 0.0) if same else _shape(unit)
-        omnibus = None
-        if len(z) >= FEWEST_FOR_SHAPE and not same:
-            omnibus = _p_normal(*shape, len(z))
+        shape, omnibus, away = (0.0, 0.0), None, unit - unit.mean()
+        if not same:
+            squared = (away**2).mean()
+            kurtosis = float((away**4).mean() / squared**2 - 3)
+            shape = float((away**3).mean() / squared**1.5), kurtosis
+            omnibus = _p_normal(*shape, len(z)) if len(z) >= FEWEST_FOR_SHAPE else None
         held = self.held[rows]
         held = held[np.isfinite(held)]
         points = GROUP_POINTS if holm is not None else 4 * GROUP_POINTS
@@ -671,12 +673,6 @@ class _Table:
 def _two_sided(total: ArrayLike, f: ArrayLike) -> Array:
     smaller = np.minimum(special.chdtr(f, total), special.chdtrc(f, total))
     return np.where(np.asarray(f) > 0, np.minimum(2 * smaller, 1.0), np.nan)
-
-
-def _shape(z: Array) -> tuple[float, float]:
-    away = z - z.mean()
-    squared = (away**2).mean()
-    return float((away**3).mean() / squared**1.5), float((away**4).mean() / squared**2 - 3)
 
 
 def _p_normal(skewness: float, kurtosis: float, n: int) -> float:

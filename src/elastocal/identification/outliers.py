@@ -174,16 +174,9 @@ class FitToGood:
 
 ROUNDS = 12
 Found = TypeVar("Found")
-# A fit, the observations (n,) it is of, and the `better_half` of all.
+# A fit, the observations (n,) it is of, and of the half of all that lies nearest the mean square
+# and the degrees of freedom of a fit to so many.
 Stand = tuple[Found, BoolArray, tuple[float, float]]
-
-
-def better_half(squared: Array, dof: float, good: BoolArray) -> tuple[float, float]:
-    """Mean square of the half of all observations that lies nearest, and the degrees of freedom of
-    a fit to so many."""
-    half = len(squared) // 2 + 1
-    own = max(dof, 1.0) * half / max(int(good.sum()), 1)
-    return float(np.partition(squared, half - 1)[:half].sum()) / own, own
 
 
 def explains_more(one: Stand, other: Stand) -> bool:
@@ -212,7 +205,10 @@ def until_it_stands(
             if not visited:
                 raise
             break  # so few cannot judge the others
-        visited.append((found, good, better_half(squared, dof, good)))
+        half = len(squared) // 2 + 1
+        own = max(dof, 1.0) * half / max(int(good.sum()), 1)
+        nearest = float(np.partition(squared, half - 1)[:half].sum())
+        visited.append((found, good, (nearest / own, own)))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]

@@ -247,8 +247,7 @@ def position_at(
     equilibrium; `spread` is the covariance of what was determined."""
     rows, q = tool.rows(table), table.q
     joints, common = noise.scatter(q.shape[1])
-    found = uncertainty_at(tool, rows, q)
-    place = tool.poses(rows, q)[0]
+    found, place = uncertainty_at(tool, rows, q), tool.poses(rows, q)[0]
     J = tool.errors(rows, q, place, None)[1]
     visit = (J * joints**2) @ J.transpose(0, 2, 1) + common**2 * np.eye(3)
     arm = tool.calibrated

@@ -296,18 +296,18 @@ class Solution:
 
     @cached_property
     def crossed(self) -> tuple[Array, Array]:
-        """Residual (rows,) of each configuration under a fit to the others, and leverage
-        (rows,)."""
+        """Residual (rows,) of each configuration under a fit to the others, and leverage (rows,).
+
+        Where that fit leaves a direction open by more than FAR, it has typical deviations of what
+        is kept, and of what that stands for, beside it: no arm that works is off by as much.
+        Without the pose that shows it the direction would have no column; fitted all the same it
+        takes the pose metres away.
+        """
         if self.held is not None:
             return self.held
         held, leverage = looked_at(self.fit)
-        return held if self.problem.large else self._no_farther(held, leverage), leverage
-
-    def _no_farther(self, held: Array, leverage: Array) -> Array:
-        """`held` (rows,) where the fit to the others leaves a direction open by more than FAR: with
-        typical deviations of what is kept, and of what that stands for, beside it.  No arm that
-        works is off by as much.  Without the pose that shows it the direction would have no column;
-        fitted all the same it takes the pose metres away."""
+        if self.problem.large:
+            return held, leverage
         fit, kept, sizes = self.fit, self.reduction.kept, self.problem.sizes
         weights, observed = self.problem.weights, self.problem.observations
         shares = self.reduction.mixing * sizes[self.reduction.dropped]
@@ -329,7 +329,7 @@ class Solution:
             open_ = variance * np.linalg.eigvalsh(V[:p, :p])[-1] > FAR**2 / (1 + FAR**2)
             if open_ and np.isfinite(held[at]).all():
                 held[at] = fit.residual[at] - B[at] @ (V @ (z - rows[at].T @ e[at]))[:p]
-        return held
+        return held, leverage
 
 
 def solve(
@@ -590,20 +590,11 @@ class SmoothPart:
         matrix[np.ix_(there, there)] = covariance[np.ix_(at[there], at[there])]
         return replace(self, value=x[mine], covariance=matrix)
 
-    def _own_waves(self, x: Array) -> Array:
-        """The waves at x (n,) without their mean and their wave of one period per turn (of a time,
-        its slope), for which offsets, lengths and tilts of the arm can stand."""
-        assert self.group.basis is not None
-        alike = [np.ones(len(x)), *((np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],))]
-        Q, _ = np.linalg.qr(np.column_stack(alike))
-        waves = self.group.basis(x)
-        return np.asarray(waves - Q @ (Q.T @ waves))
-
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
         """By unit, over all components and the places of the readings: rms of what is left of the
-        function without what the arm can stand for, the 95 % interval of that, and the rms half
-        width of its 95 % band.
+        function without what offsets, lengths and tilts of the arm can stand for, the 95 %
+        interval of that, and the rms half width of its 95 % band.
 
         Of parameters that are no function of one quantity, the root of their sum of squares.
         """
@@ -616,7 +607,11 @@ class SmoothPart:
             else:
                 places = np.sort(self.places)
                 even = np.linspace(0, len(places) - 1, min(len(places), PLACES)).astype(int)
-                waves = self._own_waves(places[even])
+                # Less the mean and the wave of one period per turn (of a time, the slope).
+                x = places[even]
+                of_the_arm = (np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],)
+                Q, _ = np.linalg.qr(np.column_stack([np.ones(len(x)), *of_the_arm]))
+                waves = basis(x) - Q @ (Q.T @ basis(x))
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
             k = waves.shape[1]
