@@ -86,10 +86,8 @@ class FaultyGroup:
 @dataclass(frozen=True)
 class OutlierReport:
     """Findings, groups before readings and the largest first, and what is left without them.
-
     `sigma` is the noise of a whitened row.  `tests` says how many were made per level, `good` (n,)
-    which observations the fit rests on.
-    """
+    which observations the fit rests on."""
 
     findings: tuple[FaultyGroup, ...]
     sigma: float

@@ -51,10 +51,8 @@ ROUND_OFF = 1e-12
 @dataclass(frozen=True)
 class Matrix:
     """M(x) = constant + Σ x_i slopes_i ⪰ 0; constant (n, n), slopes (p, n, n), all symmetric.
-
-    `balance` (n,) is d where the matrix stands for diag(d) M diag(d): a congruence changes no
-    sign of an eigenvalue, and brings rows of different units to one size.
-    """
+    `balance` (n,) is d where the matrix stands for diag(d) M diag(d): a congruence changes no sign
+    of an eigenvalue, and brings rows of different units to one size."""
 
     label: str
     constant: Array
@@ -309,12 +307,10 @@ def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
 
 @dataclass(frozen=True)
 class ActiveConstraint:
-    """A constraint that holds with equality at the solution.
-
-    `value` is the bound or the equality's right-hand side (0 for a matrix), in the parameter's
-    unit; `multiplier` the shadow price ∂(minimum of the objective)/∂value: ≥ 0 at a lower bound,
-    ≤ 0 at an upper one; for a matrix tr Z, the price of M ⪰ t·I per unit of t.
-    """
+    """A constraint that holds with equality at the solution.  `value` is the bound or the
+    equality's right-hand side (0 for a matrix), in the parameter's unit; `multiplier` the shadow
+    price ∂(minimum of the objective)/∂value: ≥ 0 at a lower bound, ≤ 0 at an upper one; for a
+    matrix tr Z, the price of M ⪰ t·I per unit of t."""
 
     label: str
     kind: Literal["lower", "upper", "equality", "semidefinite"]

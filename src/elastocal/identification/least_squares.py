@@ -114,13 +114,10 @@ EPS = float(np.finfo(np.float64).eps)
 
 
 def orthogonal(B: Array) -> tuple[Array, Array]:
-    """Of the whitened B (rows, p) Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy and V Vᵀ =
-    (BᵀB)⁻¹.
-
-    Any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ: BᵀB, whose condition is that of B squared, is
-    never formed.  Raises InputError where the columns depend on each other, InsufficientDataError
-    where there are no more rows than parameters.
-    """
+    """Of the whitened B (rows, p) Q (rows, p) with QᵀQ = I and V (p, p) with x̂ = V Qᵀy,
+    V Vᵀ = (BᵀB)⁻¹: any sandwich (BᵀB)⁻¹ BᵀΩB (BᵀB)⁻¹ is V (QᵀΩQ) Vᵀ, and BᵀB, whose condition is
+    that of B squared, is never formed.  InputError where the columns depend on each other,
+    InsufficientDataError where there are no more rows than parameters."""
     rows, p = B.shape
     if rows <= p:
         raise InsufficientDataError(
@@ -262,8 +259,8 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
 
 
 def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
-    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.  For g(I −
-    Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) the smaller of the two is decomposed."""
+    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.  The smaller
+    side of g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) is decomposed."""
     by_row = Qc.shape[1] < Qc.shape[2]
     gram = Qc @ Qc.transpose(0, 2, 1) if by_row else Qc.transpose(0, 2, 1) @ Qc
     values, U = np.linalg.eigh(gram)
@@ -309,11 +306,9 @@ def held_out_by_parts(
     problem: Problem, x: Array, columns: IntArray, half: Array, step: Array | None = None
 ) -> tuple[Array, Array]:
     """The same with the model linearised at x, a part at a time, and the leverage (rows,) of each.
-
     `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
     the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
-    step to the linear model's minimum, where x is not it.
-    """
+    step to the linear model's minimum, where x is not it."""
     held, leverage = np.empty((2, len(problem.observations.value)))
     together, size = problem.weights.together, problem.observations.size
 

@@ -419,11 +419,9 @@ def refuse_nonsense(
     apart: Observations | None = None,
 ) -> None:  # fmt: skip
     """Raise InsufficientDataError, with the likely cause, where a fit is none of this robot.
-
     `apart` are the readings that it left out; `every` reading is looked at for the cause, since few
     may be left in `observed`.  Deflections are small whatever the mistake: there positions that a
-    mistake undone makes fit are enough.
-    """
+    mistake undone makes fit are enough."""
     left, n = [residual], len(observed.lead)
     if apart is not None:
         left.append(apart.value - model.predict(apart.table, x, apart))

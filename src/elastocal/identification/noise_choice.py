@@ -117,7 +117,6 @@ class NoisyReadings:
 
     def model(self, prior: LogPrior | None = None) -> Mixed:
         """Packs of clusters of the sets: readings of a configuration that share anything are one.
-
         With a course in time its coefficients are columns of B, which readings of zero with the
         unknown variance hold.  Restricted likelihood is then that of the course taken for noise
         (Henderson 1975), and nothing as large as the table squared is formed."""
@@ -336,12 +335,10 @@ class NoiseTest:
 
 @dataclass(frozen=True)
 class NoiseFit:
-    """The noise model that was chosen, the estimate under it, and what else was tried.
-
-    `fit` is in orthonormal parameters, B T with T (p, p), which shifts all its log-likelihoods by
-    one constant.  Neither the units of the parameters nor their correlation then cost digits, and
-    columns that depend on each other are found out.
-    """
+    """The noise model that was chosen, the estimate under it, and what else was tried.  `fit` is in
+    orthonormal parameters, B T with T (p, p), which shifts all its log-likelihoods by one constant.
+    Neither the units of the parameters nor their correlation then cost digits, and columns that
+    depend on each other are found out."""
 
     kind: str
     fit: Fitted
@@ -537,11 +534,9 @@ class _Choice:
 
 def not_knowing_times(found: NoiseFit) -> NoiseFit:
     """The same fit with a covariance that does not take for known how long what drifts lasts, where
-    the cell does not say: the mean over the correlation times tried, Σ = Σ_m w_m Σ_m.
-
-    w_m ∝ the restricted likelihoods.  To what the degrees of freedom f_m leave unknown,
-    Σ_m w_m/f_m, comes what the models differ by (`Covariance.tails`), most for base and tracker.
-    """
+    the cell does not say: the mean over the correlation times tried, Σ = Σ_m w_m Σ_m.  w_m ∝ the
+    restricted likelihoods.  To what the degrees of freedom f_m leave unknown, Σ_m w_m/f_m, comes
+    what the models differ by (`Covariance.tails`), most for base and tracker."""
     readings, T, fits = found.fit.noisy.readings, found.T, [found.fit]
     if found.fit.lasting is None or readings.visits is None:
         return found

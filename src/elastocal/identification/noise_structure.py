@@ -118,11 +118,9 @@ SYSTEMATIC = 0.01
 
 
 def in_random_order(table: Measurements) -> bool:
-    """Whether poses that follow each other in the table are no nearer than chance allows at 1 %.
-
-    Σ |q_i+1 − q_i|² / Σ |q_i − q̄|² has the mean 2 and the variance 4 (n − 2)/(n² − 1) for each
-    joint (von Neumann 1941), poses that only the load or a repeat tells apart counted once.
-    """
+    """Whether poses that follow each other in the table are no nearer than chance allows at 1 %.  Σ
+    |q_i+1 − q_i|² / Σ |q_i − q̄|² has the mean 2 and the variance 4 (n − 2)/(n² − 1) for each joint
+    (von Neumann 1941), poses that only the load or a repeat tells apart counted once."""
     moves = np.abs(np.diff(table.q, axis=0)).max(axis=1, initial=0.0) > 0
     q = table.q[np.concatenate([[True], moves])] if len(table) else table.q
     n, spread = len(q), q.std(axis=0)
@@ -534,12 +532,10 @@ PARTITIONS: tuple[tuple[str, ...], ...] = (
 
 
 def of_configurations(readings: Readings, every: bool) -> Iterator[Deviation]:
-    """Deviations that these readings can tell apart; or `every` one that there may be.
-
-    An arm does not come back to quite the same place: a deviation per configuration; per
-    configuration and load; per configuration and marker; and per set, common to its repeats. One is
-    left out where it would coincide with another or with the noise of single readings.
-    """
+    """Deviations that these readings can tell apart; or `every` one that there may be.  An arm does
+    not come back to quite the same place: a deviation per configuration; per configuration and
+    load; per configuration and marker; and per set, common to its repeats. One is left out where it
+    would coincide with another or with the noise of single readings."""
     kept: dict[tuple[str, ...], IntArray] = {}
     for by in PARTITIONS:
         unit = numbered(*(getattr(readings, label) for label in by))

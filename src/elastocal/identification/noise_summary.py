@@ -349,11 +349,9 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
 
 def _ratio_to_stated(found: MethodResult, sigma: float, spent: int) -> float | None:
     """Root mean square of the residual in units of the stated noise, per degree of freedom; of
-    stated tails, in units of what is left of that noise where far readings are set apart.
-
-    Readings that share some of it are weighted as they share it, and what the parameters take of
-    the residual at these weights is taken: only then does it have the expectation 1.
-    """
+    stated tails, in units of what is left of that noise where far readings are set apart.  Readings
+    that share some of it are weighted as they share it, and what the parameters take of the
+    residual at these weights is taken: only then does it have the expectation 1."""
     solution = found.solution
     problem, fit = solution.problem, solution.fit
     observed, model, unit = problem.observations, problem.model, 1.0
@@ -398,11 +396,9 @@ SMALL_ETA = (0.00880, 0.00661, 0.00471, 0.00371, 0.00295, 0.00219, 0.00173)
 
 @dataclass(frozen=True)
 class NormalScores:
-    """Points (k,) in ascending order: expected and observed value, and the band at each.
-
-    `n` values were ordered; k ≤ n of them are given, evenly spaced over the expected values.
-    `inside` says whether every given point lies in the simultaneous 95 % band.
-    """
+    """Points (k,) in ascending order: expected and observed value, and the band at each.  `n`
+    values were ordered; k ≤ n of them are given, evenly spaced over the expected values. `inside`
+    says whether every given point lies in the simultaneous 95 % band."""
 
     n: int
     expected: Array
@@ -432,11 +428,9 @@ def normal_scores(z: Array, most: int) -> NormalScores:
 
 
 def simultaneous_level(n: int) -> float:
-    """Local level η at which all n order statistics stay in their bands with 95 %.
-
-    From n = 200 on, η = −ln 0.95 / (2 ln n · lln n) · (1 − 1.3 llln n / lln n), with lln = ln ln
-    (Weine, McPeek and Abney 2023, J. Stat. Softw. 106(10)); below, a table.
-    """
+    """Local level η at which all n order statistics stay in their bands with 95 %.  From n = 200
+    on, η = −ln 0.95 / (2 ln n · lln n) · (1 − 1.3 llln n / lln n), with lln = ln ln (Weine, McPeek
+    and Abney 2023, J. Stat. Softw. 106(10)); below, a table."""
     if n < SMALL_N[-1]:
         return float(np.exp(np.interp(np.log(n), np.log(SMALL_N), np.log(SMALL_ETA))))
     log = np.log(n)
@@ -526,11 +520,9 @@ class GroupSummary:
 
 @dataclass(frozen=True)
 class Grouping:
-    """The rows by component, marker, configuration or load state, over common bin `edges`.
-
-    Of `n_groups` groups, `n_small` have fewer than 8 values and `n_deviating` scatter more or less
-    than the model says; `groups` are at most 12, those of the smallest p, in the table's order.
-    """
+    """The rows by component, marker, configuration or load state, over common bin `edges`.  Of
+    `n_groups` groups, `n_small` have fewer than 8 values and `n_deviating` scatter more or less
+    than the model says; `groups` are at most 12, those of the smallest p, in the table's order."""
 
     by: str
     edges: Array
@@ -542,12 +534,10 @@ class Grouping:
 
 @dataclass(frozen=True)
 class ResidualSummary:
-    """Standardised residuals of the whole table over `edges`, and by group.
-
-    `absolute` says whether the size of the noise was stated or estimated as part of the model;
-    else the residuals told it, and the whole table's mean square is 1.  `n_alone` rows have no
-    residual of their own, because they alone determine something.
-    """
+    """Standardised residuals of the whole table over `edges`, and by group.  `absolute` says
+    whether the size of the noise was stated or estimated as part of the model; else the residuals
+    told it, and the whole table's mean square is 1.  `n_alone` rows have no residual of their own,
+    because they alone determine something."""
 
     whole: GroupSummary
     edges: Array
@@ -558,9 +548,7 @@ class ResidualSummary:
     @property
     def deviating(self) -> tuple[tuple[str, GroupSummary], ...]:
         """(grouping, group) of those listed that scatter more or less than the model says.
-
-        Smallest p first: a loud configuration makes its markers and components loud as well.
-        """
+        Smallest p first: a loud configuration makes its markers and components loud as well."""
         found = [(g.by, group) for g in self.groupings for group in g.groups if group.deviates]
         return tuple(sorted(found, key=lambda pair: pair[1].p))
 

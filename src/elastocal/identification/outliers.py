@@ -130,12 +130,10 @@ ALONE = 1e-9  # share of an observation's direction that the other observations 
 
 
 class FitToGood:
-    """y ≈ B z with z ~ N(0, 1), fitted to the observations that are `good` (n,).
-
-    B (n, size, p) is per prior deviation, y (n, size), and `variance` that of a row.  With
-    RᵀR = Σ BᵀB + variance of the good ones, T = B R⁻¹ (n, size, p) makes T_i T_jᵀ the covariance of
-    two predictions in units of the variance.  `e` (n, size) is y less its prediction.
-    """
+    """y ≈ B z with z ~ N(0, 1), fitted to the observations that are `good` (n,).  B (n, size, p) is
+    per prior deviation, y (n, size), and `variance` that of a row.  With RᵀR = Σ BᵀB + variance of
+    the good ones, T = B R⁻¹ (n, size, p) makes T_i T_jᵀ the covariance of two predictions in units
+    of the variance.  `e` (n, size) is y less its prediction."""
 
     def __init__(self, B: Array, y: Array, good: BoolArray, variance: float) -> None:
         self.good = good
@@ -242,9 +240,7 @@ def are_accidents(observed: Observations, faulty: BoolArray) -> bool:
 def _by_chance(observed: Observations, faulty: BoolArray) -> float:
     """Chance that the `faulty` ones (N,) follow each other in the order of lines, of all or of each
     marker, as they do, over the chance of what the order of any joint within a load state shows.
-
-    What is read before the arm moves on counts once: it has the errors of its pose in common.
-    """
+    What is read before the arm moves on counts once: it has the errors of its pose in common."""
     table, lead = observed.table, observed.lead
     line, marker, q = table.row[lead], table.marker[lead], table.q[lead]
     order, stay = np.argsort(line), np.zeros(len(line), dtype=np.int64)

@@ -75,12 +75,9 @@ MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
 
 @dataclass(frozen=True)
 class Influence:
-    """What a configuration does to the fit.
-
-    `leverage`: how many of the parameters it pays for.  `cook`: Cook's distance, infinite where it
-    alone determines something.  Without it `moved` would move by `by` standard deviations, more
-    than any other parameter.
-    """
+    """What a configuration does to the fit.  `leverage`: how many of the parameters it pays for.
+    `cook`: Cook's distance, infinite where it alone determines something.  Without it `moved` would
+    move by `by` standard deviations, more than any other parameter."""
 
     configuration: str
     readings: int
@@ -128,9 +125,7 @@ FEWEST_VISITS = 12
 class Autocorrelation:
     """Correlations of the mean residuals of visits that are 1, 2, … apart, and the p-value of the
     first being no larger than in a random order; `band` holds 95 % of single ones by chance.
-
-    Visits follow each other by the table's times, or by the order of its rows (`by`).
-    """
+    Visits follow each other by the table's times, or by the order of its rows (`by`)."""
 
     correlations: tuple[float, ...]
     p: float
@@ -168,12 +163,10 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
 
 
 def over_permutations(mean: Array) -> tuple[float, float]:
-    """Mean and standard deviation of Σ m_i·m_{i+1} over all orders of the rows m of `mean` (n, k),
-    which sum to zero.
-
-    Two products of neighbours share both rows, one or none; the mean of their product over all
-    distinct rows follows for each from T = Σ |m|², F = |Σ m mᵀ|² and Q = Σ |m|⁴.
-    """
+    """Mean and standard deviation of Σ m_i·m_{i+1} over all orders of the rows m of `mean` (n,
+    k), which sum to zero.  Two products of neighbours share both rows, one or none; the mean of
+    their product over all distinct rows follows for each from T = Σ |m|², F = |Σ m mᵀ|² and
+    Q = Σ |m|⁴."""
     n, square = len(mean), (mean**2).sum(axis=1)
     T, F, Q = square.sum(), ((mean.T @ mean) ** 2).sum(), (square**2).sum()
     two = (F - Q) / (n * (n - 1))
@@ -193,11 +186,9 @@ def over_permutations(mean: Array) -> tuple[float, float]:
 @dataclass(frozen=True)
 class ParameterSet:
     """A set of parameters: how many are fitted, 3-D rms (m) of its residual and held out.
-
-    `heldout_over_chosen`: its held-out rms less that of the parameters that were chosen, and
-    `ci95` of this difference, by resampling configurations.  `log_likelihood`: restricted, less
-    that of the chosen ones.
-    """
+    `heldout_over_chosen`: its held-out rms less that of the parameters that were chosen, and `ci95`
+    of this difference, by resampling configurations.  `log_likelihood`: restricted, less that of
+    the chosen ones."""
 
     name: str
     parameters: int

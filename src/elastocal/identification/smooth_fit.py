@@ -87,11 +87,9 @@ class Scales:
 
 @dataclass(frozen=True)
 class LinearRows:
-    """Rows linearised: the R factor of [B_f B_s e], e at nominal functions.
-
-    `std` (shrunk,) are the prior's standard deviations as declared, `group` (shrunk,) the numbers
-    of the groups, of which the first are `functions`, the others parameters of known size.
-    """
+    """Rows linearised: the R factor of [B_f B_s e], e at nominal functions.  `std` (shrunk,) are
+    the prior's standard deviations as declared, `group` (shrunk,) the numbers of the groups, of
+    which the first are `functions`, the others parameters of known size."""
 
     factor: RFactor
     std: Array
@@ -152,10 +150,8 @@ class LinearRows:
 
 class Posterior:
     """The estimate under a prior: ordinary columns first, then the shrunk ones that take part.
-
     `r_factor` is that of readings and prior rows P (own, columns) together, in units of σ, the
-    shrunk ones counted from nominal; `own` index those that take part.
-    """
+    shrunk ones counted from nominal; `own` index those that take part."""
 
     def __init__(self, linear: LinearRows, scales: Scales) -> None:
         k, std = linear.ordinary, np.sqrt(scales.scale / scales.variance)[linear.group] * linear.std
@@ -269,8 +265,8 @@ class JointFit:
 
     def standardised(self, others: Part | None = None) -> Array:
         """Residuals (N, size) free of the fit's part in them, in m or rad: of the fit's own
-        readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1
-        − QQᵀ."""
+        readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of
+        1 − QQᵀ."""
         problem, side = self.found.problem, -1
         if others is not None:
             own, side = others.observations, 1

@@ -228,12 +228,10 @@ MOSTLY = 0.5
 
 
 def prefer_wider(found: Fit, reduction: Reduction) -> tuple[Fit, Reduction]:
-    """A wider set, where held-out configurations show that it is needed.
-
-    Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides, first on the linearised model, then on the fit that starts at its minimum: from where
-    the narrow one ended it may take hundreds of steps.
-    """
+    """A wider set, where held-out configurations show that it is needed.  Typical sizes are prior
+    knowledge and may be wrong for this arm; a test on held-out data decides, first on the
+    linearised model, then on the fit that starts at its minimum: from where the narrow one ended it
+    may take hundreds of steps."""
     problem, every = found.problem, found.of_free
     observed, sigma = problem.observations, residual_sigma(found, len(reduction.kept))
     judges = problem.weights, observed.configuration, observed.size
@@ -274,12 +272,10 @@ MANY, SAMPLE = 2000, 5000
 
 @dataclass(frozen=True)
 class Solution:
-    """The fit of the kept set, which parameters those are, and how well it predicts.
-
-    `reduction` holds indices into the model's parameters; `nominal_rms` is the 3-D rms in m of the
-    nominal arm with only base, markers and cable placed; `held` is `crossed` where that is not what
-    B and weights say.
-    """
+    """The fit of the kept set, which parameters those are, and how well it predicts.  `reduction`
+    holds indices into the model's parameters; `nominal_rms` is the 3-D rms in m of the nominal arm
+    with only base, markers and cable placed; `held` is `crossed` where that is not what B and
+    weights say."""
 
     fit: Fit
     reduction: Reduction
@@ -593,11 +589,9 @@ class SmoothPart:
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
         """By unit, over all components and the places of the readings: rms of what is left of the
-        function without what offsets, lengths and tilts of the arm can stand for, the 95 %
-        interval of that, and the rms half width of its 95 % band.
-
-        Of parameters that are no function of one quantity, the root of their sum of squares.
-        """
+        function without what offsets, lengths and tilts of the arm can stand for, the 95 % interval
+        of that, and the rms half width of its 95 % band.  Of parameters that are no function of one
+        quantity, the root of their sum of squares."""
         basis = self.group.basis
         found = {}
         for unit in dict.fromkeys(self.group.units):

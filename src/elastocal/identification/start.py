@@ -367,12 +367,10 @@ ROUGH, AWAY = 2e-3, 0.3
 
 
 def _distance_start(model: Model, table: Measurements, x: Array, movable: set[int]) -> Array:
-    """Anchor, offset and attachment by robust least squares.
-
-    With p the nominal flange, d the reading, a the anchor and o the offset, |p − a| = d − o is
-    linear in a, o and |a|² − o².  Which side of the robot the anchor is on shows only in all poses
-    together: mirror images of that solution are tried too, and the best robust cost wins.
-    """
+    """Anchor, offset and attachment by robust least squares.  With p the nominal flange, d the
+    reading, a the anchor and o the offset, |p − a| = d − o is linear in a, o and |a|² − o².  Which
+    side of the robot the anchor is on shows only in all poses together: mirror images of that
+    solution are tried too, and the best robust cost wins."""
     columns = np.array(
         [i for i, p in enumerate(model.parameters)
          if i in movable and effect_of(p.effect).registered]

@@ -23,13 +23,10 @@ MAX_LENGTH, MAX_MASS = 50.0, 1e5  # m, kg: beyond them a unit is wrong, no arm i
 
 @dataclass(frozen=True)
 class Joint:
-    """One moving joint of the chain.
-
-    `placement` (4, 4) takes coordinates of this joint's frame at zero motion to the previous
-    joint's frame (to the base frame for the first joint); `axis` (3,) is the unit joint axis in
-    this joint's frame.  `lower` and `upper` are in rad (revolute) or m (prismatic), infinite where
-    the source has no limit.
-    """
+    """One moving joint of the chain.  `placement` (4, 4) takes coordinates of this joint's frame at
+    zero motion to the previous joint's frame (to the base frame for the first joint); `axis` (3,)
+    is the unit joint axis in this joint's frame.  `lower` and `upper` are in rad (revolute) or m
+    (prismatic), infinite where the source has no limit."""
 
     name: str
     kind: JointKind
@@ -49,12 +46,10 @@ class LinkMass:
 
 @dataclass(frozen=True, eq=False)
 class Chain:
-    """A serial chain base → joint 1 → … → joint n → flange.
-
-    `flange_placement` (4, 4) places the flange in the last joint's frame. `masses` holds one entry
-    per joint, all bodies rigidly carried by that joint lumped, or is empty where the source has no
-    inertias.  `notes`: what to know of how the source was read, in sentences.
-    """
+    """A serial chain base → joint 1 → … → joint n → flange.  `flange_placement` (4, 4) places the
+    flange in the last joint's frame. `masses` holds one entry per joint, all bodies rigidly carried
+    by that joint lumped, or is empty where the source has no inertias.  `notes`: what to know of
+    how the source was read, in sentences."""
 
     name: str
     joints: tuple[Joint, ...]

@@ -65,11 +65,8 @@ LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
 def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
     """`_steps` of a function as five lists, and its number of registers: those that CasADi gave the
     instructions, of which few are in use at a time.  NotImplementedError for a CasADi operation
-    that numpy has no counterpart for.
-
-    Not a tuple for every step: thousands of these would have Python look for garbage in all that is
-    loaded, 0.07 s each time.
-    """
+    that numpy has no counterpart for.  Not a tuple for every step: thousands of these would have
+    Python look for garbage in all that is loaded, 0.07 s each time."""
     columns = tuple([*column] for column in zip(*_steps(function), strict=True))
     return columns, int(function.sz_w())
 

@@ -53,12 +53,10 @@ def read_mjcf(path: str | Path, base: str | None = None, flange: str | None = No
 
 @dataclass(frozen=True)
 class MjcfArm:
-    """A compiled MuJoCo model, its links and joints, and the names of base and flange.
-
-    `bodies`: names of links by the number of the body, which for one without a name is
-    "body 5".  `unweighed`: numbers of those whose masses meshes that are not there would state.
-    `told`: what MuJoCo and the reader say of the file.
-    """
+    """A compiled MuJoCo model, its links and joints, and the names of base and flange.  `bodies`:
+    names of links by the number of the body, which for one without a name is "body 5".
+    `unweighed`: numbers of those whose masses meshes that are not there would state. `told`: what
+    MuJoCo and the reader say of the file."""
 
     model: Any
     tree: Tree

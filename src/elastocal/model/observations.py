@@ -25,12 +25,10 @@ COMPONENTS = {
 
 @dataclass(frozen=True)
 class Observations:
-    """N observations of `size` components each, as linear combinations of table rows.
-
-    `value` (N·size,) holds what was observed, row-major (all components of an observation
-    together); `combine` (N, n_rows) says which rows enter: the identity, or loaded minus mean
-    unloaded for deflections.  `lead` (N,) is the table row that names each observation.
-    """
+    """N observations of `size` components each, as linear combinations of table rows.  `value`
+    (N·size,) holds what was observed, row-major (all components of an observation together);
+    `combine` (N, n_rows) says which rows enter: the identity, or loaded minus mean unloaded for
+    deflections.  `lead` (N,) is the table row that names each observation."""
 
     kind: str
     value: Array
@@ -169,8 +167,8 @@ def available_noise(table: Measurements, tracker: Tracker) -> str:
 
 def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tuple[Array, str]:
     """Covariance (n, 3, 3) in m² of each row's x, y, z, and a sentence on where it comes from.
-    `kind`: "rows", "axis" or "polar".  Polar noise lies along the line of sight and across it: Σ =
-    Σ_k s_k² e_k e_kᵀ over range, azimuth and elevation direction."""
+    `kind`: "rows", "axis" or "polar".  Polar noise lies along the line of sight and across it:
+    Σ = Σ_k s_k² e_k e_kᵀ over range, azimuth and elevation direction."""
     n, noise = len(table), tracker.noise
     if kind == "axis":
         need(isinstance(noise, CartesianNoise), "the cell has no [tracker] sigma_um")

@@ -279,9 +279,9 @@ class Reaching(BoundedSearch):
         return np.linalg.norm(r[:, :3], axis=1), 2 * np.arcsin(np.minimum(sine, 1.0))
 
     def nearest(self, q: Array, target: IntArray, near: Array) -> Array:
-        """Postures (R, n) that still reach the targets, moved towards `near` (n,): steps along (I −
-        J⁺J)(near − q), then back onto the target; a step counts only if the distance falls, so that
-        the result is never farther off than q."""
+        """Postures (R, n) that still reach the targets, moved towards `near` (n,): steps along
+        (I − J⁺J)(near − q), then back onto the target; a step counts only if the distance falls, so
+        that the result is never farther off than q."""
         q, rate = q.copy(), np.ones(len(q))
         for _ in range(NULL_STEPS):
             rows = np.flatnonzero(rate > 1e-3)
@@ -316,11 +316,9 @@ BLOCK = 10_000  # starts at a time, which bounds the memory
 
 @dataclass(frozen=True)
 class Postures:
-    """For T targets K postures each, reached ones first, the nearest to `near` of all first.
-
-    `q` (T, K, n) rad or m; `miss` (T, K) m and `turn` (T, K) rad: what is left of the errors in
-    position and rotation (zero where none is prescribed).
-    """
+    """For T targets K postures each, reached ones first, the nearest to `near` of all first.  `q`
+    (T, K, n) rad or m; `miss` (T, K) m and `turn` (T, K) rad: what is left of the errors in
+    position and rotation (zero where none is prescribed)."""
 
     q: Array
     miss: Array

@@ -74,12 +74,10 @@ class Tag:
 
 
 class XmlFile:
-    """The tags of an XML file, and the edits to make in its text.
-
-    `tags` in the order of the file, the root first; `end`: where the root's end tag starts.  `what`
-    it should be ("a URDF") stands in messages.  It nests no deeper than a robot does and declares
-    no entities, which may stand for more text than memory holds.
-    """
+    """The tags of an XML file, and the edits to make in its text.  `tags` in the order of the file,
+    the root first; `end`: where the root's end tag starts.  `what` it should be ("a URDF") stands
+    in messages.  It nests no deeper than a robot does and declares no entities, which may stand for
+    more text than memory holds."""
 
     def __init__(self, path: Path, data: bytes, what: str) -> None:
         start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
@@ -297,11 +295,9 @@ class FileJoint:
 @dataclass(frozen=True)
 class Tree:
     """Links, each with its own mass (0 where the file has none), and joints, in file order.
-
     `parts`: what links are called; `frames`: other names of places, fixed to a link.  Raises
     InputError at construction unless they form one tree: every link has at most one parent joint,
-    exactly one has none, and all hang on that root.
-    """
+    exactly one has none, and all hang on that root."""
 
     path: Path
     name: str

@@ -205,11 +205,9 @@ class Recent:
 
 class SymbolicArm:
     """h(inputs, X, θ) and F(inputs, X, θ) = θ − law(τ) of one row, as CasADi expressions.
-
     `parameters` are those of all active effects, in order; `arm.inputs` what a row must give.
-    `extra` effects with their places act besides those that the cell chooses.  `backend` is that
-    of its functions.
-    """
+    `extra` effects with their places act besides those that the cell chooses.  `backend` is that of
+    its functions."""
 
     def __init__(
         self,
