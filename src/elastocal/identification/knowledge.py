@@ -263,10 +263,19 @@ class Constraints:
         )
         equalities = (*self.equalities, *pinned)
         rows = [_row(e.terms, position, f"equality '{e}'")[0] for e in equalities]
+        matrices = list[Matrix]()
+        for stated in self.matrices:
+            n = len(stated.entries)
+            constant, slopes = np.zeros((n, n)), np.zeros((p, n, n))
+            for i, j in product(range(n), repeat=2):
+                where = f"matrix '{stated.label}', entry ({i + 1}, {j + 1})"
+                terms = combination(stated.entries[i][j])
+                slopes[:, i, j], constant[i, j] = _row(terms, position, where)
+            matrices.append(Matrix(stated.label, constant, slopes, np.ones(n)))
         return System(
             tuple(names), np.where(met, -np.inf, lower), np.where(met, np.inf, upper),
             np.array(rows).reshape(len(rows), p), np.array([e.value for e in equalities]),
-            tuple(map(str, equalities)), tuple(_matrix(m, position) for m in self.matrices),
+            tuple(map(str, equalities)), tuple(matrices),
         )  # fmt: skip
 
 
@@ -293,16 +302,6 @@ def _row(
     for name in filter(None, terms):
         row[_index(name, position, where)] += terms[name]
     return row, terms.get("", 0.0)
-
-
-def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
-    n = len(stated.entries)
-    constant, slopes = np.zeros((n, n)), np.zeros((len(position), n, n))
-    for i, j in product(range(n), repeat=2):
-        where = f"matrix '{stated.label}', entry ({i + 1}, {j + 1})"
-        terms = combination(stated.entries[i][j])
-        slopes[:, i, j], constant[i, j] = _row(terms, position, where)
-    return Matrix(stated.label, constant, slopes, np.ones(n))
 
 
 @dataclass(frozen=True)

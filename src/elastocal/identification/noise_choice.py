@@ -407,7 +407,6 @@ def estimate_noise(
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:
-    """The model with the smallest criterion; of many readings a sample chooses it."""
     some = readings.sample(max(CHOSEN_FROM, PER_PARAMETER * readings.n_parameters))
     if some is readings:
         return _Choice(readings).result(T)

@@ -630,7 +630,10 @@ class _Table:
         self, name: str, rows: IntArray | slice, edges: Array, holm: float | None
     ) -> GroupSummary:
         z = self.z[rows]
-        counts = np.histogram(z, edges)[0]
+        counts, below = np.histogram(z, edges)[0], special.ndtr(edges)
+        if self.dof is not None and self.dof > 1:  # of a ratio to s from these rows: Thompson's τ
+            share = np.minimum(edges**2 / self.dof, 1.0)
+            below = 0.5 + 0.5 * np.sign(edges) * special.betainc(0.5, (self.dof - 1) / 2, share)
         total, f = float(self.squared[rows].sum()), float(self.spare[rows].sum())
         p = float(_two_sided(total, f))
         unit = z / (np.abs(z).max() or 1.0)  # no power of it overflows
@@ -645,17 +648,10 @@ class _Table:
         held = held[np.isfinite(held)]
         points = GROUP_POINTS if holm is not None else 4 * GROUP_POINTS
         return GroupSummary(
-            name, len(z), counts, len(z) * np.diff(self._cdf(edges)), int(len(z) - counts.sum()),
+            name, len(z), counts, len(z) * np.diff(below), int(len(z) - counts.sum()),
             normal_scores(z, points), *shape, omnibus, total / f, f, p,
             p if holm is None else holm, float(np.mean(held**2)) if held.size else None,
         )  # fmt: skip
-
-    def _cdf(self, z: Array) -> Array:
-        """Distribution of z: normal, or of a ratio to s from the same rows (Thompson's τ)."""
-        if self.dof is None or self.dof <= 1:
-            return np.asarray(special.ndtr(z))
-        beta = special.betainc(0.5, (self.dof - 1) / 2, np.minimum(z**2 / self.dof, 1.0))
-        return np.asarray(0.5 + 0.5 * np.sign(z) * beta)
 
 
 def _two_sided(total: ArrayLike, f: ArrayLike) -> Array:

@@ -290,7 +290,6 @@ class JointFit:
 
 
 def fit_smooth(course: Course) -> MethodResult:
-    """All free parameters fitted together, from fits of the ordinary ones alone."""
     course.progress("fitting smooth functions")
     search = _Search(course)
     fit, noise, good = search.settled(~course.faulty)

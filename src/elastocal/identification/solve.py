@@ -176,7 +176,6 @@ WIDER = WORTH_A_COLUMN / FAR
 
 
 def residual_sigma(found: Fit, n_parameters: int) -> float:
-    """Standard deviation of a whitened row: √(rss / (rows − parameters))."""
     dof = max(len(found.whitened) - n_parameters, 1)
     return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
 
@@ -668,7 +667,6 @@ class MethodResult:
 
     @cached_property
     def ci95(self) -> Array:
-        """The 95 % intervals (fitted, 2)."""
         return self.spread.interval(self.solution.fit.x[self.solution.fit.columns])
 
     def told(

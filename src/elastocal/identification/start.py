@@ -446,7 +446,6 @@ def check_rows(model: Model, table: Measurements) -> None:
 
 
 def check_limits(model: Model, table: Measurements) -> None:
-    """Joint values within the limits of robot and cell; InputError names line, joint and remedy."""
     revolute = np.array([k == "revolute" for k in model.chain.kinds])
     wound = np.abs(table.q[:, revolute]) > 4 * np.pi
     if wound.any():

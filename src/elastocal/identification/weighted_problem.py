@@ -386,11 +386,8 @@ class Problem:
     def residual(self, x: Array) -> Array:
         """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
         residual = np.empty(len(self.observations.value))
-
-        def predicted(part: Part) -> None:
-            residual[part.rows] = self.residual_of(part, x)
-
-        list(self.each(predicted))
+        for rows, own in self.each(lambda part: (part.rows, self.residual_of(part, x))):
+            residual[rows] = own
         return residual
 
     def residual_of(self, part: Part, x: Array) -> Array:

@@ -121,8 +121,6 @@ class Scatter:
 
 @dataclass(frozen=True, eq=False)
 class Valued:
-    """A model and the values x (parameters,) to evaluate it at."""
-
     model: Model
     x: Array
 
@@ -537,7 +535,6 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
 
 
 def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array:
-    """The numbers of an option like "1,2,3"; InputError where they are others than `what`."""
     try:
         values = np.array([float(part) for part in text.split(",")])
     except ValueError:

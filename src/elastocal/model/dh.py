@@ -241,7 +241,6 @@ def _no_table(what: str, header: str) -> str | None:
 
 
 def _kind(table: RawTable, i: int) -> JointKind | None:
-    """None of a row that no joint moves."""
     kind, name = table.text(i, "type"), table.text(i, "joint")
     if not kind and name.lower() in NO_JOINTS:
         raise InputError(

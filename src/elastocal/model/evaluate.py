@@ -162,14 +162,12 @@ def checked(name: str, source: str) -> str:
 
 
 def chosen_backend(name: str | None = None) -> str:
-    """`name`, else ELASTOCAL_BACKEND, else "auto"."""
     if name is not None:
         return checked(name, "backend")
     return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")
 
 
 def evaluated_by(asked: str | None = None) -> str:
-    """What evaluates tables, for reports: engines and threads."""
     engines = "casadi for few rows, else " if chosen_backend(asked) == "auto" else ""
     threads = thread_count()
     return f"{engines}numpy ({threads} thread{'s' if threads > 1 else ''})"
@@ -207,7 +205,13 @@ class BatchFunction:
         return instructions(self._function)
 
     def __call__(self, *inputs: NDArray, chunk: int = CHUNK) -> list[NDArray]:
-        arrays, n = self._rows(inputs)
+        arrays = [np.asarray(a) for a in inputs]
+        arrays = [a if a.dtype.kind == "c" else a.astype(np.float64, copy=False) for a in arrays]
+        n = max((len(a) for a in arrays if a.ndim == 2), default=1)
+        shapes, sizes = [a.shape for a in arrays], self._sizes
+        fit = [s in ((n, size), (size,)) for s, size in zip(shapes, sizes, strict=False)]
+        if len(shapes) != len(sizes) or not all(fit):
+            raise ValueError(f"inputs of shapes {shapes}; it takes {sizes} per row")
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
         few = n <= self._most * -(-n // max(chunk, 1)) and dtype == np.float64
@@ -256,14 +260,3 @@ class BatchFunction:
                     outputs[a][b] = held[out]
             for f, output in zip(flat, outputs, strict=True):
                 f[block] = output.T
-
-    def _rows(self, inputs: Sequence[NDArray]) -> tuple[list[NDArray], int]:
-        arrays = [np.asarray(a) for a in inputs]
-        arrays = [a if a.dtype.kind == "c" else a.astype(np.float64, copy=False) for a in arrays]
-        n = max((len(a) for a in arrays if a.ndim == 2), default=1)
-        shapes = [a.shape for a in arrays]
-        per_row, common = [(n, size) for size in self._sizes], [(size,) for size in self._sizes]
-        fit = [s in pair for s, *pair in zip(shapes, per_row, common, strict=False)]
-        if len(shapes) != len(self._sizes) or not all(fit):
-            raise ValueError(f"inputs of shapes {shapes}; it takes {self._sizes} per row")
-        return arrays, n

@@ -103,7 +103,17 @@ class Model(ByValue):
         self._markers_stated = bool(cell.tool.markers)
         if not self._markers_stated:
             cell = _with_markers(cell, tuple(markers) or (DEFAULT_MARKER,))
-        _check_distances(cell)
+        # Distances are from somewhere: a place that is stated, or that a fitted effect finds.
+        base = cell.model.nominal.base_position
+        effects = (effect_of(choice.name) for choice in cell.model.effects)
+        placed = cell.tracker.anchor is not None or (base is not None and bool(base.any()))
+        found = placed or any(each.registered and each.at != "markers" for each in effects)
+        require(
+            cell.model.observe != "distance" or found,
+            f'{cell.source}: key model.observe = "distance" needs the place that distances are '
+            f'from; add "{DistanceSensor.name}" to [model] effects, which finds it, or state '
+            "[tracker] anchor_m = [x, y, z] in the data's frame",
+        )
         chain = load_chain(cell)
         self._assemble(chain, numbered(cell, chain), (), backend)
 
@@ -482,20 +492,6 @@ def check_equilibrium(table: Measurements, predicted: Array, remedy: str = NOMIN
 def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
     # All nominally at the flange's origin.
     return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
-
-
-def _check_distances(cell: Cell) -> None:
-    """Distances are from somewhere: a place that is stated, or that a fitted effect finds."""
-    base = cell.model.nominal.base_position
-    effects = (effect_of(c.name) for c in cell.model.effects)
-    placed = cell.tracker.anchor is not None or (base is not None and bool(base.any()))
-    found = placed or any(each.registered and each.at != "markers" for each in effects)
-    require(
-        cell.model.observe != "distance" or found,
-        f'{cell.source}: key model.observe = "distance" needs the place that distances are from; '
-        f'add "{DistanceSensor.name}" to [model] effects, which finds it, or state [tracker] '
-        "anchor_m = [x, y, z] in the data's frame",
-    )
 
 
 def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:

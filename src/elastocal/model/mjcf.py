@@ -115,7 +115,6 @@ class MjcfArm:
 
     @property
     def flange_in_body(self) -> Array:
-        """T_body_flange (4, 4)."""
         return self.tree.link_of(self.flange)[1]
 
     def weightless(self) -> list[int]:
@@ -280,7 +279,8 @@ def _joint(model: Any, j: int, parent: str, child: str, T: Array) -> FileJoint:
     lower, upper = map(float, model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf))
     return FileJoint(
         name, motion_of(model, j), parent, child, T @ before(model, j),
-        np.array(model.jnt_axis[j]), (lower, upper), rest=_ref(model, j), number=j,
+        np.array(model.jnt_axis[j]), (lower, upper),
+        rest=float(model.qpos0[model.jnt_qposadr[j]]), number=j,
     )  # fmt: skip
 
 
@@ -298,12 +298,9 @@ def joints_of(model: Any, body: int) -> list[int]:
 
 def before(model: Any, j: int) -> Array:
     """X (4, 4): the frame of joint j at zero in its body's, Trans(p) J(a, −r)."""
-    turned = rigid.moved(motion_of(model, j), model.jnt_axis[j], -_ref(model, j))
+    rest = float(model.qpos0[model.jnt_qposadr[j]])
+    turned = rigid.moved(motion_of(model, j), model.jnt_axis[j], -rest)
     return pose_at(model.jnt_pos[j]) @ turned
-
-
-def _ref(model: Any, j: int) -> float:
-    return float(model.qpos0[model.jnt_qposadr[j]])
 
 
 def transform(position: Sequence[float] | Array, quaternion: Sequence[float] | Array) -> Array:
@@ -370,13 +367,12 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
     fields = [g for g in spec.geoms if g.hfieldname]
     strip(spec, [*fields, *(g for b in stated for g in b.geoms if not g.hfieldname)])
     first: ValueError | None = None
-
-    def is_mesh(file: Path) -> bool:
-        return file.is_file() and file.stat().st_size <= MOST_MESH_BYTES
-
     used, folder = {g.meshname for g in spec.geoms}, path.parent / (spec.compiler.meshdir or "")
-    missing = {m.name: m.file for m in spec.meshes
-               if m.name in used and m.file and not is_mesh(folder / m.file)}  # fmt: skip
+    wanted = {m.name: m.file for m in spec.meshes if m.name in used and m.file}
+    missing = {
+        name: file for name, file in wanted.items()
+        if not (at := folder / file).is_file() or at.stat().st_size > MOST_MESH_BYTES
+    }  # fmt: skip
     for lost in (missing, None):  # those, then all
         try:  # a spec that could not be compiled says so again at whatever is asked of it
             geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
@@ -501,7 +497,6 @@ class _Model:
         return _count(tag) * (inside + sum(self._named(file, tag)))
 
     def _named(self, file: XmlFile, tag: Tag) -> Iterator[float]:
-        """Weights of the models that it names."""
         name = tag.get("file")
         if tag.name == "attach":
             models = {one.get("name") or Path(one.get("file")).stem: one.get("file")

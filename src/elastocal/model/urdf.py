@@ -234,7 +234,6 @@ def _around(data: bytes) -> str:
 
 
 def _undeclared(data: bytes) -> str:
-    """What to say of bytes that are no UTF-8 in a file that declares no encoding, else ""."""
     try:
         data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -601,7 +600,6 @@ def tree_of(file: XmlFile) -> Tree:
 
 
 def xacro_left(path: Path, what: str) -> str:
-    """The message that `what` of the file shows that it is still to be expanded."""
     plain = path.name.removesuffix(".xacro")
     plain = plain if plain.endswith(".urdf") and plain != path.name else "expanded.urdf"
     return (

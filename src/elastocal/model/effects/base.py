@@ -593,9 +593,7 @@ class Entry(Effect):
 class JointMotion(Entry):
     """q_i ← q_i + u, in rad (m for a prismatic joint)."""
 
-    name = "joint_motion"
-    stage: ClassVar[Stage] = "transmission"
-    at = "joints"
+    name, stage, at = "joint_motion", "transmission", "joints"
     units = ("rad",)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
@@ -605,9 +603,7 @@ class JointMotion(Entry):
 class LinkLength(Entry):
     """Lengths of link i ← (1 + u) times themselves: its distal frame moves away from its own."""
 
-    name = "link_length"
-    stage: ClassVar[Stage] = "geometry"
-    at = "links"
+    name, stage, at = "link_length", "geometry", "links"
     units = ("1",)
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
@@ -620,9 +616,7 @@ class LinkLength(Entry):
 class LinkFrame(Entry):
     """T_link ← T_link · Trans(u₁, u₂, u₃) · exp([u₄, u₅, u₆]×) at the link's distal end."""
 
-    name = "link_frame"
-    stage: ClassVar[Stage] = "geometry"
-    at = "links"
+    name, stage, at = "link_frame", "geometry", "links"
     units = MOVE
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
@@ -636,9 +630,7 @@ class BaseMotion(Entry):
     Both along the axes of the tracker frame.
     """
 
-    name = "base_motion"
-    stage: ClassVar[Stage] = "tracker"
-    at = "base"
+    name, stage, at = "base_motion", "tracker", "base"
     units = MOVE
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
@@ -650,9 +642,7 @@ class BaseMotion(Entry):
 class MarkerMotion(Entry):
     """One marker moves by u (3,) in the flange frame."""
 
-    name = "marker_motion"
-    stage: ClassVar[Stage] = "tool"
-    at = "markers"
+    name, stage, at = "marker_motion", "tool", "markers"
     units = ("m", "m", "m")
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
@@ -662,9 +652,7 @@ class MarkerMotion(Entry):
 class LoadPointMotion(Entry):
     """The point where the load hangs moves by u (3,) in the flange frame."""
 
-    name = "load_point_motion"
-    stage: ClassVar[Stage] = "load"
-    at = "load"
+    name, stage, at = "load_point_motion", "load", "load"
     units = ("m", "m", "m")
 
     def enter(self, arm: Arm, place: str, u: ca.SX) -> None:

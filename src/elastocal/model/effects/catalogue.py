@@ -52,7 +52,6 @@ UNKNOWN = Effect()  # what is known of an effect that the catalogue does not hav
 
 
 def effect_of(name: str) -> Effect:
-    """The effect of that name for its traits; one with their defaults where there is none."""
     return CATALOGUE.get(name, UNKNOWN)
 
 
@@ -142,7 +141,6 @@ def check_settings(chain: Chain, cell: Cell) -> None:
 def sized_parameters(
     effect: Effect, place: str, chain: Chain, cell: Cell
 ) -> tuple[ParameterSpec, ...]:
-    """The effect's parameters at a place, of the typical sizes that the cell states."""
     stated = cell.model.nominal.sizes.get(place, {})
     return tuple(
         replace(p, typical=stated[p.key]) if p.key in stated and not p.shrunk else p
@@ -350,7 +348,6 @@ class SymbolicArm:
 
     @cached_property
     def regressor(self) -> Total:
-        """The reading h of every row and B = dh/dX."""
         return Total(self, self.reading, self.p)
 
     def settled(self, y: ca.SX) -> ca.SX:

@@ -48,9 +48,7 @@ class BaseFrame(Effect):
     regular up to a full turn, so the tracker may be turned any way.
     """
 
-    name = "base_frame"
-    stage = "tracker"
-    at = "base"
+    name, stage, at = "base_frame", "tracker", "base"
     registered = True
     rank = STATION
     formats = ("rigid", "elastic")
@@ -82,9 +80,7 @@ class LinkGeometry(Effect):
     (Stone 1987; Hollerbach, Khalil and Gautier 2008).
     """
 
-    name = "link_geometry"
-    stage = "geometry"
-    at = "links"
+    name, stage, at = "link_geometry", "geometry", "links"
     rank = LINK
     formats = ("rigid", "elastic")
     unknowns = (
@@ -102,9 +98,7 @@ class MarkerPosition(Effect):
     For distances this is the cable's or ball-bar's attachment point.
     """
 
-    name = "marker_position"
-    stage = "tool"
-    at = "markers"
+    name, stage, at = "marker_position", "tool", "markers"
     registered = True
     rank = MARKER
     formats = ("rigid", "elastic")
@@ -122,9 +116,7 @@ class MarkerPosition(Effect):
 class MarkerOrientation(Effect):
     """R_flange_target = exp([rx, ry, rz]×), rotation vector in rad; nominal: as the flange."""
 
-    name = "marker_orientation"
-    stage = "tool"
-    at = "markers"
+    name, stage, at = "marker_orientation", "tool", "markers"
     registered = True
     rank = MARKER
     formats = ("rigid", "elastic")
@@ -144,8 +136,7 @@ class DistanceSensor(Effect):
     or given).
     """
 
-    name = "distance_sensor"
-    stage = "tracker"
+    name, stage = "distance_sensor", "tracker"
     seen_in = "distance"
     at = "tracker"
     registered = True
@@ -183,8 +174,7 @@ class TrackerDistortion(Effect):
     network measurement".
     """
 
-    name = "tracker_distortion"
-    stage = "tracker"
+    name, stage = "tracker_distortion", "tracker"
     remedy = (
         "measure a reference length (scale bar) or set the tracker up in a second place: that "
         "tells its errors from the arm's"
@@ -278,8 +268,7 @@ class JointDrift(WarmUp):
     warm leave a drift that a constant offset takes up.
     """
 
-    name = "joint_drift"
-    stage = "transmission"
+    name, stage = "joint_drift", "transmission"
     formats = ("rigid", "elastic")
     entry = JointMotion()
     unknowns = (ParameterSpec("drift", MOTION, 0.0, 1e-4),)
@@ -292,8 +281,7 @@ class EncoderJump(Jump):
     referenced anew in the middle of a campaign.
     """
 
-    name = "encoder_jump"
-    stage = "transmission"
+    name, stage = "encoder_jump", "transmission"
     constants = (JUMP_TIME,)
     formats = ("rigid", "elastic")
     entry = JointMotion()
@@ -308,8 +296,7 @@ class BaseDrift(WarmUp):
     fixed reflectors beside the arm can tell the two apart.
     """
 
-    name = "base_drift"
-    stage = "tracker"
+    name, stage = "base_drift", "tracker"
     remedy = MEASURE_MONUMENTS
     entry = BaseMotion()
     unknowns = pose_change("drift", 5e-5)
@@ -323,9 +310,7 @@ class FrameJump(Jump):
     after T moves rigidly.
     """
 
-    name = "frame_jump"
-    stage = "tracker"
-    at = "tracker"
+    name, stage, at = "frame_jump", "tracker", "tracker"
     constants = (JUMP_TIME,)
     remedy = MEASURE_MONUMENTS
     entry = BaseMotion()
@@ -341,8 +326,7 @@ class MarkerSlip(Jump):
     In m.  A reflector that was taken off its magnetic nest and put back, glue that gives way.
     """
 
-    name = "marker_slip"
-    stage = "tool"
+    name, stage = "marker_slip", "tool"
     constants = (replace(JUMP_TIME, key="slip_time_s"),)
     entry = MarkerMotion()
     unknowns = tuple(ParameterSpec(f"slip_{k}", "m", 0.0, 1.5e-4) for k in "xyz")
@@ -364,8 +348,7 @@ class ThermalExpansion(WarmUp):
     temperature.  Motors and gears heat the castings: 8 K make 0.1 mm per metre of steel.
     """
 
-    name = "thermal_expansion"
-    stage = "geometry"
+    name, stage = "thermal_expansion", "geometry"
     formats = ("rigid", "elastic")
     entry = LinkLength()
 
@@ -400,9 +383,7 @@ class ThermalExpansion(WarmUp):
 class JointOffset(Effect):
     """δq = a: the joint's zero differs from nominal by a (rad, or m for a prismatic joint)."""
 
-    name = "joint_offset"
-    stage = "transmission"
-    at = "joints"
+    name, stage, at = "joint_offset", "transmission", "joints"
     rank = OFFSET
     formats = ("rigid", "elastic")
     unknowns = (ParameterSpec("offset", MOTION, 0.0, 1e-3),)
@@ -414,8 +395,7 @@ class JointOffset(Effect):
 class EncoderScale(DrivenEffect):
     """δq = a·q with the commanded joint value q; a is dimensionless."""
 
-    name = "encoder_scale"
-    stage = "transmission"
+    name, stage = "encoder_scale", "transmission"
     entry = JointMotion()
     unknowns = (ParameterSpec("encoder_scale", "1", 0.0, 3e-4),)
 
@@ -513,9 +493,7 @@ class GearSpectrum(DrivenEffect):
     of the angles that the order was estimated from.
     """
 
-    name = "gear_spectrum"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "gear_spectrum", "transmission", "turning joints"
     together = True
     family = "angle"
     sized_by = "spectrum_size_rad"
@@ -576,8 +554,7 @@ class WristCoupling(DrivenEffect):
     ratios.  a, b and c (dimensionless) are the errors of those ratios.
     """
 
-    name = "wrist_coupling"
-    stage = "transmission"
+    name, stage = "wrist_coupling", "transmission"
     entry = JointMotion()
     unknowns = tuple(ParameterSpec(f"coupling_{k}", "1", 0.0, 2e-4) for k in "abc")
 
@@ -627,9 +604,7 @@ class Backlash(TorqueEffect):
     model has; where the links' weights decide the side, switch `link_gravity` on.
     """
 
-    name = "backlash"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "backlash", "transmission", "turning joints"
     unknowns = (ParameterSpec("backlash", "rad", 0.0, 2e-4, lower=0.0),)
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
@@ -658,9 +633,7 @@ class Hysteresis(Effect):
     smooth: √(τ² + τ_s²) − τ_s with τ_s a thousandth of the joint's rated torque.
     """
 
-    name = "hysteresis"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "hysteresis", "transmission", "turning joints"
     needs = ("approach",)
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
@@ -702,9 +675,7 @@ class MoveLag(DrivenEffect):
     has an error c of its own.
     """
 
-    name = "move_lag"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "move_lag", "transmission", "turning joints"
     family = "move"
     entry = JointMotion()
     unknowns = (
@@ -729,9 +700,7 @@ class MoveHysteresis(DrivenEffect):
     Until the joint has moved it has an error of its own.
     """
 
-    name = "move_hysteresis"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "move_hysteresis", "transmission", "turning joints"
     unless = "approach"
     family = "move"
     entry = JointMotion()

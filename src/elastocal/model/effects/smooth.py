@@ -179,9 +179,7 @@ class JointCurve(SmoothEffect):
     diagnosis estimates them.
     """
 
-    name = "joint_curve"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "joint_curve", "transmission", "turning joints"
     family = "angle"
     sized_by = "curve_size_rad"
     entry = JointMotion()

@@ -44,9 +44,7 @@ class Payload(Effect):
     point moves with the arm: V = −f·p_load(θ).  No parameters.
     """
 
-    name = "payload"
-    stage = "load"
-    at = "load"
+    name, stage, at = "payload", "load", "load"
     formats = ("elastic",)
 
     def acts_unasked(self, cell: Cell) -> bool:
@@ -66,9 +64,7 @@ class PayloadError(Effect):
     load's potential −f·p(θ) what is missing: V = −f·(s p + (1 + s) R d), R the flange's rotation.
     """
 
-    name = "payload_error"
-    stage = "load"
-    at = "load"
+    name, stage, at = "payload_error", "load", "load"
     formats = ("elastic",)
     remedy = "weigh the load and measure where it hangs"
     needs = ("load",)
@@ -98,9 +94,7 @@ class LinkGravity(Effect):
     Masses and centres of mass are the URDF's (or the DH robot's table of masses).
     """
 
-    name = "link_gravity"
-    stage = "load"
-    at = "links"
+    name, stage, at = "link_gravity", "load", "links"
     formats = ("elastic",)
 
     def acts_unasked(self, cell: Cell) -> bool:
@@ -135,8 +129,7 @@ class LinkMassError(Effect):
     whose mass the robot's file gives.
     """
 
-    name = "link_mass_error"
-    stage = "load"
+    name, stage = "link_mass_error", "load"
     formats = ("elastic",)
     remedy = RECORD_TORQUES
 
@@ -216,8 +209,7 @@ class GravityCompensator(Effect):
     length far from s, below zero where it pulls) anchored anywhere.
     """
 
-    name = "gravity_compensator"
-    stage = "load"
+    name, stage = "gravity_compensator", "load"
     rank = STIFFNESS
     formats = ("elastic",)
     remedy = RECORD_TORQUES
@@ -348,9 +340,7 @@ class GravitySag(DrivenEffect):
     `link_weights` says more with less, and so does `link_gravity` where masses are.
     """
 
-    name = "gravity_sag"
-    stage = "transmission"
-    at = "turning joints"
+    name, stage, at = "gravity_sag", "transmission", "turning joints"
     constants = (Setting("sag_size_rad", "range", 2e-4, 1e-12, 1.0),)
     together = True
     family = "gravity"
@@ -399,9 +389,7 @@ class LinkWeights(Effect):
     to the link's end, half of the link and all that follows; across it, the link a housing away.
     """
 
-    name = "link_weights"
-    stage = "load"
-    at = "arm"
+    name, stage, at = "link_weights", "load", "arm"
     together = True
     family = "gravity"
     sized_by = "weights_kg_per_m"
@@ -495,9 +483,7 @@ class JointCompliance(TorqueEffect):
     one independent value k_ji per level, as in Klimchik et al. 2013, section 5.
     """
 
-    name = "joint_compliance"
-    stage = "compliance"
-    at = "joints"
+    name, stage, at = "joint_compliance", "compliance", "joints"
     elastic = True
     sized_by_value = True
     rank = STIFFNESS
@@ -586,9 +572,7 @@ class JointHardening(TorqueEffect):
     Typical: 20 % of the linear deflection at the rated torque.
     """
 
-    name = "joint_hardening"
-    stage = "compliance"
-    at = "turning joints"
+    name, stage, at = "joint_hardening", "compliance", "turning joints"
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = nominal_compliance(chain, cell)
@@ -639,8 +623,7 @@ class OffAxisCompliance(TiltingEffect):
     proximal link (the bearing's housing).  Typical: 5 to 20 % of the drive's compliance.
     """
 
-    name = "off_axis_compliance"
-    at = "joints"
+    name, at = "off_axis_compliance", "joints"
     sized_by_value = True
     rank = STIFFNESS
     prefix = "off_axis_compliance_"
@@ -660,8 +643,7 @@ class LinkBending(TiltingEffect):
     joint that moves the link.
     """
 
-    name = "link_bending"
-    at = "links"
+    name, at = "link_bending", "links"
     share = 0.15
 
     def axes(self, place: str, chain: Chain) -> dict[str, Array]:
@@ -682,8 +664,7 @@ class BaseCompliance(TiltingEffect):
     Typical: 10 % of the compliance of joint 1.
     """
 
-    name = "base_compliance"
-    at = "base"
+    name, at = "base_compliance", "base"
     sized_by_value = True
     rank = STIFFNESS
     prefix = "tilt_compliance_"
@@ -723,9 +704,7 @@ class TorqueCoupling(TorqueDriven):
     prior size `coupling_rad_per_Nm` of each k_i.
     """
 
-    name = "torque_coupling"
-    stage = "transmission"
-    at = "joints"
+    name, stage, at = "torque_coupling", "transmission", "joints"
     constants = (Setting("coupling_rad_per_Nm", "range", 3e-7, 1e-15, 1.0),)
     sized_by = "coupling_rad_per_Nm"
     prefix = "coupling"
@@ -743,8 +722,7 @@ class TorqueTilt(TorqueDriven):
     housing, and the link behind it.  Setting: the prior size `tilt_rad_per_Nm` of each k.
     """
 
-    name = "torque_tilt"
-    stage = "geometry"
+    name, stage = "torque_tilt", "geometry"
     constants = (Setting("tilt_rad_per_Nm", "range", 3e-7, 1e-15, 1.0),)
     sized_by = "tilt_rad_per_Nm"
     prefix = "tilt"
