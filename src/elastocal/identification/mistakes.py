@@ -305,8 +305,16 @@ def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
     shifts, flange = np.arange(-most, most + 1), nominal_flanges(model.chain, table.q)
     to = rows[:, None] + shifts
     beyond, to = (to < 0) | (to >= len(rows)), np.clip(to, 0, len(rows) - 1)
-    nearest = _blocks(table, flange, visit, shifts)
-    placed = (Registration.of(model, _moved(table, *block)) for block in nearest)
+    windows, last = [], visits - BLOCK
+    for first in np.unique(np.linspace(0, last, min(WINDOWS, last + 1)).astype(int)):
+        some = np.flatnonzero((visit >= first) & (visit < first + BLOCK))
+        own = shifts[(some[0] + shifts >= 0) & (some[-1] + shifts < len(table))]
+        at = some + own[:, None]
+        fits = LinearFits(flange[at], np.asarray(table.position)[some], table.marker[at])
+        windows += [(left > NEAR / 2, abs(s), left, first, some, int(s))
+                    for s, left in zip(own.tolist(), fits.left.tolist(), strict=True)]  # fmt: skip
+    windows.sort(key=lambda one: one[:4])
+    placed = (Registration.of(model, _moved(table, *one[4:])) for one in windows[:PLACED])
     found = next((one for one in placed if one.error <= NEAR / 2), None)
     if found is None:
         return
@@ -331,22 +339,6 @@ def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measur
     return replace(
         table.take(rows), q=table.q[rows + shift], marker=table.marker[rows + shift]
     )  # fmt: skip
-
-
-def _blocks(
-    table: Measurements, flange: Array, visit: IntArray, shifts: IntArray
-) -> list[tuple[IntArray, int]]:
-    found = []
-    last = int(visit[-1]) + 1 - BLOCK
-    for first in np.unique(np.linspace(0, last, min(WINDOWS, last + 1)).astype(int)):
-        rows = np.flatnonzero((visit >= first) & (visit < first + BLOCK))
-        own = shifts[(rows[0] + shifts >= 0) & (rows[-1] + shifts < len(table))]
-        at = rows + own[:, None]
-        fits = LinearFits(flange[at], np.asarray(table.position)[rows], table.marker[at])
-        found += [(left > NEAR / 2, abs(s), left, first, rows, int(s))
-                  for s, left in zip(own.tolist(), fits.left.tolist(), strict=True)]  # fmt: skip
-    found.sort(key=lambda one: one[:4])
-    return [(rows, s) for *_, rows, s in found[:PLACED]]
 
 
 def _path(cost: Array) -> IntArray:
@@ -532,7 +524,15 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
         before, marker = marker, np.where(other, nearest, table.marker)
         if np.array_equal(marker, before):
             break
-    meant = _as_stated(model.cell.tool, names, found.markers)[marker]
+    best, places, known = np.arange(len(names)), found.markers, model.cell.tool.markers
+    pairs = list(combinations([m for m, name in enumerate(names) if name in known], 2))
+    level = special.fdtri(6, 6, 1 - FALSE_ALARM / max(len(pairs), 1))
+    for a, b in pairs:
+        off = places[[a, b]] - np.array([known[names[m]] for m in (a, b)])
+        crossed = places[[a, b]] - np.array([known[names[m]] for m in (b, a)])
+        if (off**2).sum() > level * (crossed**2).sum():
+            best[[a, b]] = best[[b, a]]
+    meant = best[marker]
     rows = np.flatnonzero(meant != table.marker)
     if not len(rows):
         return None
@@ -552,20 +552,6 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
             "Exchange the names in these rows."
         )
     return Exchanged(rows, markers, words)
-
-
-def _as_stated(tool: Tool, names: tuple[str, ...], places: Array) -> IntArray:
-    """Which marker (M,) each is by the places (M, 3) that the cell states, where two of them are
-    exchanged; else itself."""
-    stated = [m for m, name in enumerate(names) if name in tool.markers]
-    best, pairs = np.arange(len(names)), list(combinations(stated, 2))
-    level = special.fdtri(6, 6, 1 - FALSE_ALARM / max(len(pairs), 1))
-    for a, b in pairs:
-        off = places[[a, b]] - np.array([tool.markers[names[m]] for m in (a, b)])
-        crossed = places[[a, b]] - np.array([tool.markers[names[m]] for m in (b, a)])
-        if (off**2).sum() > level * (crossed**2).sum():
-            best[[a, b]] = best[[b, a]]
-    return best
 
 
 # Loads in another unit.

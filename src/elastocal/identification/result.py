@@ -754,13 +754,9 @@ class Calibration(scrutiny.FoundFit, Result):
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:
-    told = vars(e) | {"identifiable": e.identifiable, "note": e.note or _endless(e.ci95)}
+    ends = zip(("lower", "upper"), e.ci95 or (0.0, 0.0), strict=True)
+    endless = " or ".join(name for name, v in ends if not np.isfinite(v))
+    note = e.note or (f"the data set no {endless} limit to it" if endless else "")
+    told = vars(e) | {"identifiable": e.identifiable, "note": note}
     limits = told.pop("limits")
     return dict(plain(told if limits is None else told | {"limits95": limits}))
-
-
-def _endless(ci95: tuple[float, float] | None) -> str:
-    if ci95 is None:
-        return ""
-    ends = [name for name, v in zip(("lower", "upper"), ci95, strict=True) if not np.isfinite(v)]
-    return f"the data set no {' or '.join(ends)} limit to it" if ends else ""

@@ -218,9 +218,9 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     model, free, stage = fit.model, ~fit.model.shrunk, fit.stage
     fitted = np.isin(np.arange(len(stage)), fit.columns) & free
     observed, weights, size = fit.observations, fit.weights, fit.observations.size
-    white, typical, at = weights.apply(fit.B), model.sizes(fit.B), np.flatnonzero(free)
-    parameters = tuple(model.parameters[c] for c in at)
-    apart = at[reduce(white[:, at], typical[at], parameters, 1.0, 0.0).kept]
+    white, typical, usual = weights.apply(fit.B), model.sizes(fit.B), np.flatnonzero(free)
+    parameters = tuple(model.parameters[c] for c in usual)
+    apart = usual[reduce(white[:, usual], typical[usual], parameters, 1.0, 0.0).kept]
     # As many columns as rows fit anything.
     every = np.isin(np.arange(len(stage)), apart) if len(apart) < len(white) else fitted
     named = {
@@ -246,8 +246,14 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
         left, alone = _refitted(fit, y, np.flatnonzero(own), weights)
         plain.append(rms_3d(left, size))
         held.append((alone.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
+        # log density off the span of what is placed, the others varying by their typical sizes.
         placed, others = own & (stage == 0), own & (stage > 0)
-        likelihood.append(_restricted(white, target, placed, others, typical, s2))
+        A, off = white[:, others] * typical[others], target
+        if placed.any():
+            basis = linalg.qr(white[:, placed], mode="economic")[0]
+            A, off = A - basis @ (basis.T @ A), off - basis @ (basis.T @ off)
+        at = Standardised.of(A.T @ A, A.T @ off, np.full(A.shape[1], 1 / np.sqrt(s2)))
+        likelihood.append(-0.5 * (at.log_det + (float(off @ off) - at.explained) / s2))
     _, code = np.unique(observed.configuration, return_inverse=True)
     squares = np.array([np.bincount(code, h) for h in held])
     drawn = _drawn_rms(squares, np.bincount(code), np.random.default_rng(0))
@@ -270,18 +276,6 @@ def _refitted(fit: FoundFit, y: Array, columns: IntArray, weights: Weights) -> t
     B, observed = fit.B[:, columns], fit.observations
     left = y - B @ least_norm(weights.apply(B), weights.apply(y))
     return left, held_out_residual(B, left, weights, observed.configuration, observed.size)
-
-
-def _restricted(
-    white: Array, y: Array, placed: BoolArray, others: BoolArray, sizes: Array, s2: float
-) -> float:
-    """log density of y off the span of the `placed` columns, the `others` varying by `sizes`."""
-    A, y = white[:, others] * sizes[others], y.copy()
-    if placed.any():
-        basis = linalg.qr(white[:, placed], mode="economic")[0]
-        A, y = A - basis @ (basis.T @ A), y - basis @ (basis.T @ y)
-    found = Standardised.of(A.T @ A, A.T @ y, np.full(A.shape[1], 1 / np.sqrt(s2)))
-    return -0.5 * (found.log_det + (float(y @ y) - found.explained) / s2)
 
 
 def stage_of(effect: str) -> int:

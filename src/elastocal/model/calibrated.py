@@ -544,16 +544,6 @@ def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array
     return values
 
 
-def share_of_levels(angle: Array, levels: Array) -> Array:
-    """Shares (n, levels) of each level's compliance at joint values `angle` (n,), sum 1: linear
-    between neighbouring levels, the outermost one's beyond them.  A level stands for a gravity
-    compensator's effect, which is a smooth function of the joint (Klimchik et al. 2013, section
-    5)."""
-    order = np.argsort(levels)
-    hats = (np.interp(angle, levels[order], hat[order]) for hat in np.eye(len(levels)))
-    return np.column_stack(list(hats))
-
-
 class CalibratedTool:
     """p(q) and R(q) of the tool's point, at `point` on the tool of the calibrated arm, in the
     data's frame, at the static equilibrium.  What the instrument itself distorts
@@ -602,11 +592,19 @@ class CalibratedTool:
 
     def _at(self, rows: list[NDArray], q: Array) -> list[NDArray]:
         found = dict(zip(self._symbolic.arm.inputs, rows, strict=True)) | {"q": q}
-        for joint, levels in self.cell.model.compliance_levels.items():
+        # A level stands for a gravity compensator's effect, which is a smooth function of the joint
+        # (Klimchik et al. 2013, section 5): linear between neighbouring levels, and beyond them the
+        # outermost one's.
+        for joint, stated in self.cell.model.compliance_levels.items():
             if f"level:{joint}" in found:
-                found[f"level:{joint}"] = share_of_levels(
-                    q[:, joint_index(joint)], np.array(levels)
+                angle, levels, order = (
+                    q[:, joint_index(joint)],
+                    np.array(stated),
+                    np.argsort(stated),
                 )
+                hats = np.eye(len(levels))[:, order]
+                shares = [np.interp(angle, levels[order], hat) for hat in hats]
+                found[f"level:{joint}"] = np.column_stack(shares)
         return list(found.values())
 
     def poses(self, rows: list[NDArray], q: Array) -> tuple[Array, Array]:

@@ -24,7 +24,7 @@ from elastocal.messages import InputError, check_known, require
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 from elastocal.model.effects import geometry, smooth, statics
-from elastocal.model.effects.base import Arm, Effect, Parameter, ParameterSpec, check, row_inputs
+from elastocal.model.effects.base import Arm, Effect, Parameter, check, row_inputs
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.observations import observe
 from elastocal.units import Array
@@ -138,16 +138,6 @@ def check_settings(chain: Chain, cell: Cell) -> None:
                 _check_known(f"nominal.{table}", f"{what} of {place}", key, known[place], cell)
 
 
-def sized_parameters(
-    effect: Effect, place: str, chain: Chain, cell: Cell
-) -> tuple[ParameterSpec, ...]:
-    stated = cell.model.nominal.sizes.get(place, {})
-    return tuple(
-        replace(p, typical=stated[p.key]) if p.key in stated and not p.shrunk else p
-        for p in effect.parameters(place, chain, cell)
-    )
-
-
 def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
     """Values of the effect's settings at a place: the cell's, else their defaults.  InputError
     where one has neither, or lies outside its range."""
@@ -220,7 +210,10 @@ class SymbolicArm:
         bound, known = [], dict[str, Parameter]()
         for effect, place in chosen:
             own = set_constants(effect, place, chain, cell)
-            for spec in sized_parameters(effect, place, chain, cell):
+            sizes = cell.model.nominal.sizes.get(place, {})
+            for spec in effect.parameters(place, chain, cell):
+                if spec.key in sizes and not spec.shrunk:
+                    spec = replace(spec, typical=sizes[spec.key])
                 own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
                 symbols.append(own[spec.key])
                 name = f"{place}.{spec.key}"
