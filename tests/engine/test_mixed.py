@@ -51,7 +51,7 @@ def test_likelihood_slope_and_information_are_those_of_all_rows(table, name, sha
     scale = np.sqrt(np.diag(whole.information))
     shape = np.outer(scale, scale)
     np.testing.assert_allclose(at.information / shape, whole.information / shape, atol=1e-8)
-    assert at.told.all()
+    assert (np.diag(at.information) > 1e-9 * at.known).all()
     W = np.linalg.inv(whole.information + np.diag(scale**2))
     found, dof = at.kenward_roger(W, np.eye(len(at.Phi)))
     covariance, theirs = whole.kenward_roger(W)
@@ -173,7 +173,7 @@ def test_shrunk_variances_are_nearer_the_truth_and_their_likelihood_is_an_integr
     found = MixedFit(noisy.model(LogPrior(mean, precision)), np.exp(mean))
     nodes, weights = np.polynomial.hermite_e.hermegauss(60)
     at = [np.exp(mean + np.sqrt(0.5) * z * (np.arange(12) == 0)) for z in nodes]
-    values = np.array([noisy.model().state(theta).log_likelihood for theta in at])
+    values = np.array([-0.5 * noisy.model().state(theta).value for theta in at])
     integral = values.max() + np.log(weights @ np.exp(values - values.max()) / np.sqrt(2 * np.pi))
     # Laplace with the expected curvature of 11 degrees of freedom is off by a few hundredths.
     assert found.log_likelihood == pytest.approx(integral, abs=0.1)

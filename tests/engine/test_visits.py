@@ -71,7 +71,7 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
     assert np.allclose(found.x, x, atol=1e-6 * np.sqrt(np.diag(Phi)).min())
     p = len(x)
     T = orthogonal(B)[1]
-    assert np.allclose(T @ found.fit.state.Phi[:p, :p] @ T.T, Phi, rtol=1e-6)
+    assert np.allclose(T @ found.fit.expected.Phi[:p, :p] @ T.T, Phi, rtol=1e-6)
     # No other variances are likelier.
     assert np.abs(found.fit.model.objective(np.log(found.fit.theta))[1]).max() < 1e-2
 

@@ -262,8 +262,7 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
     shared = {s.name: s.sigma for s in sizes if s.sigma is not None}
     if test is not None:
         # These hold where the readings of a configuration are correlated.
-        clustered = noise.interval_kind.lower().startswith("cr")
-        counted = "the intervals" if clustered else "nothing"
+        counted = "the intervals" if noise.interval_kind.lower().startswith("cr") else "nothing"
         if shared or noise.drift is not None:
             counted = "the noise model"
         say, kind, doing = _good, "repeats_agree", ""

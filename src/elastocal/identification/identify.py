@@ -243,8 +243,7 @@ def summarise(
     noise, parts = noise_of(found, sigma)
     left_out = {int(c) for s in found.smooth if not s.scale for c in s.group.columns.ravel()}
     own_sizes, unsure = of_this_arm(solution, found.spread.std)
-    sized = replace(found, solution=own_sizes)
-    estimates, combinations = _estimates(sized, left_out, unsure)
+    estimates, combinations = _estimates(replace(found, solution=own_sizes), left_out, unsure)
     determined = tuple(model.names[c] for c in kept)
     rho, told = found.spread.correlation, ~model.shrunk[kept]
     i, j = np.nonzero(np.triu(np.abs(rho) > CORRELATED, k=1) & np.outer(told, told))
@@ -378,8 +377,7 @@ def _estimates(
         found[i] = estimate(i, limits=limits, note=_not_stated(model.parameters[i], x[i], limits))
     for i in range(len(model.parameters)):
         if i not in found:
-            zero = i in left_out
-            found[i] = estimate(i, note=NOT_SHOWN if zero else "fixed by the user")
+            found[i] = estimate(i, note=NOT_SHOWN if (i in left_out) else "fixed by the user")
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 
@@ -458,8 +456,7 @@ def _adapted(
         if fewer is not None:
             solution, noise, now, readings = fewer
     assert noise is not None
-    final = readings.take(now)
-    return solution, not_knowing_times(estimate_noise(final, like=noise)), now
+    return solution, not_knowing_times(estimate_noise(readings.take(now), like=noise)), now
 
 
 def refined(
@@ -666,8 +663,7 @@ def _held_out_rms(solution: Solution, judge: Solution) -> float:
         left_out = np.array([block.get(c, -1) for c in observed.configuration.tolist()])
         weights = replace(solution.problem.weights, together=left_out)
         held = held_out_residual(fit.B, fit.residual, weights, left_out, observed.size)
-    known = held[np.isfinite(held)]
-    return float(np.sqrt(np.mean(known**2)))
+    return float(np.sqrt(np.mean(held[np.isfinite(held)] ** 2)))
 
 
 def _published(course: Course, start: Solution) -> MethodResult:
@@ -678,8 +674,7 @@ def _published(course: Course, start: Solution) -> MethodResult:
     observed, fit, options = start.problem.observations, start.fit, course.options
     method, good, group = options.resolved, ~course.faulty, None
     if method == "eq14":
-        own = observed.configuration[:, None] * observed.size + np.arange(observed.size)
-        group = own.ravel()
+        group = (observed.configuration[:, None] * observed.size + np.arange(observed.size)).ravel()
     size = start.problem.sizes[fit.columns]
     with said_of(f"{observed.table.source}: {option('method', method)}"):
         last = published.eq14(fit.B * size, fit.residual, group)[-1]

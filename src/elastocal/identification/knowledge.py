@@ -405,8 +405,7 @@ def share_of_prior(cofactor: Array, P: Array) -> Array:
     """
     passed = ((P @ cofactor) ** 2).sum(axis=0)
     variance = np.diag(cofactor)
-    share = np.full(len(variance), np.nan)
-    return np.divide(passed, variance, out=share, where=variance > 0)
+    return np.divide(passed, variance, out=np.full(len(variance), np.nan), where=variance > 0)
 
 
 def _stated_prior(tables: Mapping[str, PriorTable], spot: Spot, _: str) -> GaussianPrior | None:
@@ -450,8 +449,8 @@ class Knowledge:
     def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, Any]:
         kinds = ("bounds", "equality", "semidefinite")
         bounds, equalities, matrices = (tuple(table.get(kind, ())) for kind in kinds)
-        constraints = Constraints(bounds, equalities, matrices)
-        return {"constraints": constraints, "source": str(spot.path)}
+        found = Constraints(bounds, equalities, matrices)
+        return {"constraints": found, "source": str(spot.path)}
 
     def of(self, model: Model) -> tuple[Constraints, GaussianPrior | None]:
         """Constraints and prior on the model's parameters.

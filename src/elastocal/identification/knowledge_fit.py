@@ -305,8 +305,7 @@ def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     before, problem = solution.reduction, solution.problem
     columns, k = found.fit.columns, len(found.fit.columns)
     dropped = np.setdiff1d(before.dropped, columns)
-    both = np.concatenate([columns, dropped])
-    R = problem.evaluate(found.fit.x, both)[1].R
+    R = problem.evaluate(found.fit.x, np.concatenate([columns, dropped]))[1].R
     mixing = found.pinned(found.face) @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * problem.sizes[dropped] / problem.sizes[columns][:, None]
     mixing[share < NO_PART] = 0.0

@@ -408,8 +408,7 @@ def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
 
 
 def rms_3d(residual: Array, size: int) -> float:
-    parts = residual.reshape(-1, size)[:, :3]
-    return float(np.sqrt((parts**2).sum(axis=1).mean()))
+    return float(np.sqrt((residual.reshape(-1, size)[:, :3] ** 2).sum(axis=1).mean()))
 
 
 # Does a wider set of parameters predict better?  A test, since any gain is taken too often.
@@ -443,8 +442,7 @@ def predicts_better(
     if not after < before < np.inf:
         return bool(after < before)
     n, w = weights.apply(narrow), weights.apply(wide)
-    own = np.repeat(numbered(configuration), size)
-    f = np.bincount(own, 2 * n * (n - w))
+    f = np.bincount(np.repeat(numbered(configuration), size), 2 * n * (n - w))
     if len(f) < 2:
         return False
     deviation = float(f.std(ddof=1)) / np.sqrt(len(f))

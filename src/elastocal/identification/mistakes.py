@@ -245,8 +245,7 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
             count = maps[k].mistakes + len(more) + (0 < len(more) < len(words))
             if words:
                 told = " and ".join(words).replace("{", "{{").replace("}", "}}")
-                changed = replace(table, q=q[k], position=undone)
-                other = (f"{told} they would fit to {{}}", changed)
+                other = (f"{told} they would fit to {{}}", replace(table, q=q[k], position=undone))
                 found.append((float(fits.left[k]), count, other))
     found.sort(key=lambda one: one[0])
     likely = [one for one in found if one[0] <= POOR] or found[:2]

@@ -591,8 +591,7 @@ def _drift(record: VisitRecord, name: str, lasting: float, along: Array) -> Devi
     faster = record.faster(lasting)[:, :, None, None] * axes
     waves = record.waves(lasting)[:, None, :, None] * axes[:, None, :]
     waves = waves.reshape(*waves.shape[:2], -1)
-    turns = not along[:3].any()
-    return Deviation(TIME, name, record.visit, faster, waves=waves, turns=turns)
+    return Deviation(TIME, name, record.visit, faster, waves=waves, turns=not along[:3].any())
 
 
 CONFIGURATION, JOINTS, EACH, TIME = "configuration", "joints", "each-joint", "time"
@@ -645,8 +644,7 @@ class Kind(NamedTuple):
         return self._replace(parts=tuple(part for part in PARTS if part in parts))
 
     def with_part(self, part: str) -> Kind:
-        others = (p for p in self.parts if not {p, part} <= {JOINTS, EACH})
-        return self.having(part, *others)
+        return self.having(part, *(p for p in self.parts if not {p, part} <= {JOINTS, EACH}))
 
     def without(self, part: str) -> Kind:
         return self._replace(parts=tuple(p for p in self.parts if p != part))

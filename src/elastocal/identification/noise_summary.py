@@ -302,8 +302,7 @@ def noise_of(found: MethodResult, sigma: float) -> tuple[Noise, dict[str, float]
         spare = len(residual) / max(len(residual) - spent, 1)
         parts = {"readings": float(squared.sum()) / len(squared) * spare}
     else:
-        none = np.zeros(0, dtype=np.int64)
-        bare = linearised(problem.model, observed, solution.fit.x, none)
+        bare = linearised(problem.model, observed, solution.fit.x, np.zeros(0, dtype=np.int64))
         own = own_noise(estimated.fit, bare)[0]
         alone = np.diagonal(own, axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
         visits = sum(variance * d.mean_square(3) for d, variance in estimated.fit.of(bare))

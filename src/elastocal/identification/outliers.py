@@ -495,8 +495,7 @@ def settle(
         left_out, inside = np.sqrt(within * outside / (behind - within)), chosen[:, None]
         point = rejection_point(t.size, np.where(inside, outside, behind))
         agrees = np.asarray(~(np.where(inside, left_out, np.abs(t)) > point).any(axis=1))
-        squared = np.einsum("ni,nij,nj->n", r, precision[0], r)
-        return found, squared, dof, agrees
+        return found, np.einsum("ni,nij,nj->n", r, precision[0], r), dof, agrees
 
     try:
         return until_it_stands(good, judged)[:2]

@@ -487,8 +487,7 @@ class Calibration(scrutiny.FoundFit, Result):
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
         """
-        view = import_module(VIEWS)
-        view.write_page(self, Path(path), inputs, command, seed, certificate=True)
+        import_module(VIEWS).write_page(self, Path(path), inputs, command, seed, certificate=True)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:

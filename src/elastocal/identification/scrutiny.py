@@ -144,8 +144,7 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     table, lead = observed.table, observed.lead
     timed = table.time is not None and bool(np.ptp(np.asarray(table.time)) > 0)
     order = np.argsort(np.asarray(table.time)[lead] if timed else lead, kind="stable")
-    configuration = observed.configuration[order]
-    visit = np.cumsum(np.r_[0, np.diff(configuration) != 0])
+    visit = np.cumsum(np.r_[0, np.diff(observed.configuration[order]) != 0])
     number = int(visit[-1]) + 1 if len(visit) else 0
     if number < FEWEST_VISITS or not (spread > 0).all():
         return None

@@ -158,8 +158,7 @@ class Posterior:
         self.own = own = np.flatnonzero(std > 0)
         self.P = np.eye(len(own), k + len(own), k) / std[own, None]
         prior = RFactor(np.column_stack([self.P, np.zeros(len(own))]), 0)
-        rows = linear.factor.of_columns(np.append(np.arange(k), k + own))
-        self.r_factor = rows.merged(prior)
+        self.r_factor = linear.factor.of_columns(np.append(np.arange(k), k + own)).merged(prior)
 
     @cached_property
     def half(self) -> Array:
@@ -414,8 +413,7 @@ class _Search:
         if self.estimating:
             # From the second round on, whose fit has such weights, the kind of noise is known.
             known = noise if k > 1 else None
-            readings = replace(self.readings, e=self.standard)
-            return settle(readings, self.options.noise, good, known)
+            return settle(replace(self.readings, e=self.standard), self.options.noise, good, known)
         n, size = len(self.standard), self.observed.size
         e = self.every.problem.weights.apply(self.standard.ravel()).reshape(n, size)
         squared, dof = (e**2).sum(axis=1), max(int(good.sum()) * size, 1)

@@ -142,8 +142,7 @@ def reduce(
         _, T, order = linalg.qr(off * alike, mode="economic", pivoting=True)
         far = np.abs(np.diag(T))
         own = candidates[order[: len(far)]]
-        least = np.maximum(threshold, STRUCTURAL * length[own])
-        chosen = np.append(chosen, own[far > least])
+        chosen = np.append(chosen, own[far > np.maximum(threshold, STRUCTURAL * length[own])])
         basis = linalg.qr(R[:, chosen], mode="economic")[0]
     kept = np.sort(chosen)
     while 0 < threshold < WORTH_A_COLUMN and len(kept):

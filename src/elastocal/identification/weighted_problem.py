@@ -188,8 +188,7 @@ def whitener(covariance: sparse.csr_array) -> sparse.csr_array:
         size = members.shape[1]
         i, j = members[:, :, None], members[:, None, :]
         i, j = np.broadcast_arrays(i, j)
-        dense = np.asarray(covariance[i.ravel(), j.ravel()]).reshape(i.shape)
-        inverse = inverse_factor(dense)
+        inverse = inverse_factor(np.asarray(covariance[i.ravel(), j.ravel()]).reshape(i.shape))
         keep = np.tril(np.ones((size, size), dtype=bool))
         rows.append(i[:, keep].ravel())
         columns.append(j[:, keep].ravel())

@@ -347,8 +347,7 @@ def _of_deviations(path: Path, text: str, ur_model: str | None) -> Chain:
     own = sections["mounting"]
     delta = np.array([_six(path, own, f"delta_{name}") for name in ("theta", "a", "d", "alpha")])
     check_angles(f"{path}: delta_theta", tuple(delta[0]), "this file is in rad")
-    nominal = _nominal(path, sections, ur_model, delta)
-    chain, far = _apart(path, delta, nominal)
+    chain, far = _apart(path, delta, _nominal(path, sections, ur_model, delta))
     require(
         far <= FARTHEST,
         f"{path}: the arm is {far * 1e3:.0f} mm away from the nominal one, and factory "

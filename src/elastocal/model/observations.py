@@ -133,8 +133,7 @@ def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], s
 
     def partners(*keys: NDArray[np.int64]) -> sparse.csr_array:
         """1 (N, n) where an unloaded row has the keys of a loaded one."""
-        group = numbered(*keys)
-        of = sparse.csr_array((np.ones(len(table)), (np.arange(len(table)), group)))
+        of = sparse.csr_array((np.ones(len(table)), (np.arange(len(table)), numbered(*keys))))
         return sparse.csr_array(of[lead] @ (of.T @ unloaded))
 
     found = partners(table.configuration, table.repeat, table.marker)

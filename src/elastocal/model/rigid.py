@@ -125,8 +125,7 @@ def drawn_joints(chain: Chain) -> tuple[Array, Array, Array]:
 def highest_origins(chain: Chain, up: Array) -> Array:
     """The largest height (joints,) in m of each joint's origin along `up` (3,), of drawn poses."""
     symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
-    frames = [base, *nominal_frames(chain, symbol, base)]
-    placed = zip(frames, chain.joints, strict=False)
+    placed = zip([base, *nominal_frames(chain, symbol, base)], chain.joints, strict=False)
     origins = ca.horzcat(*(point(T, joint.placement[:3, 3]) for T, joint in placed))
     heights = BatchFunction([symbol], [ca.DM(up).T @ origins])(drawn_joints(chain)[2])[0]
     return np.asarray(heights).reshape(-1, chain.n_joints).max(axis=0)

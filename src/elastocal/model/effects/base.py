@@ -201,8 +201,7 @@ class Arm:
             self.T_tracker_link.append(T)
             T = T @ self.links[i] @ self._deflection(f"link{i + 1}")
         self.T_tracker_flange = T
-        chosen = self._one_hot_sum(self.markers)
-        self.reading["position"] = rigid.point(T, chosen)
+        self.reading["position"] = rigid.point(T, self._one_hot_sum(self.markers))
         reach = self.reading["position"] - self.anchor
         self.reading["distance"] = ca.sqrt(ca.sumsqr(reach)) + self.length_offset
         self.reading["rotation"] = T[:3, :3] @ self._one_hot_sum(self.marker_rotation)

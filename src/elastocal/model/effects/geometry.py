@@ -125,8 +125,7 @@ class MarkerOrientation(Effect):
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         vector = ca.vertcat(p["rx"], p["ry"], p["rz"])
-        name = place.removeprefix("marker:")
-        arm.marker_rotation[name] = rigid.rotation_from_vector(vector)
+        arm.marker_rotation[place.removeprefix("marker:")] = rigid.rotation_from_vector(vector)
 
 
 class DistanceSensor(Effect):

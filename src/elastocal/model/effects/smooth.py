@@ -91,8 +91,7 @@ class Waves:
             period, fade = 2 * math.pi, math.inf
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
         order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
-        frequency = np.asarray(2 * np.pi * order / period, dtype=np.float64)
-        return cls(low, frequency, span, fade)
+        return cls(low, np.asarray(2 * np.pi * order / period, dtype=np.float64), span, fade)
 
     @classmethod
     def of(cls, f: SmoothFunction) -> Waves:

@@ -158,8 +158,7 @@ class LinkMassError(Effect):
     def load(self, arm: Arm, place: str, p: Symbols) -> None:
         T = arm.T_tracker_link[index(place)]
         moment = ca.vertcat(*[p[f"moment_{k}"] for k in "xyz"])
-        height = p["mass_error"] * T[2, 3] + T[2, :3] @ moment
-        arm.add_potential(STANDARD_GRAVITY * height)
+        arm.add_potential(STANDARD_GRAVITY * (p["mass_error"] * T[2, 3] + T[2, :3] @ moment))
 
 
 GEOMETRY = (
@@ -581,8 +580,7 @@ class JointHardening(TorqueEffect):
         return (ParameterSpec("hardening", "rad/(N*m)^3", 0.0, typical or None),)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        k3 = p["hardening"]
-        add_deflection(arm, index(place), f"{place}.hardening", lambda tau: k3 * tau**3)
+        add_deflection(arm, index(place), f"{place}.hardening", lambda tau: p["hardening"] * tau**3)
 
 
 class TiltingEffect(LoadedEffect):
