@@ -55,14 +55,13 @@ OPEN = 0.5  # of a parameter's prior deviation: what is no better known is undet
 class FaultyGroup:
     """One thing that is wrong.
 
-    `readings` (k,) indices of its observations and `lines` their lines; `beyond` how many of
-    these lie beyond the noise on their own.  `pattern` says whether a group errs in common, a
-    displacement, or by scatter; `error` is the length in m of the median error or the rms length,
-    of poses the position's, `sigmas` that of the whitened errors over the noise of a row.
-    `p_value` is adjusted for all tests of the report; `p_left` is that of what one common shift
-    leaves of the errors, by the noise of the others: 0 of a single reading.  `influence` is the
-    largest change of a parameter, in its standard deviations, if the readings were fitted along,
-    and `moves_most` that parameter.
+    `readings` (k,) are its observations, of which `beyond` lie beyond the noise on their own.
+    `pattern`: whether a group errs in common, a displacement, or by scatter; `error` is the length
+    in m of the median error or the rms length, of poses the position's, `sigmas` that of the
+    whitened errors over the noise of a row.  `p_value` is adjusted for all tests of the report;
+    `p_left` is that of what one common shift leaves of the errors, by the noise of the others.
+    `influence` is the largest change of a parameter, `moves_most`, in its standard deviations, if
+    the readings were fitted along.
     """
 
     level: Level
@@ -294,15 +293,14 @@ def report_faulty(
     good: BoolArray,
     residual: Array | None = None,
 ) -> OutlierReport | None:
-    """The report of the readings that are not `good` (N,), under the `noise` of the method: alone
-    or as groups, and groups of good ones that err together; one at a time, the one that explains
-    most first, as long as a majority is left.  None for a table too large for B.
+    """The readings that are not `good` (N,), under the `noise` of the method, alone or as groups,
+    and groups of good ones that err together; None for a table too large for B.
 
     Readings are linearised at a fit that faulty ones do not bend (`clean`), B and residual whitened
     by the noise of single readings, D.  Where a configuration's readings share a deviation, what is
     looked at is D V⁻¹ e, the residual less that deviation's best prediction, and configurations are
     not tested: that they deviate is part of the noise.  Where smooth functions were fitted,
-    `residual` (N, size) is free of their part in it, and the ordinary parameters alone may follow a
+    `residual` (N, size) is free of their part, and the ordinary parameters alone may follow a
     group's error.
     """
     if whole.problem.large:

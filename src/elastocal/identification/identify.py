@@ -405,14 +405,13 @@ def _adapted(
     visits: bool = True, judging: bool = True,
 ) -> Adapted:  # fmt: skip
     """Fit with weights that the residuals tell, from `start`, the fit to the `good` (N,)
-    observations, which faulty readings do not bend.
+    observations.
 
     Noise and good readings are settled at its values and the kept parameters fitted anew with these
-    weights, until neither changes.  Then the parameters are chosen again by what is there now, if
-    other readings are good or the weights show more, and with them, as whenever the good readings
-    have changed, the kind of noise.  Noise that knows the arm's `visits` counts, and readings are
-    judged, unless told otherwise.  More parameters that do not settle are none: the fit without
-    them stays.
+    weights, until neither changes.  Then the parameters are chosen again, if other readings are
+    good or the weights show more, and with them, as whenever the good readings have changed, the
+    kind of noise. Noise that knows the arm's `visits` counts, and readings are judged, unless told
+    otherwise.  More parameters that do not settle are none: the fit without them stays.
     """
     every, same = course.every, True
     noise: NoiseFit | None = None
@@ -568,12 +567,10 @@ def _by_method(course: Course) -> MethodResult:
 
 def with_limits(every: Solution, found: MethodResult, options: Options) -> MethodResult:
     """The result with the parameters that the readings hardly show held, and the others fitted anew
-    with the weights and the kind of noise found.
-
-    One that lies beyond its bound by more than its interval contradicts the model and stays fitted:
-    whoever reads it has to see that.  Of methods other than generalised and ordinary least squares
-    all stay fitted, and where bounds or knowledge say what the readings do not.
-    """
+    with the weights and the kind of noise found.  One that lies beyond its bound by more than its
+    interval contradicts the model and stays fitted, for all to see.  Of methods other than
+    generalised and ordinary least squares all stay fitted, and where bounds or knowledge say what
+    the readings do not."""
     fitted = found.method in ("reml", "wls", "ols")
     limits: dict[int, tuple[float, float]] = {}  # held ones keep what was found of them
     while True:

@@ -396,12 +396,12 @@ class GaussianPrior:
 
 
 def share_of_prior(cofactor: Array, P: Array) -> Array:
-    """Share (p,) of each estimate's information that the prior gave, 0 to 1.
+    """Share (p,) of each estimate's information that the prior gave, 0 to 1; NaN where constraints
+    fix it.
 
     With V = (H_data + H_prior)⁻¹ (on the active face), V = V H_data V + V H_prior V: the posterior
     variance splits into what the noise and what the prior's uncertainty pass on, and the share is
-    (V H_prior V)_ii / V_ii; for a single parameter τ⁻²/(τ⁻² + σ⁻²).  NaN where V_ii = 0: a value
-    that the constraints fix.
+    (V H_prior V)_ii / V_ii; for a single parameter τ⁻²/(τ⁻² + σ⁻²).
     """
     passed = ((P @ cofactor) ** 2).sum(axis=0)
     variance = np.diag(cofactor)
@@ -530,14 +530,13 @@ class Reduced:
     """|t − J x|² = constant + |u|² on x = unit · (centre + T u), all x that the equalities allow,
     where rows u ≥ least.
 
-    `unit` (p,) makes the columns of J unit length, so that slacks and tolerances do not depend on
-    a parameter's physical unit; `limits` are the constraints on x/unit − centre.  The rows (k, q)
-    are of unit length, `lengths` (k,) what they were divided by: first the finite bounds, lower
-    ones first, `sides` 1 for a lower bound and −1 for an upper one of parameter `of_row`, then the
-    `cuts` wᵀM(u)w ≥ 0 found so far, by number of the matrix and w.
-
-    Raises InputError where equalities contradict each other, which it names, and
-    InsufficientDataError where they and J (rows, p) leave a direction undetermined.
+    `unit` (p,) makes the columns of J unit length, so that tolerances do not depend on a
+    parameter's physical unit; `limits` are the constraints on x/unit − centre.  The rows (k, q) are
+    of unit length, `lengths` (k,) what they were divided by: first the finite bounds, lower ones
+    first, `sides` 1 for a lower bound and −1 for an upper one of parameter `of_row`, then the
+    `cuts` wᵀM(u)w ≥ 0 found so far, by number of the matrix and w.  Raises InputError where
+    equalities contradict each other, and InsufficientDataError where they and J (rows, p) leave a
+    direction undetermined.
     """
 
     def __init__(self, J: Array, t: Array, system: System) -> None:

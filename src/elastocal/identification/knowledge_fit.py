@@ -89,12 +89,9 @@ ENDLESS = 1000.0  # times as far as in the linear model: there is no end
 
 def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
-    nonlinear objective at most `rise` above its minimum; infinite where there is no end.
-
-    Each step goes to that end of the model linearised where the last one ended, and is halved until
-    the objective there is near what is allowed.  An end may also be where poses have no equilibrium
-    any more.  Steps that do not settle lead to none.
-    """
+    nonlinear objective at most `rise` above its minimum; infinite where there is none.  Each step
+    goes to that end of the model linearised where the last one ended, and is halved until the
+    objective there is near what is allowed, or poses have an equilibrium."""
     fit, limit, size = found.fit, found.objective + rise, found.fit.problem.sizes[found.fit.columns]
     objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
     assert objective.limits is not None
@@ -124,11 +121,11 @@ def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
 def fitted_columns(solution: Solution, stated: PriorRows, sigma: float) -> IntArray:
     """Indices of the parameters to fit with what is `stated` of all of them, ascending.
 
-    These are the kept parameters of the solution; the free ones that the prior or an equality
-    names, for that is knowledge of themselves; and what else the choice of the kept parameters
-    finds worth a column with the prior and the equalities as further rows: with a prior on k,
-    readings of k + d are knowledge of d.  Bounds and matrices make nothing known: they act on the
-    fitted parameters, with all others held where the fit held them.
+    These are the kept ones; the free ones that the prior or an equality names, for that is
+    knowledge of themselves; and what else `reduce` finds worth a column with the prior and the
+    equalities as further rows: with a prior on k, readings of k + d are knowledge of d.  Bounds and
+    matrices make nothing known: they act on the fitted parameters, with all others held where the
+    fit held them.
 
     Raises InputError for a prior on a parameter that is held fixed; InsufficientDataError where an
     equality names a parameter that stays undetermined.
@@ -178,13 +175,12 @@ def intervals_with_knowledge(
 ) -> Covariance:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
-    auto: t intervals of the posterior covariance where no inequality is active, which bounds cut
-    off (`MethodResult.told`); else the profile {v: S(v) − Ŝ ≤ t² σ²} of the model linearised under
-    the constraints, S(v) the least objective with the parameter at v.  profile: of the nonlinear.
-
-    The covariance takes equalities for exact and leaves inequalities out: knowing more than it
-    says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
-    Parameters that are `many` (columns,), those of smooth functions, have t intervals in any case.
+    auto: t intervals of the posterior covariance where no inequality is active, cut off by bounds
+    (`MethodResult.told`); else the profile {v: S(v) − Ŝ ≤ t² σ²} of the model linearised under the
+    constraints, S(v) the least objective with the parameter at v.  profile: of the nonlinear.  The
+    covariance takes equalities for exact and leaves inequalities out: knowing more than it says, no
+    estimate is farther off.  Parameters that are `many` (columns,), those of smooth functions, have
+    t intervals in any case.
     """
     known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
     # A posterior variance V moves with the noise's variance s² by the readings' share of it,
@@ -218,12 +214,10 @@ CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user
 def fit_with_knowledge(before: MethodResult, options: Options, progress: Progress) -> MethodResult:
     """Minimise |W (y − h(X))|² + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
-    W and the readings are those that the method ended with `before`, σ the noise of a whitened row
-    under it; t intervals have the method's own degrees of freedom.  The prior of smooth functions
-    joins the stated one, which counts where both name a parameter.
-
-    Raises InputError for constraints that contradict each other or held values and names that are
-    no parameters; InsufficientDataError as `fitted_columns`.
+    W, readings and degrees of freedom are those that the method ended with `before`, σ the noise of
+    a whitened row under it.  The prior of smooth functions joins the stated one, which counts where
+    both name a parameter.  Raises InputError for constraints that contradict each other or held
+    values and names that are no parameters; InsufficientDataError as `fitted_columns`.
     """
     solution, names = before.solution, before.solution.problem.model.names
     fit, own, prior = solution.fit, solution.fit.known, options.prior

@@ -23,12 +23,10 @@ LEVEL = 0.95
 class Covariance:
     """Covariance (p, p) of x̂ in the squared units of the parameters, with t degrees of freedom.
 
-    `dof` (p,) belongs to the variance of each parameter on its own: infinite where the variance
-    is known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval
-    of a combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers
-    to Cx.  `among`: where it is the mean of covariances under several models, their weights and
-    matrices; `dof` then is that of `tails`.  `ends` (p, 2): the 95 % intervals where they are not
-    those of t.
+    `dof` (p,) belongs to the variance of each parameter on its own: infinite where the variance is
+    known, 0 where the estimator cannot tell it (the interval is then unbounded).  `among`: where it
+    is the mean of covariances under several models, their weights and matrices; `dof` then is that
+    of `tails`.  `ends` (p, 2): the 95 % intervals where they are not those of t.
     """
 
     kind: str
@@ -197,14 +195,12 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
 
     Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the generalised
     inverse square root, which leaves parameters outside that direction unbiased (there, Theorem 1).
-    A parameter that depends on it has no cluster-robust variance: its dof is 0 and its interval
-    unbounded.  CR3 does not exist then: InsufficientDataError, as for a single cluster.
+    A parameter that depends on it has dof 0 and an unbounded interval.  CR3 does not exist then:
+    InsufficientDataError, as for a single cluster.
 
-    Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
-
-    Degrees of freedom by Satterthwaite for every kind, each for its own A_c (Pustejovsky & Tipton
-    2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero over the clusters, and far
-    fewer where few clusters matter.
+    Cost: n p² + G p³ operations; nothing of size n² is formed.  Degrees of freedom by
+    Satterthwaite, each for its own A_c (Pustejovsky & Tipton 2018); at most G, or G − 1 for CR0 and
+    CR1, whose scores sum to zero over the clusters, and far fewer where few clusters matter.
     """
     p, n, G = len(V), 0, 0
     meat, outer, alone = np.zeros((p, p)), np.zeros((p, p, p)), np.zeros(p, dtype=bool)
@@ -279,14 +275,12 @@ def held_out_residual(
 ) -> Array:
     """Residual (rows,) of every configuration under the fit to all the others.
 
-    With whitened B = QR and whitened residual e, leaving configuration c out moves the estimate
-    by x̂ − x̂₍₋c₎ = R⁻¹ Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c, exactly for a linear model (Allen 1974, PRESS,
-    by groups); the residual of c then grows by B_c times that.  A configuration that alone
-    determines a parameter has no held-out residual: its rows are infinite.
-
-    B (rows, columns) and residual (rows,) raw; `configuration` (observations,), `size` rows each.
-    Where all readings are correlated, as by a drift, those of `weights.together` are left out at a
-    time.
+    With whitened B = QR and whitened residual e, leaving configuration c out moves the estimate by
+    x̂ − x̂₍₋c₎ = R⁻¹ Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c, exactly for a linear model (Allen 1974, PRESS, by
+    groups); the residual of c then grows by B_c times that, infinitely where it alone determines a
+    parameter.  B (rows, columns) and residual (rows,) raw; `configuration` (observations,), `size`
+    rows each.  Where all readings are correlated, as by a drift, those of `weights.together` are
+    left out at a time.
     """
     rows, e = weights.beside_common(B, residual)
     Q, R = linalg.qr(rows, mode="economic")
@@ -433,10 +427,10 @@ def predicts_better(
     some?
 
     Both models see the same noise, and the wider one errs more from estimating more: under the
-    narrow one's truth f_c = |n_c|² − (|w_c|² − |n_c − w_c|²) = 2 n_cᵀ(n_c − w_c), whitened, has
-    the mean zero over configurations c, since n_c − w_c comes from the others (Clark and West
-    2007, J. Econometrics 138, 291).  True where its t exceeds the quantile of a one-sided test and
-    the squares themselves became smaller.
+    narrow one's truth f_c = |n_c|² − (|w_c|² − |n_c − w_c|²) = 2 n_cᵀ(n_c − w_c), whitened, has the
+    mean zero over configurations c, since n_c − w_c comes from the others (Clark and West 2007, J.
+    Econometrics 138, 291).  True where its t is significant, one-sided, and the squares themselves
+    became smaller.
     """
     before, after = rms_3d(narrow, size), rms_3d(wide, size)
     if not after < before < np.inf:

@@ -570,9 +570,8 @@ def load_unit(result: Calibration) -> Iterator[Finding]:
     """Are all compliances about as much too large as kilograms for newtons make them, or too small?
 
     What they should be about is what the cell states, else what winds each revolute joint up by
-    RATED_WIND_UP at its rated torque, by the links' weights.  The median of the ratios has to be
-    that factor to within what arms differ from what is expected of them (EXPECTED_TO).  By the
-    links' weights, a rule of thumb, it is worth a look, and no more.
+    RATED_WIND_UP at its rated torque, by the links' weights: a rule of thumb, worth a look, and no
+    more.  The median of the ratios has to be that factor to within EXPECTED_TO.
     """
     model, chain = result.model, result.model.chain
     known = {e.name: e.value for e in result.ordinary if e.value is not None}

@@ -383,11 +383,10 @@ def estimate_noise(
     """Variances of the chosen noise model by REML, and the estimate under it.
 
     `kind`: the name of a `Kind`, or "auto", unless it is that of `like`, a fit of nearly the same
-    readings, where the search then starts; how it was chosen there holds here.  Auto takes the
-    noise of single readings with the smallest criterion that the table has the labels and the
-    readings for, each with what a configuration may share, and then changes by one part what makes
-    the criterion smaller, until nothing does; scatter of the joints and drift are tried where a
-    test finds a trace of them.
+    readings, where the search then starts.  Auto takes the noise of single readings with the
+    smallest criterion that the table has the labels and the readings for, each with what a
+    configuration may share, and then changes by one part what makes the criterion smaller, until
+    nothing does; scatter of the joints and drift are tried where a test finds a trace of them.
     """
     Q, T = orthogonal(readings.B.reshape(-1, readings.n_parameters))
     basis = replace(readings, B=Q.reshape(readings.B.shape))

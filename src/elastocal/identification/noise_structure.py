@@ -41,13 +41,13 @@ class VisitRecord:
 
     `visit` (N, m) numbers the arm's visits to a pose (−1: no such row), `motion` (N, m, size,
     joints) is ∂(reading)/∂q there, `share` (N, m) the row's factor in the reading, `place` (N, m)
-    its time as a share of the campaign's `span` in s; where the table has no times (`timed`), the
-    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.
-    `lasting`: the correlation times of a drift that may be, as shares of the span; the cell's own
-    alone, where it states a drift and the table has times.  None are where the model itself has
-    what changes with time, and, unless the cell states one, where readings follow each other from
-    pose to neighbouring pose: they err alike because of what the model lacks, and a drift in its
-    place would leave the base as uncertain as it is large.
+    its time as a share of the campaign's `span` in s, by the order of the rows where the table has
+    no times (`timed`).  `turning` (joints,) says which joints are revolute.  `lasting`: the
+    correlation times of a drift that may be, as shares of the span; the cell's own alone, where it
+    states a drift and the table has times.  None are where the model itself has what changes with
+    time, and, unless the cell states one, where poses follow neighbouring poses: such readings err
+    alike because of what the model lacks, and a drift in its place would leave the base as
+    uncertain as it is large.
     """
 
     visit: IntArray

@@ -360,9 +360,8 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
     at nominal, on the model linearised at the whole fit; each configuration is predicted by the fit
-    to the others (`held_out_residual`), the last step as the result has it.  The first step is
-    "nominal_arm", with base and markers placed by the other configurations.  Intervals are by
-    resampling configurations.
+    to the others, the last step as the result has it.  The first step is "nominal_arm", with base
+    and markers placed by the others.  Intervals are by resampling configurations.
     """
     model = result.model
     large = len(result.residual) * len(result.determined) > MOST_BUDGETED

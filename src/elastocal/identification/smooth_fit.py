@@ -204,13 +204,12 @@ LEAST_GAIN, CERTAIN = 0.01, 50.0
 
 class Functions:
     """What of the parameters `free` has a prior: columns (shrunk,), in groups (shrunk,) of one
-    scale each.
+    scale each: the smooth functions `groups`, then parameters that deviate from nominal by a size
+    that is known, to either side, those of an effect at a place that have one unit together.
 
-    First the smooth functions `groups`, then parameters that deviate from nominal by a size that is
-    known, to either side, those of an effect at a place that have one unit together.  A minimal
-    complete set of these, the rest held at nominal, fits the poses measured as well, but far from
-    them it goes anywhere: each that is kept stands for all that are not, where these poses cannot
-    tell them apart.  None are where nothing would be left without a prior.
+    A minimal complete set of these, the rest held at nominal, fits the poses measured as well, but
+    far from them it goes anywhere: each that is kept stands for all that are not, where these poses
+    cannot tell them apart.  None are where nothing would be left without a prior.
     """
 
     def __init__(self, model: Model, free: IntArray) -> None:

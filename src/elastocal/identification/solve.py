@@ -115,15 +115,14 @@ def reduce(
     """Choose a minimal complete set of columns of the whitened B (rows, parameters), or of its R.
 
     Columns are scaled by typical size and by the noise `sigma` of a whitened row, so that the
-    length of a column off the span of the kept ones counts how many standard deviations a
-    typical deviation moves the data: a parameter below `threshold` is not worth a column (at 1
-    the variance it would add equals the squared bias it would remove).  Pivoted QR in the order
-    of `ranks` (columns,), by default the effects': first what a user asks for by name; link
-    geometry takes the rest.  There a kept column that would have to deviate by more than FAR for a
-    typical deviation of a dropped one is exchanged for that one, which makes the volume of those
-    kept larger each time (Gu and Eisenstat 1996, SIAM J. Sci. Comput. 17, 848).
-    `threshold` 0 keeps everything that is structurally independent; of a wider set, below
-    WORTH_A_COLUMN, what is shorter than it beside all others goes again, the shortest first.
+    length of a column off the span of the kept ones counts how many standard deviations a typical
+    deviation moves the data: a parameter below `threshold` is not worth a column; 0 keeps
+    everything that is structurally independent.  Pivoted QR in the order of `ranks` (columns,), by
+    default the effects': first what a user asks for by name; link geometry takes the rest.  There a
+    kept column that would have to deviate by more than FAR for a typical deviation of a dropped one
+    is exchanged for that one, which makes the volume of those kept larger each time (Gu and
+    Eisenstat 1996, SIAM J. Sci. Comput. 17, 848).  Of a wider set, below WORTH_A_COLUMN, what is
+    shorter than it beside all others goes again, the shortest first.
     """
     # The triangular factor has the same geometry as B at any number of rows.
     R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
@@ -464,15 +463,14 @@ BENT_SAMPLE = 1000  # observations it is found from: what readings at random pos
 
 def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, Array]:
     """Root mean square (kept,) of what estimates and combinations leave out by being linear, and
-    the relative variance of its square, by the draws and where the logarithm of the size of what is
-    held has the variance `unsure`.
+    the relative variance of its square, where the logarithm of the size of what is held has the
+    variance `unsure`.
 
     The readings determine a nonlinear function of the parameters.  Typical deviations δ of those
     dropped, with −mixing · δ of those kept, leave them where they are in the first order, and so do
-    the errors of those kept, of this `covariance` (kept, kept); what estimates do in the second
-    is found from the mean of the readings at both and at their opposites.  Where a length is hardly
-    told, a direction that is not told at all moves the markers by the product of the two.  What the
-    fit knows besides the readings holds estimates against it, equalities for exact.
+    the errors of those kept, of this `covariance` (kept, kept); what estimates do in the second is
+    found from the mean of the readings at both and at their opposites.  Where a length is hardly
+    told, a direction that is not told at all moves the markers by the product of the two.
     """
     problem, found, chosen = solution.problem, solution.fit, solution.reduction
     kept, dropped = chosen.kept, chosen.dropped
@@ -642,12 +640,12 @@ class MethodResult:
     """The final fit, its `spread`, and the noise where it was estimated.
 
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
-    fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
-    many parameters the readings paid for (`effective`; in a fit to readings alone all fitted), and
-    `warnings` where the readings contradict them.  `smooth` are the smooth functions, `beside`
-    which σ of a whitened row and its degrees of freedom were found, and `standard` (N, size) the
-    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
-    the parameters that the readings `hardly_shown`, by their index.
+    fit. What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
+    many parameters the readings paid for (`effective`; None: all fitted), and `warnings` where the
+    readings contradict them.  `beside` the `smooth` functions, σ of a whitened row and its degrees
+    of freedom, and `standard` (N, size), the residuals of all readings free of the fit's part in
+    them.  `limits` are the 95 % intervals of the parameters that the readings hardly show, by their
+    index.
     """
 
     method: str

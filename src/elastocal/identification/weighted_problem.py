@@ -584,13 +584,12 @@ def fit(
     """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
     other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
 
-    On R factors, with the cost and the gradient of all rows, until a step promises less than
-    `tolerance` of the cost.  Every step starts from the residual of the exact model, so that the
-    rounding of one is taken back by the next.  Constraints are convex and kept in every step: where
-    none improves the fit, the conditions of Karush, Kuhn and Tucker hold.
-
-    Raises ElastocalError where the start has poses without equilibrium, InputError for constraints
-    that contradict each other, InsufficientDataError where they leave something undetermined.
+    Until a step promises less than `tolerance` of the cost.  Every step starts from the residual of
+    the exact model, so that the rounding of one is taken back by the next.  Constraints are convex
+    and kept in every step: where none improves the fit, the conditions of Karush, Kuhn and Tucker
+    hold.  Raises ElastocalError where the start has poses without equilibrium, InputError for
+    constraints that contradict each other, InsufficientDataError where they leave something
+    undetermined.
     """
     size, u = problem.sizes[columns], np.zeros(len(columns))
     known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))

@@ -61,10 +61,10 @@ class OpenParameters:
     """The parameters D that the data left open, by `names` (D,), and what they stand for.
 
     `mixing` (K, D): a deviation of X_D went into the estimates of the K determined parameters as
-    mixing · X_D, the least-squares solution of ∂(readings)/∂X_D ≈ ∂(readings)/∂X_K · mixing at
-    the poses measured.  `typical` (D,): typical deviations in SI units, 0 where none is known.
-    `redundant`: those that no pose under the loads measured tells from the rest: it is the model
-    that has one parameter too many, and nothing needs to be done.
+    mixing · X_D, the least-squares solution of ∂(readings)/∂X_D ≈ ∂(readings)/∂X_K · mixing at the
+    poses measured.  `typical` (D,): typical deviations in SI units, 0 where none is known.
+    `redundant`: those that no pose under the loads measured tells from the rest: nothing needs to
+    be done, it is the model that has one parameter too many.
     """
 
     more: ClassVar[str] = "ignore"

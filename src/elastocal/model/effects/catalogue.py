@@ -422,13 +422,12 @@ def configuration_rows(
     symbolic: SymbolicArm, template: Measurements, columns: NDArray[np.int64]
 ) -> tuple[ca.Function, ca.Function]:
     """B (rows, columns) = ∂prediction/∂X of the configuration whose rows `template` lists, all its
-    markers and load states, as a function of q (n,) and X (parameters,); and its adjoint,
-    (q, X, W) → ∇_q Σ_ij W_ij B_ij (n,), one reverse sweep, for W (rows, columns).
+    markers and load states, as a function of q (n,) and X (parameters,); and its adjoint, (q, X, W)
+    → ∇_q Σ_ij W_ij B_ij (n,), one reverse sweep, for W (rows, columns).
 
-    Rows and their order are those of `Model.regressor` on the template, which gives everything but
-    q: markers, forces, the level of a split joint, time.  Deflections are explicit functions of q
-    and X: eq. (3) for a linear model, STEPS fixed-point steps for the equilibrium.  Where poses
-    are observed, the rotation is taken as measured without error, as in planning.
+    Rows are those of `Model.regressor` on the template, which gives everything but q.  Deflections
+    are explicit functions of q and X: eq. (3) for a linear model, STEPS fixed-point steps for the
+    equilibrium.  Where poses are observed, the rotation is taken as measured without error.
     """
     arm, p = symbolic.arm, symbolic.p
     observed = observe(template, arm.cell.model.observe)
