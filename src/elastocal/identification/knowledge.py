@@ -549,7 +549,24 @@ class Reduced:
         most = CONTRADICTION * max(1.0, float(np.max(np.abs(origin), initial=0.0)))
         if np.max(np.abs(missed), initial=0.0) > most:
             _refuse(limits.equality_labels, missed)
-        self.centre, self.T = centre, T = _free_minimum(J * unit, t, origin, basis, system.names)
+        # The least-squares point among origin + basis · w, and T (p, q) with |J T u| = |u|.
+        centre, T = origin, basis
+        if basis.shape[1]:
+            Q, R = linalg.qr(J * unit @ basis, mode="economic")
+            singular, right = linalg.svd(R)[1:]
+            tiny = UNDETERMINED * float(np.max(singular, initial=0.0))
+            loose = right[int((singular > tiny).sum()) :]
+            if len(loose):
+                moved = np.abs(loose @ basis.T).max(axis=0)
+                each = zip(system.names, moved, strict=True)
+                free = [name for name, m in each if m > 1e-3 * moved.max()]
+                raise InsufficientDataError(
+                    f"data, prior and equalities do not determine {listed(free)}: values can "
+                    "change together without moving a reading; hold some of them, or state a prior"
+                )
+            T = linalg.solve_triangular(R, basis.T, trans="T").T
+            centre = origin + T @ (Q.T @ (t - J * unit @ origin))
+        self.centre, self.T = centre, T
         # About the free minimum numbers are as small as the constraints allow.
         self.limits = limits = limits.moved(centre, zero + 1)
         below, above = (np.flatnonzero(np.isfinite(b)) for b in (limits.lower, limits.upper))
@@ -727,24 +744,3 @@ def _refuse(labels: Sequence[str], prices: Sequence[float] | Array) -> NoReturn:
 def minimise(J: Array, t: Array, system: System) -> Minimum:
     """Minimise |t − J x|² over the system's x; errors as in `Reduced`."""
     return Reduced(J, t, system).minimum()
-
-
-def _free_minimum(
-    J: Array, t: Array, origin: Array, basis: Array, names: tuple[str, ...]
-) -> tuple[Array, Array]:
-    """Least-squares x (p,) among origin + basis · w, and T (p, q) with |J T u| = |u|."""
-    if not basis.shape[1]:
-        return origin, basis
-    Q, R = linalg.qr(J @ basis, mode="economic")
-    singular, right = linalg.svd(R)[1:]
-    tiny = UNDETERMINED * float(np.max(singular, initial=0.0))
-    loose = right[int((singular > tiny).sum()) :]
-    if len(loose):
-        moved = np.abs(loose @ basis.T).max(axis=0)
-        free = [n for n, m in zip(names, moved, strict=True) if m > 1e-3 * moved.max()]
-        raise InsufficientDataError(
-            f"data, prior and equalities do not determine {listed(free)}: values can change "
-            "together without moving a reading; hold some of them, or state a prior"
-        )
-    T = linalg.solve_triangular(R, basis.T, trans="T").T
-    return origin + T @ (Q.T @ (t - J @ origin)), T

@@ -155,24 +155,19 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     total = float((mean**2).sum())
     lags = range(1, min(LAGS, number // 4) + 1)
     found = tuple(float((mean[:-k] * mean[k:]).sum()) / total for k in lags)
-    centre, width = over_permutations(mean)
-    p = float(special.ndtr((centre / total - found[0]) / (width / total)))
-    band = float(special.ndtri(0.975)) * width / total
-    return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")
-
-
-def over_permutations(mean: Array) -> tuple[float, float]:
-    """Mean and standard deviation of Σ m_i·m_{i+1} over all orders of the rows m of `mean` (n,
-    k), which sum to zero.  Two products of neighbours share both rows, one or none; the mean of
-    their product over all distinct rows follows for each from T = Σ |m|², F = |Σ m mᵀ|² and
-    Q = Σ |m|⁴."""
-    n, square = len(mean), (mean**2).sum(axis=1)
+    # Of Σ m_i·m_{i+1} over all orders of the rows m, which sum to zero: two products of neighbours
+    # share both rows, one or none; the mean of their product over all distinct rows follows for
+    # each from T = Σ |m|², F = |Σ m mᵀ|² and Q = Σ |m|⁴.
+    n, square = number, (mean**2).sum(axis=1)
     T, F, Q = square.sum(), ((mean.T @ mean) ** 2).sum(), (square**2).sum()
     two = (F - Q) / (n * (n - 1))
     three = (2 * Q - F) / (n * (n - 1) * (n - 2))
     four = (T**2 + 2 * F - 6 * Q) / (n * (n - 1) * (n - 2) * (n - 3))
     second = (n - 1) * two + 2 * (n - 2) * three + (n - 2) * (n - 3) * four
-    return -float(T / n), float(np.sqrt(second - (T / n) ** 2))
+    centre, width = -float(T / n), float(np.sqrt(second - (T / n) ** 2))
+    p = float(special.ndtr((centre / total - found[0]) / (width / total)))
+    band = float(special.ndtri(0.975)) * width / total
+    return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")
 
 
 # Sets of parameters side by side, on the model linearised at the fit.

@@ -94,7 +94,22 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
     acts (`payload`); link weights act where `link_gravity` says so.  InputError for an unknown
     effect, place or setting, with the nearest valid one, and for an effect that has no place on
     this arm."""
-    check_settings(chain, cell)
+    nominal = cell.model.nominal
+    for table, what, given, keys_of in (
+        ("settings", "setting", nominal.settings, lambda e, *at: [s.key for s in e.settings(*at)]),
+        # Shrunk parameters have their size from a setting.
+        ("sizes", "parameter", nominal.sizes,
+         lambda e, *at: [p.key for p in e.parameters(*at) if not p.shrunk]),
+    ):  # fmt: skip
+        known: dict[str, list[str]] = {}
+        for effect in CATALOGUE.values() if given else ():
+            for place in effect.places(chain, cell):
+                if keys := keys_of(effect, place, chain, cell):
+                    known.setdefault(place, []).extend(keys)
+        for place, values in given.items():
+            _check_known(f"nominal.{table}", "place", place, known, cell)
+            for key in values:
+                _check_known(f"nominal.{table}", f"{what} of {place}", key, known[place], cell)
     wanted: dict[str, list[str | None]] = {
         name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
     }
@@ -115,27 +130,6 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
                 _check_known("effects", f"place of {name}", where, places, cell)
         chosen += [(effect, place) for place in places if None in asked or place in asked]
     return chosen
-
-
-def check_settings(chain: Chain, cell: Cell) -> None:
-    """InputError where the cell sets, or states the size of, what no effect of the catalogue has
-    on this arm."""
-    nominal = cell.model.nominal
-    for table, what, given, keys_of in (
-        ("settings", "setting", nominal.settings, lambda e, *at: [s.key for s in e.settings(*at)]),
-        # Shrunk parameters have their size from a setting.
-        ("sizes", "parameter", nominal.sizes,
-         lambda e, *at: [p.key for p in e.parameters(*at) if not p.shrunk]),
-    ):  # fmt: skip
-        known: dict[str, list[str]] = {}
-        for effect in CATALOGUE.values() if given else ():
-            for place in effect.places(chain, cell):
-                if keys := keys_of(effect, place, chain, cell):
-                    known.setdefault(place, []).extend(keys)
-        for place, values in given.items():
-            _check_known(f"nominal.{table}", "place", place, known, cell)
-            for key in values:
-                _check_known(f"nominal.{table}", f"{what} of {place}", key, known[place], cell)
 
 
 def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
@@ -394,24 +388,22 @@ class Total:
         """y (n, m) and dy/dz (n, m, columns) of every row; y is NaN where there is no equilibrium.
         `columns` are those of z, by default all."""
         asked = tuple(range(self._z.shape[0])) if columns is None else columns
-        given = [*inputs, *extra, x]
-        return self._recent(asked, given, lambda: self._evaluated(inputs, x, extra, asked))
+        arm, given = self._arm, [*inputs, *extra, x]
 
-    def _evaluated(
-        self, inputs: list[NDArray], x: Array, extra: Sequence[NDArray], asked: tuple[int, ...]
-    ) -> tuple[Array, Array]:
-        arm, function, given = self._arm, self._function(asked), [*inputs, *extra, x]
-        theta, F_theta = arm.equilibrium(inputs, x)
-        if not arm.implicit:
-            y, slope = function(*given, theta)
+        def evaluated() -> tuple[Array, Array]:
+            function, (theta, F_theta) = self._function(asked), arm.equilibrium(inputs, x)
+            if not arm.implicit:
+                y, slope = function(*given, theta)
+                return y[..., 0], slope
+            y_theta = self._slopes(*given, theta)[0]
+            y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
+            adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
+            adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
+            y, slope = function(*given, theta, adjoint)
+            y[~np.isfinite(theta).all(axis=1)] = np.nan
             return y[..., 0], slope
-        y_theta = self._slopes(*given, theta)[0]
-        y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
-        adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
-        adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
-        y, slope = function(*given, theta, adjoint)
-        y[~np.isfinite(theta).all(axis=1)] = np.nan
-        return y[..., 0], slope
+
+        return self._recent(asked, given, evaluated)
 
 
 # Fixed-point steps to the equilibrium.  Under 280 kg on a KR 270 they leave 2·10⁻⁴ of a column.
