@@ -40,11 +40,11 @@ def renamed(table: ec.Measurements, rows: np.ndarray, order: list[int]) -> ec.Me
 @pytest.mark.parametrize(("first", "order"), [(1, [1, 0, 2]), (12, [1, 2, 0])])
 def test_the_rows_are_told_from_whichever_pose_names_are_exchanged(model, first, order):
     table = campaign(model)
-    found = exchanged(model, renamed(table, table.configuration >= first, order))
+    rows, _, words = exchanged(model, renamed(table, table.configuration >= first, order))
     moved = (table.configuration >= first) & (np.array(order)[table.marker] != table.marker)
-    assert np.array_equal(found.rows, np.flatnonzero(moved))
+    assert np.array_equal(rows, np.flatnonzero(moved))
     lines = f"{table.row[moved][0]}–{table.row[moved][-1]}"
-    assert f"{moved.sum()} rows (lines {lines}" in found.words
+    assert f"{moved.sum()} rows (lines {lines}" in words
 
 
 def test_names_exchanged_everywhere_are_told_by_the_places_of_the_cell(model):

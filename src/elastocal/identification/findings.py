@@ -497,10 +497,11 @@ def _test(result: Calibration) -> Iterator[Finding]:
 
 def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
     if (found := exchanged(result.model, whole)) is not None:
-        lines = whole.row[found.rows]
+        rows, markers, words = found
+        lines = whole.row[rows]
         fitted = np.isin(lines, result.observations.table.row).any()
         yield (_care if fitted else _note)(
-            "exchanged_markers", found.words, markers=found.markers, rows=len(lines),
+            "exchanged_markers", words, markers=markers, rows=len(lines),
             lines=tuple(lines.tolist()),
         )  # fmt: skip
 

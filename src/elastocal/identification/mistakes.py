@@ -89,7 +89,7 @@ def nominal_fit(
     if len(table.marker_names) > 1:
         mixed = exchanged(Model.assembled(chain, replace(cell, model=ModelSpec())), table)
         if mixed is not None:
-            return NominalFit(error, mixed.words.removesuffix("."), True)
+            return NominalFit(error, mixed[2].removesuffix("."), True)
     if far <= POOR:
         return NominalFit(error, rotations_off(_turns(rigid, table), "the nominal arm"))
     near, best = far, ""
@@ -494,17 +494,8 @@ BESIDE, NEARER = 3.0, 5.0
 SHOWN = 6  # runs of lines, and configurations, that are named
 
 
-@dataclass(frozen=True)
-class Exchanged:
-    """Rows (k,) of a table with the name of another marker, the `markers` mixed up, and what to
-    do."""
-
-    rows: IntArray
-    markers: tuple[str, ...]
-    words: str
-
-
-def exchanged(model: Model, table: Measurements) -> Exchanged | None:
+def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, ...], str] | None:
+    """Rows (k,) with the name of another marker, the markers mixed up, and what to do."""
     names, n = table.marker_names, len(table)
     poses = len(np.unique(table.q, axis=0))
     if table.position is None or len(names) < 2 or not FEWEST_POSES <= poses <= n <= MOST_READINGS:
@@ -550,7 +541,7 @@ def exchanged(model: Model, table: Measurements) -> Exchanged | None:
             f"{listed(labels, SHOWN)}): each reading there lies where the other marker is. "
             "Exchange the names in these rows."
         )
-    return Exchanged(rows, markers, words)
+    return rows, markers, words
 
 
 # Loads in another unit.
