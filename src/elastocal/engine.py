@@ -58,6 +58,7 @@ class Pack:
         return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
 
     def pairs(self, values: Array, K: int) -> Array:
+        """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
         at = (self.of[:, :, None] * K + self.of[:, None, :]).ravel()
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
@@ -104,6 +105,7 @@ class State:
 
     @cached_property
     def inverse(self) -> Array:
+        """L⁻¹ (p, p)."""
         return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
 
     def each(self) -> Iterator[tuple[Whitened, Array, Array]]:
@@ -461,6 +463,7 @@ class Products:
         return Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
 
     def value(self, at: Standardised) -> float:
+        """−2ℓ but for n log 2π."""
         a = at.noise
         return 2 * self.rows * float(np.log(a)) + self.squares / a**2 + at.log_det - at.explained
 
@@ -514,6 +517,7 @@ class Standardised:
 
     @cached_property
     def inverse(self) -> Array:
+        """L⁻¹ (k, k)."""
         return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
 
     def information(self, grown: Array) -> tuple[Array, Array]:

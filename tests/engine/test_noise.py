@@ -9,7 +9,7 @@ from engine.dense import Table, own_parts, readings, shared_part
 from scipy import stats
 
 from elastocal.identification.noise_choice import estimate_noise, own_noise
-from elastocal.identification.noise_structure import noise_models
+from elastocal.identification.noise_structure import STRUCTURES
 from elastocal.identification.outliers import FALSE_ALARM, prediction_errors, settle
 from elastocal.messages import InputError, InsufficientDataError
 
@@ -55,7 +55,7 @@ def test_what_cannot_be_asked_for_is_refused():
     with pytest.raises(InputError, match=r"found 'axes'.*did you mean 'axis'"):
         estimate_noise(readings(BASE, 0), "axes")
     alone = readings(Table(configurations=40, markers=1, repeats=1, unbalanced=False), 0)
-    for kind in (k for k in noise_models() if k.endswith("+configuration")):
+    for kind in (f"{name}+configuration" for name in STRUCTURES):
         needed = "repeats or several markers|too few readings"
         with pytest.raises((InputError, InsufficientDataError), match=needed):
             estimate_noise(alone, kind)

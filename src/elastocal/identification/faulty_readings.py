@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -204,10 +204,14 @@ class _Judged:
         self.B, self.y = B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1)
         self.off, self.good, self.names = readings.e[:, :3], good, [p.name for p in fitted]
         self.lines, self.marker = table.row[lead], np.array(table.marker_names)[table.marker[lead]]
-        self.groups = list(_groups("marker", self.marker, own_places))
-        if not shared:
-            visited = np.array(table.configuration_labels)[table.configuration[lead]]
-            self.groups += _groups("configuration", visited)
+        visited = np.array(table.configuration_labels)[table.configuration[lead]]
+        by: list[tuple[Level, NDArray[Any]]] = [("marker", self.marker), ("configuration", visited)]
+        self.groups = list[Group]()
+        for level, labels in by[:1] if shared else by:
+            names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
+            for k in np.flatnonzero((count > 1) & (2 * count < len(labels))):
+                may_shift = level != "marker" or names[k] not in own_places
+                self.groups.append(Group(level, str(names[k]), code == k, may_shift))
 
     @cached_property
     def tests(self) -> dict[Level, int]:
@@ -325,11 +329,3 @@ def report_faulty(
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     sigma = float(np.sqrt(fit.variance))
     return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, judged.tests)
-
-
-def _groups(
-    level: Level, labels: NDArray[Any], without_shift: Collection[str] = ()
-) -> Iterator[Group]:
-    names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
-    for k in np.flatnonzero((count > 1) & (2 * count < len(labels))):
-        yield Group(level, str(names[k]), code == k, names[k] not in without_shift)

@@ -288,6 +288,7 @@ def summarise(
 
 
 def _unchecked(result: Calibration) -> Array | None:
+    """What single configurations alone hold (`told_by_one`); None where it is not to be had."""
     observed, kept, weights = result.observations, result.columns, result.weights
     lone = ~np.isfinite(result.held_out)
     if not lone.any():
@@ -641,6 +642,7 @@ def _reml(course: Course) -> MethodResult:
 def _explained(
     every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
 ) -> BoolArray:
+    """Readings (N,) that are not `good`, of groups which one common shift each explains."""
     report = report_faulty(every, fitted, noise, good)
     known = [] if report is None else [f.readings for f in report.shifted]
     return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))

@@ -383,6 +383,7 @@ class GaussianPrior:
         return P, root @ self.mean
 
     def _root(self) -> Array:
+        """L⁻¹ of the Cholesky factor; by standardised parameters, whose units are alike."""
         std = np.sqrt(np.abs(np.diag(self.covariance)))
         try:
             require(bool((std > 0).all()), "")

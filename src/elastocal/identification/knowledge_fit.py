@@ -89,9 +89,9 @@ ENDLESS = 1000.0  # times as far as in the linear model: there is no end
 
 def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
     """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
-    nonlinear objective at most `rise` above its minimum; infinite where there is none.  Each step
-    goes to that end of the model linearised where the last one ended, and is halved until the
-    objective there is near what is allowed, or poses have an equilibrium."""
+    nonlinear objective at most `rise` above its minimum; infinite where steps lead to none.  Each
+    goes to that end of the model linearised where the last one ended, and is halved until poses
+    there have an equilibrium and the objective is near what is allowed."""
     fit, limit, size = found.fit, found.objective + rise, found.fit.problem.sizes[found.fit.columns]
     objective = Objective(fit.problem, fit.columns, fit.x, size, found.known)
     assert objective.limits is not None
@@ -179,8 +179,8 @@ def intervals_with_knowledge(
     (`MethodResult.told`); else the profile {v: S(v) − Ŝ ≤ t² σ²} of the model linearised under the
     constraints, S(v) the least objective with the parameter at v.  profile: of the nonlinear.  The
     covariance takes equalities for exact and leaves inequalities out: knowing more than it says, no
-    estimate is farther off.  Parameters that are `many` (columns,), those of smooth functions, have
-    t intervals in any case.
+    estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom;
+    parameters that are `many` (columns,), those of smooth functions, have t intervals in any case.
     """
     known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
     # A posterior variance V moves with the noise's variance s² by the readings' share of it,

@@ -24,9 +24,10 @@ class Covariance:
     """Covariance (p, p) of x̂ in the squared units of the parameters, with t degrees of freedom.
 
     `dof` (p,) belongs to the variance of each parameter on its own: infinite where the variance is
-    known, 0 where the estimator cannot tell it (the interval is then unbounded).  `among`: where it
-    is the mean of covariances under several models, their weights and matrices; `dof` then is that
-    of `tails`.  `ends` (p, 2): the 95 % intervals where they are not those of t.
+    known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval of a
+    combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers to Cx.
+    `among`: where it is the mean of covariances under several models, their weights and matrices;
+    `dof` then is that of `tails`.  `ends` (p, 2): the 95 % intervals where they are not those of t.
     """
 
     kind: str
@@ -43,6 +44,7 @@ class Covariance:
 
     @property
     def correlation(self) -> Array:
+        """ρ (p, p), zeros for a value that equalities fix."""
         return correlations(self.matrix)[0]
 
     def tails(self, rows: Array) -> tuple[Array, Array]:
@@ -402,6 +404,7 @@ def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
 
 
 def rms_3d(residual: Array, size: int) -> float:
+    """Root mean square length in m of the position part of the residual (rows,)."""
     return float(np.sqrt((residual.reshape(-1, size)[:, :3] ** 2).sum(axis=1).mean()))
 
 

@@ -625,7 +625,8 @@ class Kind(NamedTuple):
     @classmethod
     def of(cls, name: str) -> Kind:
         """The same; InputError where there is no such noise model."""
-        found, known = cls.parsed(name), noise_models()
+        found = cls.parsed(name)
+        known = ("auto", *STRUCTURES, *(f"{own}+{CONFIGURATION}" for own in STRUCTURES))
         alone = found.own + f"+{CONFIGURATION}" * (CONFIGURATION in found.parts)
         fits = found == found.having(*found.parts) and not {JOINTS, EACH} <= {*found.parts}
         if not fits or alone not in known or (found.own == "auto" and found.parts):
@@ -686,11 +687,6 @@ class Kind(NamedTuple):
             else:
                 found += of_joints(readings, part == EACH)
         return found
-
-
-def noise_models() -> tuple[str, ...]:
-    """Every name that `noise` takes: auto, the structures, and those with shared deviations."""
-    return ("auto", *STRUCTURES, *(f"{name}+{CONFIGURATION}" for name in STRUCTURES))
 
 
 def stated_deviations(

@@ -596,6 +596,7 @@ class _Table:
         self.held, self.dof = held, dof
 
     def judged(self, code: IntArray, names: NDArray[np.object_]) -> Array:
+        """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
         total, f = (np.bincount(code, v, len(names)) for v in (self.squared, self.spare))
         return np.where(np.bincount(code) >= FEWEST_VALUES, _two_sided(total, f), np.nan)
 

@@ -152,6 +152,7 @@ class FitToGood:
         return max(self.rss / max(self.dof, 1.0), TINY)
 
     def coordinates(self, B: Array) -> Array:
+        """T of further observations."""
         flat = B.reshape(len(B) * B.shape[1], B.shape[2])
         return np.asarray(linalg.solve_triangular(self.R, flat.T, trans="T").T).reshape(B.shape)
 
@@ -334,6 +335,7 @@ def prior_widths(problem: Problem) -> Array:
 
 
 def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
+    """B (n, size, free) and residual (n, size) of a part at x, whitened."""
     at, shape = problem.regressor(part, x, problem.free), (len(part.index), -1)
     B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
     return B.reshape(len(part.index), part.observations.size, -1), e.reshape(shape)
@@ -565,6 +567,7 @@ class HuberFit:
         return self.V @ self.z
 
     def weights(self, c: float) -> Array:
+        """ψ(d)/d (n,)."""
         return c / np.maximum(self.distance, c)
 
     def covariance(self, cluster: IntArray | None = None) -> Covariance:

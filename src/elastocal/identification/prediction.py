@@ -300,6 +300,7 @@ def _loads(force: Array, observe: str) -> Array:
 
 
 def measured_loads(observed: Observations) -> Array:
+    """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
     return _evenly(_loads(observed.table.force, observed.kind), MOST_LOADS)
 
 
@@ -395,6 +396,7 @@ def excess_of(
 
 
 def _chi2(dof: int, rng: np.random.Generator) -> Array:
+    """Draws (DRAWS,) of ν/χ²_ν: by what factor a mean square may be off."""
     dof = max(dof, 1)
     return np.asarray(dof / rng.chisquare(dof, DRAWS))
 

@@ -166,6 +166,7 @@ class Posterior:
 
     @property
     def step(self) -> Array:
+        """α and b (columns,)."""
         return self.half @ self.r_factor.projected
 
     @property

@@ -94,6 +94,7 @@ class Reduction:
         )  # fmt: skip
 
     def shifted(self, x: Array, x0: Array) -> Array:
+        """x (parameters,) with the dropped ones at x0, their share moved to the kept ones."""
         out = x.copy()
         out[self.kept] += self.mixing @ (x - x0)[self.dropped]
         out[self.dropped] = x0[self.dropped]
@@ -174,6 +175,7 @@ WIDER = WORTH_A_COLUMN / FAR
 
 
 def residual_sigma(found: Fit, n_parameters: int) -> float:
+    """Standard deviation of a whitened row: √(rss / (rows − parameters))."""
     dof = max(len(found.whitened) - n_parameters, 1)
     return max(float(np.sqrt(found.whitened @ found.whitened / dof)), 1e-12)
 
@@ -285,6 +287,7 @@ class Solution:
 
     @property
     def exact(self) -> bool:
+        """Whether the readings are computed: what is left is rounding."""
         return rms_3d(self.fit.residual, self.problem.observations.size) < EXACT
 
     @cached_property
@@ -642,10 +645,10 @@ class MethodResult:
     Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
     fit. What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
     many parameters the readings paid for (`effective`; None: all fitted), and `warnings` where the
-    readings contradict them.  `beside` the `smooth` functions, σ of a whitened row and its degrees
-    of freedom, and `standard` (N, size), the residuals of all readings free of the fit's part in
-    them.  `limits` are the 95 % intervals of the parameters that the readings hardly show, by their
-    index.
+    readings contradict them.  `smooth` are the smooth functions, `beside` which σ of a whitened row
+    and its degrees of freedom were found, and `standard` (N, size) the residuals of all readings
+    free of the fit's part in them.  `limits` are the 95 % intervals of the parameters that the
+    readings hardly show, by their index.
     """
 
     method: str

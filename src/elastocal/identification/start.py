@@ -64,7 +64,7 @@ class Options:
     `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
     stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
     published weights with σ by group or from each residual; huber and l1 are robust.  `noise`: the
-    model whose variances reml estimates (structure.noise_models).
+    model whose variances reml estimates.
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `constraints` and `prior`: a
@@ -242,6 +242,7 @@ class Registration:
         return cls(flange, np.asarray(table.position), table.marker, start)
 
     def places(self, flange: Array, marker: IntArray) -> Array:
+        """Where flanges (n, 4, 4) have each `marker` (n,)."""
         body = np.einsum("nij,nj->ni", flange[:, :3, :3], self.markers[marker]) + flange[:, :3, 3]
         return np.asarray(body @ self.rotation.T + self.translation)
 
@@ -657,6 +658,7 @@ def solved_body(table: Measurements, error: float) -> str | None:
 
 
 def _by_visit(table: Measurements) -> Array:
+    """Positions (visits, markers, 3) of the first reading of each; NaN where there is none."""
     assert table.position is not None
     visit = visits(table)
     out = np.full((int(visit.max(initial=-1)) + 1, len(table.marker_names), 3), np.nan)

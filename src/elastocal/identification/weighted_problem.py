@@ -56,6 +56,7 @@ class Weights:
     together: IntArray | None = None
 
     def apply(self, rows: Array) -> Array:
+        """Whiten a vector (rows,) or matrix (rows, k)."""
         return self.beside(rows if self.whiten is None else self.whiten @ rows)
 
     def beside(self, own: Array) -> Array:
@@ -151,6 +152,7 @@ def _available(observed: Observations, tracker: Tracker) -> str:
 
 
 def block_diagonal(blocks: Array) -> sparse.csr_array:
+    """Blocks (n, d, d) along the diagonal; their zeros are not stored."""
     n, d, _ = blocks.shape
     places = np.arange(n), np.arange(n + 1)
     out = sparse.bsr_array((np.ascontiguousarray(blocks), *places), shape=(n * d, n * d)).tocsr()
@@ -259,6 +261,7 @@ class RFactor:
 
     @property
     def half(self) -> Array:
+        """R⁻¹ (p, p)."""
         return np.asarray(linalg.solve_triangular(self.R, np.eye(self.columns)))
 
 
@@ -530,6 +533,7 @@ class Objective:
         return values
 
     def step(self, u: Array, at: Linearised, damping: float) -> Array:
+        """Minimiser of the linearised cost + damping · |step|²."""
         p = len(u)
         A, b = np.vstack([at.A, np.sqrt(damping) * np.eye(p)]), np.append(at.b, np.zeros(p))
         if self.limits is not None:
@@ -584,12 +588,12 @@ def fit(
     """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
     other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
 
-    Until a step promises less than `tolerance` of the cost.  Every step starts from the residual of
-    the exact model, so that the rounding of one is taken back by the next.  Constraints are convex
-    and kept in every step: where none improves the fit, the conditions of Karush, Kuhn and Tucker
-    hold.  Raises ElastocalError where the start has poses without equilibrium, InputError for
-    constraints that contradict each other, InsufficientDataError where they leave something
-    undetermined.
+    It ends where a step promises less than `tolerance` of the cost.  Every step starts from the
+    residual of the exact model, so that the rounding of one is taken back by the next.  Constraints
+    are convex and kept in every step: where none improves the fit, the conditions of Karush, Kuhn
+    and Tucker hold.  Raises ElastocalError where the start has poses without equilibrium,
+    InputError for constraints that contradict each other, InsufficientDataError where they leave
+    something undetermined.
     """
     size, u = problem.sizes[columns], np.zeros(len(columns))
     known = known or PriorRows(np.zeros((0, len(u))), np.zeros(0))

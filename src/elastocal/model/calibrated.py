@@ -103,6 +103,7 @@ class MeasuredVisits:
     force: Triples = keyed("forces, three numbers for each visit", "force_N", required=True)
 
     def to_json(self) -> dict[str, Any]:
+        """JSON-ready; joints to a µrad or µm, forces to a mN."""
         return {
             "q": [[round(float(v), 6) + 0.0 for v in row] for row in self.q],
             "force_N": [[round(float(v), 3) + 0.0 for v in row] for row in self.force],

@@ -151,6 +151,7 @@ def check_numbers(chain: Chain, key: str, found: Sized, degrees: bool, one: bool
 
 
 def joint_index(name: str) -> int:
+    """0-based index of "joint3", as of "link3"."""
     return int(name.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
 
 
@@ -231,6 +232,7 @@ def jaw_told(chain: Chain, moved: str = "") -> list[str]:
 
 
 def extent(chain: Chain) -> float:
+    """Length in m from joint to joint and on to the flange."""
     return float(sum(np.linalg.norm(T[:3, 3]) for T in chain.link_ends))
 
 

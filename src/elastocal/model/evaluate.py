@@ -167,12 +167,6 @@ def chosen_backend(name: str | None = None) -> str:
     return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")
 
 
-def evaluated_by(asked: str | None = None) -> str:
-    engines = "casadi for few rows, else " if chosen_backend(asked) == "auto" else ""
-    threads = thread_count()
-    return f"{engines}numpy ({threads} thread{'s' if threads > 1 else ''})"
-
-
 CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
 
 

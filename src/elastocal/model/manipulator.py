@@ -31,7 +31,7 @@ from elastocal.model.effects.base import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE, SymbolicArm, cell_of, effect_of
 from elastocal.model.effects.geometry import DistanceSensor
-from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
+from elastocal.model.evaluate import CHUNK, chosen_backend, row_blocks, thread_count
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
 
@@ -309,7 +309,9 @@ class Model(ByValue):
 
     def backend_report(self) -> str:
         """What evaluates this model, for reports: engines and threads."""
-        return evaluated_by(self.symbolic.backend)
+        few = "casadi for few rows, else " * (chosen_backend(self.symbolic.backend) == "auto")
+        threads = thread_count()
+        return f"{few}numpy ({threads} thread{'s' * (threads > 1)})"
 
     @property
     def nominal(self) -> Array:

@@ -50,6 +50,7 @@ class Observations:
 
     @property
     def load(self) -> IntArray:
+        """Number (N,) of the load state."""
         return load_states(self.table.force[self.lead])
 
     @property

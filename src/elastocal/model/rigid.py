@@ -110,6 +110,7 @@ def nominal_frames(chain: Chain, q: ca.SX, base: ca.SX) -> list[ca.SX]:
 
 
 def nominal_flanges(chain: Chain, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
     symbol = ca.SX.sym("q", chain.n_joints)
     flange = nominal_frames(chain, symbol, ca.SX.eye(4))[-1]
     return np.asarray(BatchFunction([symbol], [flange])(q)[0])
