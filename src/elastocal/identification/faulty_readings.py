@@ -291,12 +291,9 @@ class _Judged:
 
 
 def report_faulty(
-    whole: Solution,
-    clean: Solution,
-    noise: NoiseFit | None,
-    good: BoolArray,
+    whole: Solution, clean: Solution, noise: NoiseFit | None, good: BoolArray,
     residual: Array | None = None,
-) -> OutlierReport | None:
+) -> OutlierReport | None:  # fmt: skip
     """The readings that are not `good` (N,), under the `noise` of the method, alone or as groups,
     and groups of good ones that err together; None for a table too large for B.
 

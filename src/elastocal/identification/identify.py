@@ -86,13 +86,10 @@ __all__ = ["Options", "identify"]
 
 
 def identify(
-    model: Model,
-    table: Measurements,
-    options: Options | None = None,
-    test: Measurements | None = None,
-    progress: Progress = lambda message: None,
+    model: Model, table: Measurements, options: Options | None = None,
+    test: Measurements | None = None, progress: Progress = lambda message: None,
     new_poses: NewPoses | None = None,
-) -> Calibration:
+) -> Calibration:  # fmt: skip
     """Parameters with intervals from nothing but the nominal arm and a table.
 
     Start by registration, a first fit weakly tied to it, choice of a minimal complete set of

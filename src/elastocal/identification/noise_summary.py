@@ -553,13 +553,9 @@ class ResidualSummary:
 
 
 def summarise_residuals(
-    observed: Observations,
-    whitened: Array,
-    leverage: Array | None = None,
-    held_out: Array | None = None,
-    *,
-    absolute: bool = True,
-) -> ResidualSummary | None:
+    observed: Observations, whitened: Array, leverage: Array | None = None,
+    held_out: Array | None = None, *, absolute: bool = True,
+) -> ResidualSummary | None:  # fmt: skip
     """Histograms, normal scores and tests of the whitened residuals (rows,) of `observed`.
 
     `leverage` (rows,) is diag H of the whitened B, by default zero; `held_out` (rows,) the

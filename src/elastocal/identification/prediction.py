@@ -402,14 +402,9 @@ def _chi2(dof: int, rng: np.random.Generator) -> Array:
 
 
 def predicted_error(
-    arm: CalibratedArm,
-    observed: Observations,
-    excess: Excess | None,
-    spread: Covariance,
-    poses: NewPoses,
-    rng: np.random.Generator,
-    unchecked: Array | None = None,
-) -> PredictedError | None:
+    arm: CalibratedArm, observed: Observations, excess: Excess | None, spread: Covariance,
+    poses: NewPoses, rng: np.random.Generator, unchecked: Array | None = None,
+) -> PredictedError | None:  # fmt: skip
     """The error at new poses, at the markers, in the circumstances of the readings; P of
     `told_by_one` says how much of it is `unchecked`.
 

@@ -95,15 +95,9 @@ def group_sigma(residual: Array, group: IntArray) -> Array:
 
 
 def eq14(
-    B: Array,
-    dp: Array,
-    group: IntArray | None = None,
-    *,
-    sigma_0: float = SIGMA_0,
-    lam: float = 1.0,
-    iterations: int = 30,
-    tolerance: float = 1e-6,
-) -> list[PublishedFit]:
+    B: Array, dp: Array, group: IntArray | None = None, *, sigma_0: float = SIGMA_0,
+    lam: float = 1.0, iterations: int = 30, tolerance: float = 1e-6,
+) -> list[PublishedFit]:  # fmt: skip
     """WLS with the weights of eq. (14), iterated until values and intervals settle.
 
     They have settled (`converged` of the last entry) where no value and no stated standard

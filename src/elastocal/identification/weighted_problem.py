@@ -81,11 +81,9 @@ class Weights:
 
 
 def weights_for(
-    observed: Observations,
-    tracker: Tracker,
-    kind: WeightKind = "auto",
+    observed: Observations, tracker: Tracker, kind: WeightKind = "auto",
     covariance: Array | None = None,
-) -> Weights:
+) -> Weights:  # fmt: skip
     """Weights for the observations; "auto" takes the table's sigmas, else the cell's, else none.
     "rows" uses the table's sigma columns (Cartesian or polar), "axis" the cell's `sigma_um`,
     "polar" the cell's range and transverse noise, "covariance" the matrix (rows, rows) given.

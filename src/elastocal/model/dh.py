@@ -83,11 +83,9 @@ MASS_FAMILIES = (
 
 
 def read_dh(
-    path: str | Path,
-    convention: Convention = "standard",
-    masses_path: str | Path | None = None,
+    path: str | Path, convention: Convention = "standard", masses_path: str | Path | None = None,
     ur_model: str | None = None,
-) -> Chain:
+) -> Chain:  # fmt: skip
     """The chain of a DH table in CSV, one row per joint, or of a factory calibration of a UR.
 
     Columns theta0_rad|deg, d_m|mm, a_m|mm, alpha_rad|deg; optional: beta_rad|deg, joint (name),

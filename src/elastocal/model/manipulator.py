@@ -93,12 +93,9 @@ class Model(ByValue):
 
     @checked_arguments
     def __init__(
-        self,
-        cell: Cell | str | Path,
-        markers: Sequence[str] = (),
-        backend: str | None = None,
+        self, cell: Cell | str | Path, markers: Sequence[str] = (), backend: str | None = None,
         plugins: bool | None = False,
-    ) -> None:
+    ) -> None:  # fmt: skip
         cell = cell_of(cell, plugins)
         self._markers_stated = bool(cell.tool.markers)
         if not self._markers_stated:
@@ -119,12 +116,9 @@ class Model(ByValue):
 
     @classmethod
     def assembled(
-        cls,
-        chain: Chain,
-        cell: Cell,
-        extra: Sequence[tuple[Effect, str]] = (),
+        cls, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]] = (),
         backend: str | None = None,
-    ) -> Model:
+    ) -> Model:  # fmt: skip
         """The model of a chain that is there already; `cell` says all else.
 
         `extra` effects with their places act besides those that the cell chooses.
@@ -444,12 +438,9 @@ class Model(ByValue):
         return self.regressor(table, x).B
 
     def regressor(
-        self,
-        table: Measurements,
-        x: Array | None = None,
-        columns: NDArray | None = None,
+        self, table: Measurements, x: Array | None = None, columns: NDArray | None = None,
         observations: Observations | None = None,
-    ) -> Regression:
+    ) -> Regression:  # fmt: skip
         """B_i = ∂prediction/∂X stacked over the whole table (eq. 4), and the prediction.
 
         `columns` selects parameters by index (default all).  Raises InputError where the table

@@ -241,15 +241,9 @@ class Reaching(BoundedSearch):
     """r(q) and J(q) of all targets for the nominal chain."""
 
     def __init__(
-        self,
-        chain: Chain,
-        position: Array,
-        rotation: Array | None,
-        place: Array | None,
-        T_data_base: Array | None,
-        lower: Array,
-        upper: Array,
-    ) -> None:
+        self, chain: Chain, position: Array, rotation: Array | None, place: Array | None,
+        T_data_base: Array | None, lower: Array, upper: Array,
+    ) -> None:  # fmt: skip
         super().__init__(lower, upper)
         self.goal = np.clip(position, -FARTHEST, FARTHEST)
         q = ca.SX.sym("q", chain.n_joints)
@@ -335,17 +329,10 @@ class Postures:
 
 
 def inverse_kinematics(
-    chain: Chain,
-    position: Array,
-    limits: tuple[Array, Array],
-    *,
-    rotation: Array | None = None,
-    point: Array | None = None,
-    T_data_base: Array | None = None,
-    near: Array | None = None,
-    postures: int = 16,
-    seed: int = 0,
-) -> Postures:
+    chain: Chain, position: Array, limits: tuple[Array, Array], *, rotation: Array | None = None,
+    point: Array | None = None, T_data_base: Array | None = None, near: Array | None = None,
+    postures: int = 16, seed: int = 0,
+) -> Postures:  # fmt: skip
     """Postures of the nominal chain that bring `point` to `position` (T, 3) m in the data frame.
 
     `limits`: lower and upper (n,) rad or m, infinite where there is none; `rotation` (3, 3) or

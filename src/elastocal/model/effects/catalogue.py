@@ -192,12 +192,9 @@ class SymbolicArm:
     its functions."""
 
     def __init__(
-        self,
-        chain: Chain,
-        cell: Cell,
-        extra: Sequence[tuple[Effect, str]] = (),
+        self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]] = (),
         backend: str | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         arm = Arm(chain, cell)
         chosen = [*choose_effects(chain, cell), *extra]
         symbols: list[ca.SX] = []
@@ -379,12 +376,9 @@ class Total:
         return self._functions[columns]
 
     def __call__(
-        self,
-        inputs: list[NDArray],
-        x: Array,
-        extra: Sequence[NDArray] = (),
+        self, inputs: list[NDArray], x: Array, extra: Sequence[NDArray] = (),
         columns: tuple[int, ...] | None = None,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array]:  # fmt: skip
         """y (n, m) and dy/dz (n, m, columns) of every row; y is NaN where there is no equilibrium.
         `columns` are those of z, by default all."""
         asked = tuple(range(self._z.shape[0])) if columns is None else columns
