@@ -524,11 +524,9 @@ def ranked_within(codes: IntArray) -> IntArray:
 
 
 PARTITIONS: tuple[tuple[str, ...], ...] = (
-    ("configuration",),
-    ("configuration", "load"),
-    ("configuration", "marker"),
+    ("configuration",), ("configuration", "load"), ("configuration", "marker"),
     ("configuration", "load", "marker"),
-)
+)  # fmt: skip
 
 
 def of_configurations(readings: Readings, every: bool) -> Iterator[Deviation]:

@@ -264,23 +264,16 @@ class Noise:
 
     def to_json(self) -> dict[str, Any]:
         known = {
-            "single_readings": self.single,
-            "reason": self.reason,
-            "variances": self.sizes,
-            "tests": self.tests or None,
-            "drift": self.drift,
-            "tried": self.tried,
-        }
+            "single_readings": self.single, "reason": self.reason, "variances": self.sizes,
+            "tests": self.tests or None, "drift": self.drift, "tried": self.tried,
+        }  # fmt: skip
         return {
-            "kind": self.kind,
-            "description": self.description,
-            "sigma_um": microns(self.sigma),
-            "ratio_to_stated": self.ratio_to_stated,
-            "lack_of_fit": self.lack_of_fit,
+            "kind": self.kind, "description": self.description, "sigma_um": microns(self.sigma),
+            "ratio_to_stated": self.ratio_to_stated, "lack_of_fit": self.lack_of_fit,
             "held_out_by": self.held_out_by,
             "intervals": {"kind": self.interval_kind, "description": self.interval_description},
             **{name: value for name, value in known.items() if value is not None},
-        }
+        }  # fmt: skip
 
 
 def noise_of(found: MethodResult, sigma: float) -> tuple[Noise, dict[str, float]]:

@@ -251,14 +251,11 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
     kept = [k for k, name in enumerate(arm.determined) if name in rest.names]
     entries = dict(zip(model.names, arm.entries, strict=True)) if arm.entries else {}
     return replace(
-        arm,
-        model=rest,
-        x=arm.x_of(rest),
-        determined=tuple(arm.determined[k] for k in kept),
+        arm, model=rest, x=arm.x_of(rest), determined=tuple(arm.determined[k] for k in kept),
         covariance=arm.covariance[np.ix_(kept, kept)],
         entries=tuple(entries[name] for name in rest.names if name in entries),
         left=None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
-    ), tuple(gone)
+    ), tuple(gone)  # fmt: skip
 
 
 @checked_arguments
@@ -319,20 +316,15 @@ def read_calibrated(
     entries, visits = {e["name"]: e for e in result["parameters"]}, stated.measured_visits
     shape = None if visits is None else (len(visits.force), model.chain.n_joints)
     return CalibratedArm(
-        model,
-        np.array([held[name] for name in model.names]),
-        determined,
-        stated.covariance.reshape(n, n),
-        str(result_path),
+        model, np.array([held[name] for name in model.names]), determined,
+        stated.covariance.reshape(n, n), str(result_path),
         tuple(entries[name] for name in model.names),
         _left_open(stated.open, model, determined, result_path),
-        float(lacking if is_number(lacking) else 0.0) * 1e-6,
-        stated.loads_N.reshape(-1, 3),
+        float(lacking if is_number(lacking) else 0.0) * 1e-6, stated.loads_N.reshape(-1, 3),
         stated.measured_poses,
         visits if visits is not None and len(visits.q) and visits.q.shape == shape else None,
-        mostly_prior(stated.prior_share or {}),
-        scatter,
-    )
+        mostly_prior(stated.prior_share or {}), scatter,
+    )  # fmt: skip
 
 
 MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
@@ -445,25 +437,19 @@ class Conditions:
 def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[str, list[str]]:
     """By effect of the arm itself what it needs and the conditions do not state."""
     return {
-        name: [
-            need
-            for need in CATALOGUE[name].needed(calibrated.model.cell)
-            if need in RECORDED or getattr(conditions, need, 0.0) is None
-        ]
-        for name in calibrated.effects
-        if not CATALOGUE[name].of_the_measurement
-    }
+        name: [need for need in CATALOGUE[name].needed(calibrated.model.cell)
+               if need in RECORDED or getattr(conditions, need, 0.0) is None]
+        for name in calibrated.effects if not CATALOGUE[name].of_the_measurement
+    }  # fmt: skip
 
 
 def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
     spec = calibrated.model.cell.model
     spec = replace(
-        spec,
-        effects=tuple(choice for choice in spec.effects if choice.name in names),
-        link_gravity=spec.link_gravity and LinkGravity.name in names,
-        observe="position",
+        spec, effects=tuple(choice for choice in spec.effects if choice.name in names),
+        link_gravity=spec.link_gravity and LinkGravity.name in names, observe="position",
         torque="computed",
-    )
+    )  # fmt: skip
     model = calibrated.model.specified(spec)
     return Valued(model, calibrated.x_of(model))
 
@@ -582,13 +568,9 @@ class CalibratedTool:
             q[:, joint_index(name)] = values[0]
         names = tuple(self._symbolic.arm.markers)
         bare = replace(
-            table,
-            q=q,
-            marker=np.zeros(n, dtype=np.int64),
-            marker_names=names[:1],
-            rotation=np.zeros((n, 3)),
-            position=None,
-        )
+            table, q=q, marker=np.zeros(n, dtype=np.int64), marker_names=names[:1],
+            rotation=np.zeros((n, 3)), position=None,
+        )  # fmt: skip
         return row_inputs(self._symbolic.arm, bare)
 
     def _at(self, rows: list[NDArray], q: Array) -> list[NDArray]:

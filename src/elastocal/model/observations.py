@@ -15,12 +15,10 @@ from elastocal.messages import InputError, require
 from elastocal.units import Array, IntArray
 
 SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}
+XYZ = ("x", "y", "z")
 COMPONENTS = {
-    "position": ("x", "y", "z"),
-    "deflection": ("x", "y", "z"),
-    "pose": ("x", "y", "z", "rx", "ry", "rz"),
-    "distance": ("distance",),
-}
+    "position": XYZ, "deflection": XYZ, "pose": (*XYZ, "rx", "ry", "rz"), "distance": ("distance",),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)

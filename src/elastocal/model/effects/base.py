@@ -222,16 +222,10 @@ class Arm:
 
 
 COLUMNS = {
-    "q": "q1_deg …",
-    "force": "force_x_N …",
-    "torque": "torque_1_Nm …",
-    "rotation": "rx_deg … or qw …",
-    "time": "time_s or time_min",
-    "approach": "approach_1 …",
-    "temperature": "temperature_C",
-    "move": "q1_deg …",
-    "direction": "q1_deg …",
-}
+    "q": "q1_deg …", "force": "force_x_N …", "torque": "torque_1_Nm …",
+    "rotation": "rx_deg … or qw …", "time": "time_s or time_min", "approach": "approach_1 …",
+    "temperature": "temperature_C", "move": "q1_deg …", "direction": "q1_deg …",
+}  # fmt: skip
 # A row belongs to a level of a split joint when it is this close to it (rad or m).
 LEVEL_TOLERANCE = 0.01
 
