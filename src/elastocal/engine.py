@@ -350,9 +350,8 @@ class MixedFit:
             own = H[np.ix_(free, free)] * np.outer(scale, scale)
             scale *= theta[free]
             # The pseudo-inverse where variances cannot be told apart.
-            out[np.ix_(free, free)] = np.linalg.pinv(own, 1e-12, hermitian=True) * np.outer(
-                scale, scale
-            )
+            inverse = np.linalg.pinv(own, 1e-12, hermitian=True)
+            out[np.ix_(free, free)] = inverse * np.outer(scale, scale)
         return out
 
     @cached_property

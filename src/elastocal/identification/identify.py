@@ -290,10 +290,8 @@ def _unchecked(result: Calibration) -> Array | None:
     lone = ~np.isfinite(result.held_out)
     if not lone.any():
         return np.zeros((len(kept), len(kept)))
-    usual = not (
-        result.prior_share or result.smooth or result.active or weights.together is not None
-    )
-    if not usual or len(lone) * len(kept) > MOST_NUMBERS:
+    others = result.prior_share or result.smooth or result.active
+    if others or weights.together is not None or len(lone) * len(kept) > MOST_NUMBERS:
         return None
     B = result.B[:, kept]
     configuration = np.repeat(observed.configuration, observed.size)

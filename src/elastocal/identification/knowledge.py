@@ -258,9 +258,8 @@ class Constraints:
             )
         # Equal bounds have no inside, which an inequality solver needs; they are an equality.
         met = lower == upper
-        pinned = (
-            LinearEquality({names[i]: 1.0}, float(lower[i])) for i in np.flatnonzero(met).tolist()
-        )
+        at = np.flatnonzero(met).tolist()
+        pinned = (LinearEquality({names[i]: 1.0}, float(lower[i])) for i in at)
         equalities = (*self.equalities, *pinned)
         rows = [_row(e.terms, position, f"equality '{e}'")[0] for e in equalities]
         matrices = list[Matrix]()

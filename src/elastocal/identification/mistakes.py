@@ -637,9 +637,8 @@ def impossible_values(result: Calibration) -> Iterator[Finding]:
 # poses agree, the value is what the arm has; where much is left, a value that no arm has stands in
 # for what the model lacks.
 
-LARGEST_SCALE = (
-    0.5  # beyond it the points hardly move, as of a tip that touches one, or do so otherwise
-)
+# Beyond it the points hardly move, as of a tip that touches one, or do so otherwise.
+LARGEST_SCALE = 0.5
 NEARLY = 0.1  # share of the square that a scale leaves of what it explains
 SOME = 400  # readings that are enough for it
 # What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other

@@ -538,10 +538,8 @@ def of_configurations(readings: Readings, every: bool) -> Iterator[Deviation]:
     for by in PARTITIONS:
         unit = numbered(*(getattr(readings, label) for label in by))
         # Alone in its unit, a reading's own noise covers it.
-        told = (np.bincount(unit) > 1).any() and not any(
-            np.array_equal(unit, other) for other in kept.values()
-        )
-        if told or every:
+        same = any(np.array_equal(unit, other) for other in kept.values())
+        if every or ((np.bincount(unit) > 1).any() and not same):
             kept[by] = unit
     size = readings.size
     for k, kind in enumerate(("", " (rotation)")[: max(size // 3, 1)]):

@@ -188,9 +188,8 @@ def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) 
     local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
     if not len(local.kept):
         raise nothing_shown(problem.observations, problem.residual(problem.x0))
-    return replace(
-        local, kept=free[local.kept], dropped=free[local.dropped], invisible=free[local.invisible]
-    )
+    kept, dropped, gone = (free[own] for own in (local.kept, local.dropped, local.invisible))
+    return replace(local, kept=kept, dropped=dropped, invisible=gone)
 
 
 def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:
@@ -493,9 +492,8 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     rng, steps = np.random.default_rng(0), np.zeros((BENDS, len(found.x)))
     steps[:, dropped] = delta = typical * rng.standard_normal((BENDS, len(dropped)))
     steps[:, kept] = rng.standard_normal((BENDS, len(kept))) @ root.T - delta @ chosen.mixing.T
-    there, opposite = np.split(
-        problem.residual_of(looked, found.x + np.concatenate([steps, -steps])), 2
-    )
+    both = np.concatenate([steps, -steps])
+    there, opposite = np.split(problem.residual_of(looked, found.x + both), 2)
     moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
         return none, none  # so far out the arm has no equilibrium

@@ -321,9 +321,7 @@ def names_told(chain: Chain) -> str:
     """ "joint1 = shoulder_pan, joint2 = …", or "" where the file's names end with these numbers."""
     names = file_names(chain)
     ends = [re.search(r"[0-9]+$", name) for name in names.values()]
-    if all(
-        end and number == f"joint{int(end[0])}" for number, end in zip(names, ends, strict=True)
-    ):
+    if all(end and name == f"joint{int(end[0])}" for name, end in zip(names, ends, strict=True)):
         return ""
     return listed(f"{number} = {printable(name)}" for number, name in names.items())
 

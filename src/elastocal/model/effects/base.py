@@ -96,9 +96,8 @@ def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
     moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
     rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
     signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
-    return np.array(
-        [s if p.typical is None else p.typical for s, p in zip(signal, specs, strict=True)]
-    )
+    both = zip(signal, specs, strict=True)
+    return np.array([s if p.typical is None else p.typical for s, p in both])
 
 
 # The chain under construction: what effects change, and how it is put together.
@@ -148,9 +147,7 @@ class Arm:
             None if nominal.base_rotation is None else rigid.constant(nominal.base_rotation),
             None if nominal.base_position is None else rigid.constant(nominal.base_position),
         )
-        self.markers = {
-            name: rigid.constant(position) for name, position in cell.tool.markers.items()
-        }
+        self.markers = {name: rigid.constant(at) for name, at in cell.tool.markers.items()}
         self.load_point = rigid.constant(cell.tool.load_point)
         self.marker_rotation = {name: ca.SX.eye(3) for name in self.markers}
         anchor = cell.tracker.anchor
@@ -523,9 +520,8 @@ def joints(chain: Chain) -> tuple[str, ...]:
 
 def turning_joints(chain: Chain) -> tuple[str, ...]:
     """Those of `joints` that are revolute."""
-    return tuple(
-        j for j, kind in zip(joints(chain), chain.kinds, strict=True) if kind == "revolute"
-    )
+    kinds = zip(joints(chain), chain.kinds, strict=True)
+    return tuple(joint for joint, kind in kinds if kind == "revolute")
 
 
 def motion_unit(place: str, chain: Chain) -> str:

@@ -104,10 +104,8 @@ class MarkerPosition(Effect):
     formats = ("rigid", "elastic")
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        nominal = cell.tool.markers[place.removeprefix("marker:")]
-        return tuple(
-            ParameterSpec(k, "m", float(v), 3e-3) for k, v in zip("xyz", nominal, strict=True)
-        )
+        nominal = zip("xyz", cell.tool.markers[place.removeprefix("marker:")], strict=True)
+        return tuple(ParameterSpec(k, "m", float(v), 3e-3) for k, v in nominal)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         arm.markers[place.removeprefix("marker:")] = ca.vertcat(p["x"], p["y"], p["z"])
@@ -567,9 +565,8 @@ class WristCoupling(DrivenEffect):
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         n = arm.chain.n_joints
         first, second = arm.q_commanded[n - 3], arm.q_commanded[n - 2]
-        return ca.vertcat(
-            p["coupling_a"] * first, p["coupling_b"] * first + p["coupling_c"] * second
-        )
+        a, b, c = (p[spec.key] for spec in self.unknowns)
+        return ca.vertcat(a * first, b * first + c * second)
 
 
 # Joints that come to rest elsewhere: play, friction behind the encoder, and what lags behind.

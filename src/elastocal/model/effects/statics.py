@@ -220,9 +220,8 @@ class GravityCompensator(Effect):
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         given = EXAMPLE | (cell.model.nominal.gravity_compensator or {})
         stiffness = float(given["stiffness_N_per_m"])
-        shape = zip(
-            GEOMETRY, (*given["anchor_m"], given["arm_m"], given["free_length_m"]), strict=True
-        )
+        sizes = *given["anchor_m"], given["arm_m"], given["free_length_m"]
+        shape = zip(GEOMETRY, sizes, strict=True)
         return (
             ParameterSpec("compensator_stiffness", "N/m", stiffness, abs(stiffness) or None),
             *(ParameterSpec(key, "m", float(value), 1e-2) for key, value in shape),
@@ -356,10 +355,8 @@ class GravitySag(DrivenEffect):
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         up, j = arm.T_tracker_base[2, :3].T, index(place)
         torques = levers(arm.chain, arm.q_commanded, j) @ up
-        terms = _sizes(arm.chain, j).items()
-        return sum(
-            (p[f"sag_{n}"] * torques[k] / size for n, (k, size) in enumerate(terms, 1)), ca.SX(0)
-        )
+        terms = enumerate(_sizes(arm.chain, j).items(), 1)
+        return sum((p[f"sag_{n}"] * torques[k] / size for n, (k, size) in terms), ca.SX(0))
 
 
 # Kilograms of an arm of one metre: arms of 0.6 to 1.4 m weigh 15 to 40 kg per square metre of their
