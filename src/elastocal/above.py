@@ -226,8 +226,7 @@ def _array(value: Any) -> bool:
 
 
 def _values(value: Any) -> bool:
-    """Numbers, complex ones too; whether they can be computed with is for what computes with
-    them."""
+    """Numbers, complex ones too; what computes with them says whether it can."""
     import numpy as np
 
     try:

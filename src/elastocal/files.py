@@ -63,7 +63,6 @@ OTHERS = {
 
 @contextmanager
 def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
-    """An existing regular file of at most `max_bytes`, opened for binary reading."""
     told = f"the {what} is given by its path; found {type(path).__name__}"
     require(isinstance(path, str | Path), told)
     ending = Path(path).suffix.lower()
@@ -112,7 +111,6 @@ PIECE = 1 << 20  # bytes read at once
 
 
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    """The content of a regular file of at most `max_bytes`, sized before it is read."""
     data = bytearray()
     with open_input(path, what, max_bytes) as handle:
         # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
@@ -128,10 +126,8 @@ def read_text(path: str | Path, what: str, max_bytes: int) -> str:
 
 
 def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
-    """What a JSON file of at most `max_bytes` holds; whole numbers too long for that are floats.
-
-    Raises InputError, with `remedy`, where it is no strict JSON: names the line where there is one.
-    """
+    """Strict JSON; whole numbers too long for it become floats.  What is wrong is told with the
+    line, where there is one, and the `remedy`."""
     text = read_text(path, what, max_bytes)
 
     def number(digits: str) -> float:
@@ -159,11 +155,8 @@ def decoded(
     source: str, data: bytes, remedy: str, codec: str = "utf-8-sig", name: str = "UTF-8",
     line: int = 1,
 ) -> str:  # fmt: skip
-    """The text of `data`, which begins in `line` of a file, in the encoding `codec`.
-
-    Raises InputError that names line and byte where `data` is no such text; `name` is what people
-    call the encoding, `remedy` what they can do.
-    """
+    """The text of `data`, which begins in `line` of a file; `name` is what people call the encoding
+    `codec`, `remedy` what they can do."""
     try:
         return data.decode(codec)
     except UnicodeDecodeError as error:
@@ -238,11 +231,8 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
-    """A handle (text in UTF-8) whose content appears under `path` only when all of it is written.
-
-    Raises InputError as `check_output` does; whatever fails within the `with` block leaves no
-    temporary file and the old content of `path` untouched.
-    """
+    """A handle (text in UTF-8) whose content appears under `path` only when all of it is written;
+    whatever fails leaves no temporary file, and the old content of `path` untouched."""
     check_output(path)
     mode = "b" if binary else ""
     how: dict[str, Any] = {} if binary else {"encoding": "utf-8", "newline": "\n"}
@@ -282,7 +272,6 @@ def _write_errors(path: str | Path) -> Iterator[None]:
 
 
 def atomic_write(path: str | Path, content: str | bytes) -> None:
-    """Write text (as UTF-8) or bytes under `path`, whole or not at all."""
     with atomic_writer(path, isinstance(content, bytes)) as handle:
         handle.write(content)
 
@@ -338,14 +327,10 @@ REGISTERED: set[type] = set()  # the classes of effects, noise models and criter
 def load_plugins(
     cell: Path | None = None, modules: Sequence[str] = (), asked: bool = True, fresh: bool = True
 ) -> None:
-    """Run the plug-ins of installed packages, and the `modules` that the file `cell` names.
-
-    A name that ends with .py is the path of a file; any other is a module that can be imported.
-    What has been run is not run again, but where `fresh` for a file that has changed.  `asked`:
-    whether the user said that they may run, as the environment variable TRUSTED says of folders.
-
-    Raises InputError that names the plug-in, its file and the line, where one cannot be run.
-    """
+    """Run the plug-ins of installed packages, and the `modules` that the file `cell` names: paths
+    of files (.py) or modules that can be imported.  What has been run is not run again, but where
+    `fresh` for a file that has changed.  `asked`: whether the user said that they may run, as the
+    environment variable TRUSTED says of folders."""
     load_installed()
     owner = cell or Path("plug-ins")
     for k, name in enumerate(modules):
@@ -404,8 +389,7 @@ def load_installed() -> None:
 
 @cache
 def _load_installed_in(folders: tuple[str, ...]) -> None:
-    """Of packages in these folders: looking for them reads what every package says of itself, so it
-    is done once in a process."""
+    """Once in a process: looking for them reads what every package says of itself."""
     from importlib.metadata import entry_points
 
     for point in entry_points(group=GROUP):
@@ -486,7 +470,6 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
 
 
 def check_registered(thing: object, base: type, what: str, example: str) -> None:
-    """InputError unless `thing` is an object of a class derived from `base`, with a name."""
     if isinstance(thing, type) and issubclass(thing, base):
         raise InputError(f"register {what}, {thing.__name__}(), not its class")
     kind = type(thing)

@@ -273,7 +273,7 @@ def numbered(*columns: NDArray[Any]) -> IntArray:
 
 
 def load_states(force: Array) -> IntArray:
-    """Number (n,) of each force (n, 3) in N, alike to a µN."""
+    """Of forces (n, 3) in N, alike to a µN."""
     with np.errstate(over="ignore"):  # of forces beyond all measure
         return numbered(*np.round(force, 6).T)
 
@@ -431,11 +431,8 @@ def columns_of(
     source: str, header: Sequence[str], joint_kinds: Sequence[str], observe: str,
     extra: Sequence[Family] = (),
 ) -> Columns:  # fmt: skip
-    """What the columns of a table mean.
-
-    `joint_kinds`: "revolute" or "prismatic" per joint; `observe` decides what must be there;
-    `extra`: families that this table may have besides.
-    """
+    """What the columns of a table mean; `observe` decides what must be there, `extra` are families
+    that this table may have besides."""
     known = families(joint_kinds) | {family.name: family for family in extra}
     found = tables.match_columns(
         source,

@@ -27,10 +27,8 @@ SHOWN = 60
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str | None:
-    """The valid name closest to `name`, upper and lower case alike; None where none is near.
-
-    Names that begin with `name` come first, the shortest of them: it was not typed to its end.
-    """
+    """The valid name closest to `name`, upper and lower case alike.  Names that begin with `name`
+    come first, the shortest of them: it was not typed to its end."""
     by_lower = {v.lower(): v for v in reversed(list(valid))}
     # difflib is quadratic, and a name this long is no typing error anyway.
     typed = name[:SHOWN].lower()
@@ -80,7 +78,6 @@ SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
 
 
 def p_value(p: float) -> str:
-    """Two digits, or that it is below the smallest that is told."""
     if not math.isfinite(p):
         return "–"
     return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
@@ -110,7 +107,6 @@ def length(metres: float, digits: int = 3) -> str:
 
 
 def newtons(force: Iterable[float]) -> str:
-    """ "(0, 0, -2600) N"."""
     return f"({', '.join(rounded(v, 6) for v in force)}) N"
 
 
@@ -119,7 +115,6 @@ def load_text(force: Iterable[float]) -> str:
 
 
 def together(parts: Sequence[str], last: str = "and") -> str:
-    """ "a, b and c"."""
     return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
 
 
@@ -145,10 +140,7 @@ def quoted(found: object) -> str:
 
 def printable(text: str) -> str:
     """`text` with what a terminal would obey or a reader could not see as escapes: \\x1b, \\u202e.
-
-    The one way in which names from files and arguments are shown.  Text that is shown already
-    stays as it is.
-    """
+    Names from files and arguments are shown in no other way."""
     if text.isprintable():
         return text
     return "".join(
@@ -159,8 +151,7 @@ def printable(text: str) -> str:
 
 
 def is_label(text: str) -> bool:
-    """Can this text stand in a table cell and be read back as it is shown: one line, no blanks at
-    its ends, nothing that cannot be seen?"""
+    """One line, no blanks at its ends, nothing that cannot be seen: a cell that reads back."""
     return bool(text) and text == text.strip() == printable(text)
 
 
@@ -170,11 +161,9 @@ _NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", r
 
 
 def cell_text(cell: object) -> object:
-    """A cell of a table as it is written: text that no spreadsheet takes for a formula.
-
-    Text that begins with = + - @ and is no number gets an apostrophe before it, as spreadsheets
-    write such text; `cell_meaning` takes it off again.
-    """
+    """A cell of a table as it is written: text that begins with = + - @ and is no number gets an
+    apostrophe before it, so that no spreadsheet takes it for a formula; `cell_meaning` takes it
+    off."""
     if not isinstance(cell, str) or _NUMBER.fullmatch(cell):
         return cell
     return f"'{printable(cell)}" if _FORMULA.match(cell) else printable(cell)
@@ -210,11 +199,7 @@ def plain(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """`value` as strict JSON over several lines, without a newline at its end.
-
-    Numbers that do not exist become null; documentation of each key says what its null means.
-    Raises TypeError for what JSON has no form for.
-    """
+    """Strict JSON over several lines; numbers that do not exist become null."""
     return json.dumps(plain(value), indent=1, allow_nan=False)
 
 
@@ -297,12 +282,9 @@ def flag_of(keyword: str) -> str:
 
 
 def option(keyword: str, value: object = None) -> str:
-    """An option of a verb as a message names it.
-
-    In Python its keyword argument, `seed` or outliers='drop'; within `options_as_flags`, on the
-    command line, its flag: --seed or --outliers drop.  It is worded where the message is made,
-    since messages end in results, their files and reports as well as in exceptions.
-    """
+    """An option of a verb as a message names it: in Python its keyword argument, `seed` or
+    outliers='drop'; within `options_as_flags` its flag, --seed or --outliers drop.  It is worded
+    where the message is made, since messages end in results, their files and reports too."""
     if _said["flags"]:
         flag = flag_of(keyword)
         if value is False:
@@ -324,19 +306,16 @@ def _saying(**how: Any) -> Iterator[None]:
 
 
 def options_as_flags() -> AbstractContextManager[None]:
-    """Within it messages name options by their flags, as the command line has them."""
     return _saying(flags=True)
 
 
 def options_given(keywords: Iterable[str]) -> AbstractContextManager[None]:
-    """Within it messages on a key of the cell in whose place one of these options is given name the
-    option, where they name the key by `wish`."""
+    """Within it messages that name a key by `wish` name the option that is given in its place."""
     return _saying(given=frozenset(keywords))
 
 
 def wish(keyword: str, key: str) -> str:
-    """What the user asks for as messages name it: the option where one is given in the place of a
-    key of the cell, else the `key`."""
+    """The option where one is given in the place of a key of the cell, else the `key`."""
     return option(keyword) if keyword in _said["given"] else key
 
 
@@ -346,11 +325,9 @@ INTERNAL = 70  # what sysexits.h calls a fault of the software
 
 
 def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
-    """What a library raised as a sentence that names the files `read`, and the exit code.
-
-    Memory that ends and numbers that cannot be computed with come from the input; whatever else
-    is raised by code of elastocal is a fault of its own, and asked to be reported.
-    """
+    """What a library raised as a sentence that names the files `read`, and the exit code.  Memory
+    that ends and numbers that cannot be computed with come from the input; whatever else code of
+    elastocal raises is a fault of its own, and asked to be reported."""
     what = f"{type(error).__name__}: {error}".rstrip(": ")
     if plugin := _of_plugin(error, what):
         return plugin, 2
@@ -409,7 +386,6 @@ def _of_plugin(error: Exception, what: str) -> str:
 
 @contextmanager
 def said_of(where: object) -> Iterator[None]:
-    """Within it an InputError says first what it is said of: a file, or an option."""
     try:
         yield
     except InputError as error:
@@ -422,7 +398,7 @@ def require(condition: object, message: str) -> None:
 
 
 def check_known(name: str, there: Collection[str], told: str, them: str = "there are") -> None:
-    """Raise InputError unless `name` is one of those that are `there`: behind what is `told` of it
-    stand the nearest of them, and all."""
+    """Behind what is `told` of an unknown name stand the nearest of those that are `there`, and
+    all."""
     if name not in there:
         raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there) or 'none'}")

@@ -37,7 +37,6 @@ SPELT = {
 
 
 def _spelt(error: UnicodeError) -> tuple[str, int]:
-    """The error handler of streams: letters spelt out, or as escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     part = error.object[error.start : error.end]
@@ -166,7 +165,6 @@ def end_at_once() -> None:
 
 
 def shown(text: str) -> str:
-    """`text` of several lines, each as it can be read."""
     return "\n".join(map(printable, text.split("\n")))
 
 

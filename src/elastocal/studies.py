@@ -219,10 +219,7 @@ def _json(where: str, value: Any) -> str:
 
 
 def load(sources: Sources) -> ModuleType:
-    """Returns the module study.py, imported once per process as long as no other study comes.
-
-    Raises InputError with file and line where importing it fails.
-    """
+    """The module study.py, imported once per process as long as no other study comes."""
     global _here
     with _LOCK:
         if _here is None or _here[0] != sources.digest:
@@ -284,11 +281,8 @@ def line_of(
 
 
 def execute(sources: Sources, task: Row) -> Row:
-    """The line of results that came of the task.
-
-    Its draws are those of child `task` of SeedSequence(seed), whoever computes it and however many
-    there are.
-    """
+    """The line of results of a task, whose draws are those of child `task` of SeedSequence(seed),
+    whoever computes it and however many there are."""
     begun, rows, error, trace = time.perf_counter(), list[Row](), None, None
     draws = np.random.SeedSequence(sources.stated.seed, spawn_key=(task["task"],))
     try:
@@ -455,8 +449,7 @@ class ClusterLostError(ElastocalError):
 
 
 def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int | None) -> Lines:
-    """Lines of results of joblib's processes, by default one per core; where one alone is asked for
-    it is this process, for a debugger."""
+    """By default one per core; where one alone is asked for it is this process, for a debugger."""
     from joblib.externals import loky
 
     jobs = jobs or loky.cpu_count()
@@ -476,8 +469,7 @@ def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int 
 def on_cluster(
     study: Study, tasks: Sequence[Row], stop: StudyStop, client: Any, tell: Callable[[str], None]
 ) -> Lines:
-    """The same of a Dask cluster's workers.  No task waits at one: what is out is what is waited
-    for on Ctrl-C."""
+    """No task waits at a worker: what is out is what is waited for on Ctrl-C."""
 
     def room() -> int:
         # Without a limit a scheduler that goes away while it is asked is waited for for ever.

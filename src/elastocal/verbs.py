@@ -733,7 +733,6 @@ def _table(name: str, model: Model, given: Table) -> Measurements:
 
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
-    """What a file and the option `physical` state together; None where neither was given."""
     from elastocal.identification.knowledge import Knowledge, read_knowledge
 
     if given is None:

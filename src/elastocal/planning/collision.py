@@ -32,9 +32,9 @@ CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 def hull(solid: Solid, boxed: bool = False) -> tuple[Array, float]:
-    """Points (k, 3) in the carrier's frame and a radius: the solid is their convex hull grown by
-    the radius; a cylinder lies inside, and a mesh that is `boxed`, so that k ≤ 8, in the box around
-    it along its own axes."""
+    """Points (k, 3) in the carrier's frame and a radius by which their convex hull is grown: the
+    solid, or what a cylinder, and a mesh that is `boxed` (k ≤ 8, along its own axes), lies
+    inside."""
     if solid.shape == "mesh":
         points, radius = mesh_hull(solid)[0], 0.0
         if boxed:
@@ -51,7 +51,7 @@ def hull(solid: Solid, boxed: bool = False) -> tuple[Array, float]:
 
 
 def support(solid: Solid, direction: Array) -> float:
-    """max d·x over the solid, for a unit direction d (3,) in the carrier's frame, in m; exact."""
+    """max d·x over the solid, for a unit direction d (3,) in the carrier's frame; exact."""
     points, radius = hull(solid)
     if solid.shape == "cylinder":
         along = float(solid.placement[:3, 2] @ direction)
@@ -60,7 +60,7 @@ def support(solid: Solid, direction: Array) -> float:
 
 
 def touches(solid: Solid, point: Array, within: float) -> bool:
-    """True where the solid is at most `within` m from a point (3,) in the carrier's frame."""
+    """At most `within` m from a point (3,) in the carrier's frame."""
     import coal
 
     there = coal.Transform3s(np.eye(3), np.array(point, dtype=float))
@@ -70,7 +70,7 @@ def touches(solid: Solid, point: Array, within: float) -> bool:
 
 
 def capsule_between(name: str, a: Array, b: Array, radius: float) -> Solid:
-    """The capsule with cap centres a and b (3,); a sphere where they coincide."""
+    """A sphere where the cap centres coincide."""
     length = float(np.linalg.norm(b - a))
     if length < 1e-9:
         return Solid(name, "sphere", np.array([radius]), pose_at((a + b) / 2))
@@ -88,10 +88,8 @@ def rotation_to(z: Array) -> Array:
 
 
 def coal_shape(solid: Solid) -> Any:
-    """The coal shape centred at the solid's placement; meshes are their convex hull.
-
-    The hull makes a mesh a solid body: a triangle surface would not see what lies inside it.
-    """
+    """Centred at the solid's placement; a mesh is its convex hull, a solid body: a triangle surface
+    would not see what lies inside it."""
     import coal
 
     if solid.shape != "mesh":
@@ -104,7 +102,7 @@ def coal_shape(solid: Solid) -> Any:
 
 
 def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (k, 3) of the mesh's convex hull in the solid's own frame, and its triangles."""
+    """Vertices (k, 3) in the solid's own frame, and triangles."""
     if solid.mesh is None:
         raise InputError(f"body '{solid.name}' is a mesh, but no file is given for it")
     return _mesh_hull(solid.mesh, tuple(solid.size.tolist()), solid.name)
@@ -236,7 +234,6 @@ def data_base(cell: Cell) -> Array:
 
 
 def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
-    """Every body of the cell: arm, carried bodies, hanging load and rope, obstacles."""
     workspace = cell.workspace
     bodies = (
         *_arm(cell, chain),
@@ -462,8 +459,6 @@ class Poses:
 
 
 class Kinematics:
-    """Frames of the rigid nominal arm in whole batches."""
-
     def __init__(self, cell: Cell, chain: Chain) -> None:
         self.chain = chain
         self.T_data_base = data_base(cell)
@@ -517,9 +512,7 @@ class Collisions:
         self, poses: Poses, extra: float | Array = 0.0, placed: Array | None = None
     ) -> BoolArray:
         """(N,): some pair is nearer than its margin plus `extra` m, for all pairs or for each.
-
-        `placed` (N, 7 free): position and quaternion (x, y, z, w) of every free body.
-        """
+        `placed` (N, 7 free): position and quaternion (x, y, z, w) of every free body."""
         import pinocchio as pin
 
         last = poses.frames[:, poses.q.shape[1] - 1, :3, :3]
@@ -779,7 +772,6 @@ class Paths:
         return free
 
     def _interval(self, poses: Poses, half: Array) -> tuple[BoolArray, BoolArray]:
-        """Intervals (K,) that are free for certain, and those that refuse their move."""
         change = self._bound(poses, half)
         moved = change.max(axis=1, initial=0.0)
         # One batch per octave: its intervals share the largest change of every pair.

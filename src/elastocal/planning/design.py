@@ -417,8 +417,8 @@ class _Design:
     def _fewest(
         self, setup: Setup, pool: FeasiblePool, sought: Callable[[IntArray, Checkpoint], Search]
     ) -> tuple[Search, tuple[PlanSize, ...]]:
-        """The plan of the fewest poses that meets the target, and the sizes that were tried: the
-        bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
+        """The fewest poses that meet the target, and the sizes that were tried: the bound tells
+        where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
         wanted, figure = self.cell.design.target, setup.criterion.figure
         assert wanted is not None
         metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
@@ -511,8 +511,8 @@ class _Design:
         )  # fmt: skip
 
     def _names(self, pool: FeasiblePool, chosen: IntArray, own: int) -> tuple[str, ...]:
-        """Those that stay, behind the `own` ones of the pool, keep theirs, and the others are
-        numbered after all there have been."""
+        """Those that stay, behind the `own` ones of the pool, keep theirs; the others are numbered
+        after all there have been."""
         pins, q = self.options.pins, pool.q
         labels = self.options.done.configuration_labels if self.options.done else ()
         kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
