@@ -151,7 +151,6 @@ def diagnose(
 
 
 def _write_extended(path: Path, found: Diagnosis, data: Path, plugins: bool) -> Iterator[str]:
-    """Write the cell with the effects found, and say so and what to do with it."""
     from elastocal.model.manipulator import where_smooth_functions_end
     from elastocal.report.diagnosis_view import added_text
     from elastocal.saving import save_found_cell
@@ -170,7 +169,6 @@ def _write_extended(path: Path, found: Diagnosis, data: Path, plugins: bool) -> 
 
 
 def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> str:
-    """Write the extra poses, and say so; or why there are none to write."""
     from elastocal.saving import save_extra_poses
 
     extra = found.extra
@@ -316,7 +314,6 @@ def _check(
     targets: Path | None, target: str | None, output: Path | None, table: Path | None,
     of_a_table: tuple[str, str | None, str | None],
 ) -> None:  # fmt: skip
-    """Raises InputError for options that do not go together."""
     (_, box, rotation), given = of_a_table, (targets is not None) + (target is not None)
     need = "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE"
     require(given > 0 or table is not None, need)
@@ -428,7 +425,7 @@ def compare(
 
 
 def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
-    """Cell and both results where the cell does not come first, as it once did not."""
+    """Where the cell does not come first, as it once did not."""
     told = f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
     require(old.suffix.lower() != ".toml", told)
     known = old.parent / "cell.toml" if cell is None else cell
@@ -524,8 +521,7 @@ def _told(ending: Ending, results: Path) -> str:
 
 
 def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
-    """Tells how far a study is, of `total` tasks those that `ended`, failures among them: rate per
-    minute of this run, time left, failures; the first call begins."""
+    """Rate per minute of this run, time left, failures; the first call begins."""
     begun, before = time.monotonic(), -1
 
     def show(total: int, ended: int, failed: int) -> None:

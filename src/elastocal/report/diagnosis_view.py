@@ -307,7 +307,6 @@ def sensitivity(d: Diagnosis) -> list[str]:
 
 
 def diagnosis_steps(d: Diagnosis) -> list[str]:
-    """What to do now: the remedies of the findings, what extra poses promise, what to record."""
     steps = [f.remedy for f in d.findings if f.remedy]
     if (extra := d.extra) is not None:
         rivals, n = say.together([say.name_of(name) for name in extra.rivals], "or"), extra.n_poses
@@ -329,8 +328,8 @@ def diagnosis_steps(d: Diagnosis) -> list[str]:
 
 
 def alike(d: Diagnosis) -> list[str]:
-    """Sets of effects that these data cannot tell apart; beside many causes, the one that was
-    taken with its probability."""
+    """Sets of effects that these data cannot tell apart; beside many causes, the one that was taken
+    with its probability."""
     taken = {(f.effect, f.where): f.probability for f in d.effects} if d.groups else {}
 
     def told(e: EffectAt) -> str:
@@ -414,7 +413,6 @@ def pair_table(d: Diagnosis) -> say.ShownTable:
 
 
 def untested_table(d: Diagnosis) -> say.ShownTable:
-    """Effects that could not be tested, those with the same reason and remedy in one row."""
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
         effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
@@ -429,8 +427,7 @@ def untested_table(d: Diagnosis) -> say.ShownTable:
 
 
 def location_table(d: Diagnosis) -> say.ShownTable:
-    """The stages of the chain from commanded joints to tracker with the evidence for each, and the
-    likeliest places."""
+    """The stages of the chain from commanded joints to tracker, and the likeliest places."""
     location = d.location
     if location is None:
         return say.ShownTable((), [])
@@ -464,7 +461,6 @@ def _unnamed(d: Diagnosis) -> list[tuple[str, ComponentShare]]:
 
 
 def share_text(fraction: float, fine: bool | None = None) -> str:
-    """ "55 %", "1.6 %", "< 0.1 %"."""
     if not math.isfinite(fraction):
         return "–"
     fine = abs(fraction) < FINE if fine is None else fine
@@ -508,7 +504,6 @@ def cause_table(d: Diagnosis) -> say.ShownTable:
 
 
 def place_table(d: Diagnosis) -> say.ShownTable:
-    """What acts at each place, below the finding that it belongs to."""
     named = [c for c in d.components if c.named]
     found = [
         (say.effect_at_places(g.name, g.places),
