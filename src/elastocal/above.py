@@ -198,8 +198,6 @@ class Result(Saved):
         return import_module(VIEWS).frame(self)
 
 
-# Arguments
-
 # numpy is loaded where a value is looked at: the command line reads the kinds alone, for --help.
 
 MOST = 10_000_000  # of anything that is counted: more is a slip of the key

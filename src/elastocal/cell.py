@@ -314,8 +314,6 @@ def _check_names(table: Any, spot: Spot) -> None:
             places[name] = here
 
 
-# The space around the arm: bodies, obstacles, keep-out, sight, load (DESIGN: [workspace]).
-
 KnownEffects = Collection[str]
 
 

@@ -58,8 +58,6 @@ from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.tables import column, csv_text
 from elastocal.units import Array, BoolArray, IntArray
 
-# Targets: where the tool is to be, and in which frame that is stated.
-
 NEITHER = 1e-12  # the side that a joint came from where no move of it is known; 0 is a first visit
 
 Frame = Literal["base", "tracker"]
@@ -639,8 +637,6 @@ def _rows(targets: Targets, which: NDArray) -> str:
     rows = np.flatnonzero(which) if which.dtype == bool else which
     return some((targets.place(int(row)) for row in rows), 1)
 
-
-# Commands as files: the table that a robot program is made from, and a summary.
 
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.

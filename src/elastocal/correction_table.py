@@ -280,9 +280,6 @@ def _with_table(
     return errors[0], errors[1]
 
 
-# As the command line states and writes them.
-
-
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
     if text is None:
         return None

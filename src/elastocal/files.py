@@ -313,8 +313,6 @@ def _runs(process: int) -> bool:
     return True
 
 
-# Plug-ins.
-
 GROUP = "elastocal.plugins"
 MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
@@ -464,9 +462,6 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
         file, line = found or foreign or ("", 0)
         text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
         raise InputError(f"{where}: {file}, line {line}: {text}; correct the plug-in") from error
-
-
-# What may be registered, whatever it is.
 
 
 def check_registered(thing: object, base: type, what: str, example: str) -> None:

@@ -381,9 +381,6 @@ def order_contradicted(table: Measurements) -> str | None:
     )
 
 
-# Its columns
-
-
 def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
     numbered = list(enumerate(joint_kinds, start=1))
 
@@ -470,8 +467,6 @@ def _wrong_count(header: Sequence[str], family: Family) -> str:
         "drop the columns too many, or use the cell of the right robot")  # fmt: skip
     return f"{len(stems)} joint columns{names}, but the robot has {n} joints; {way}"
 
-
-# Reading
 
 READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured
 
@@ -605,9 +600,6 @@ def _check_duplicates(raw: RawTable, table: Measurements) -> None:
         )
 
 
-# Writing
-
-
 def write_measurements(measurements: Measurements, path: str | Path) -> None:
     """Write the table as CSV, or Parquet where the ending says so (.parquet, .pq); it reads back
     bit for bit.  Whole or not at all."""
@@ -630,9 +622,6 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
     rows = (zip(*(v[some].tolist() for v in columns.values()), strict=True) for some in pieces)
     with atomic_writer(path) as handle:
         tables.write_csv(handle, columns, chain.from_iterable(rows))
-
-
-# A covariance of their noise.
 
 
 def read_matrix(path: str | Path, what: str) -> Array:

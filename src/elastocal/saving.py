@@ -231,8 +231,6 @@ def number(value: float, digits: int) -> str:
     return "0" if text in ("-0", "") else text
 
 
-# An execution as a list of what a robot program does: move, have the load changed, measure.
-
 AXES = 6
 TAKE_OFF = "take the load off"
 
@@ -315,8 +313,6 @@ def limits_text(lower: Array, upper: Array) -> str:
         shown.append(f"J{i} {' '.join(told).removeprefix('from ' * (len(told) == 2)) or 'any'}")
     return ", ".join(shown)
 
-
-# What was written, read back.
 
 SAME = 1e-6  # rad, between a value of the plan and of the program
 DIGIT = 1e-8  # rad, more than half of the last digit of a program, 1e-6° or 1e-9 rad

@@ -256,8 +256,6 @@ def _standard(model: Model, rng: np.random.Generator, shape: tuple[int, ...]) ->
     return np.asarray(rng.standard_t(dof, shape) * np.sqrt(1 - 2 / dof))
 
 
-# The worked example.
-
 DEMO = Path(__file__).parent / "demo"  # its files
 LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg
 REPEATS = 6

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# The lines of a CSV file: bounded, checked and counted.
-
 MAX_LINE = 64 * 1024
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
@@ -188,9 +186,6 @@ IGNORED = ("#", "_", "note")
 # Seen in other people's tables: they make a name such as x_cm a wrong unit, not a typing error.
 OTHER_UNITS = {unit for units in FACTORS.values() for unit in units if unit}
 OTHER_UNITS |= {"km", "nm", "inch", "urad", "grad", "turn", "mNm"}
-
-
-# What a table may hold
 
 
 @dataclass(frozen=True)
@@ -356,9 +351,6 @@ def _unknown(
     )
 
 
-# What a table holds
-
-
 @dataclass(frozen=True)
 class Labels:
     """`codes` (n,) index into `names`, which stand in order of first appearance."""
@@ -433,9 +425,6 @@ class RawTable:
                     raise InputError(
                         f"{self.where(i, column.header)}: {what}; write a name or number"
                     )
-
-
-# Sources
 
 
 PARQUET = (".parquet", ".pq")
@@ -527,9 +516,6 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
     frame.columns = [str(name) for name in frame.columns]
     require(len(frame) > 0, f"{source}: has columns but no rows; add measurements")
     return frame
-
-
-# Writing
 
 
 def write_csv(

@@ -19,7 +19,6 @@ _TO_SI = {
     **dict.fromkeys(("", "si", "m", "rad", "N", "Nm", "s", "C", "kg"), (1.0, 1.0)),
 }  # fmt: skip
 
-# The types that every room passes on: arrays of numbers, and who is told of progress.
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]

@@ -699,9 +699,6 @@ def effects(cell: Any = None) -> DataFrame:
     return pd.DataFrame(effect_entries(_checked_cell(getattr(given, "cell", given), "cell")))
 
 
-# What the verbs take
-
-
 def _silent(message: str) -> None:
     """Who asks for no progress is told none."""
 

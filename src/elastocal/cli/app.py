@@ -208,9 +208,6 @@ def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool 
     return code
 
 
-# The files that a command reads and writes: checked before the work, written after it.
-
-
 def repeated() -> str:
     return shlex.join(["elastocal", *sys.argv[1:]])
 
@@ -225,9 +222,6 @@ def files_of(cell: Cell) -> list[Path]:
     return [path for path in named if path is not None]
 
 
-# Commands from the signatures of the verbs: an option is declared once.
-
-# What the user asks of a verb: its keyword arguments.
 Asked: TypeAlias = dict[str, Any]
 # Metavar and meaning of an option that is another thing as a text than in Python.
 Texts: TypeAlias = Mapping[str, tuple[str, Callable[[Any], Any]]]

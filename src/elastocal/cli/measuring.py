@@ -126,8 +126,6 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     screen.print('In the cell: [model] effects = ["joint_offset", "backlash:joint2"].')
 
 
-# design: a plan of poses.
-
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 CURVE = "--curve takes numbers of poses, as in 10,15,20"
 
@@ -302,9 +300,6 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     return written
 
 
-# simulate: measurements of a plan that were never made.
-
-
 @command(
     short_help="Simulate the measurements of a plan",
     verb=verbs.simulate,
@@ -349,9 +344,6 @@ def simulate(
     run.answer(
         lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
     )
-
-
-# import: tracker exports and joint logs → the measurement table.
 
 
 @command(

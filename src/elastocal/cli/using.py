@@ -99,8 +99,6 @@ def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float
     return {name: um * 1e-6 for name, um in found.items()}
 
 
-# diagnose: why the real arm still differs from the model.
-
 MOST_POSES = 10
 
 
@@ -182,9 +180,6 @@ def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> st
     return f"wrote {path}: {extra.n_poses} poses, {len(extra.plan)} visits"
 
 
-# next: which poses to measure next, or that no more are needed.
-
-
 @command("next")
 def next_command(
     cell: CellFile, data: DataFile, output: Output, batch: Annotated[int, typer.Option(min=1)] = 5,
@@ -229,9 +224,6 @@ def next_command(
     show = partial(print_report, result=found)
     if run.answer(found.to_json, show, files=found.plan is not None) and found.plan is None:
         say(f"{output} not written")
-
-
-# compensate and export: what a result is for.
 
 
 GRID = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
@@ -325,9 +317,6 @@ def _check(
     require(rotation is None or box is not None, "--rotation belongs to --box")
 
 
-# export: the calibrated arm for other programs.
-
-
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
 def export(
     cell: CellFile, result: ResultFile, output: Output, format: str | None = None,
@@ -374,9 +363,6 @@ def export(
         lambda: {"output": str(output)} | done.to_json(),
         lambda screen: print_blocks(screen, export_blocks(done)),
     )
-
-
-# compare: what has changed since the last calibration.
 
 
 @command(short_help="What has changed since the last calibration?")
@@ -433,8 +419,6 @@ def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, 
     require(cell is not None or known.is_file(), f"{told} {old} {new}")
     return known, old, new
 
-
-# study: a scripted study, on the local cores or on a Dask cluster.
 
 EVERY = 10.0  # s between plain lines of progress
 
@@ -536,9 +520,6 @@ def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
         tell(text + (f", {failed} failed" if failed else ""))
 
     return show
-
-
-# demo: the example.
 
 
 @command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")

@@ -283,9 +283,6 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     return tuple(tensors) if len(tensors) == chain.n_joints else ()
 
 
-# What an export costs: how far the file's arm is from the calibrated one, effect by effect.
-
-
 @dataclass(frozen=True)
 class Cost:
     """`total` between the full model and the file's, `effects` one by one, over `poses`.

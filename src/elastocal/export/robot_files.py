@@ -147,8 +147,6 @@ def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
     ]
 
 
-# A URDF for an arm that has none: a robot described by a DH table or a MuJoCo model.
-
 NEW_ENDS = NEW_BASE, NEW_FLANGE = "base_link", "flange"
 NO_LIMIT = 1e6  # m; a URDF's slide must have limits
 
@@ -253,9 +251,6 @@ def _from(folder: Path, place: Path) -> str:
         return Path(os.path.relpath(place, folder)).as_posix()
     except ValueError:  # on another drive
         return place.as_posix()
-
-
-# The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.
 
 
 def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Array) -> Array:

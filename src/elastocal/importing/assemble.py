@@ -556,8 +556,6 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
     return np.array([int(text) for text in stated], dtype=np.int64)
 
 
-# Whether an imported table can be right: its units, and whether the robot of a cell fits it.
-
 # Industrial arms measured by trackers: radians of a campaign span more than this, degrees too.
 SMALLEST_SPREAD_DEG = 7.0  # 2 pi: a column of radians read as degrees spans less
 LARGEST_TURN_DEG = 720.0

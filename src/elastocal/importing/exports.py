@@ -308,8 +308,6 @@ def _rapid(whole: str) -> Found:
         start += len(statement) + 1
 
 
-# Rows of a file as the mapping reads them.
-
 FORCES = tuple(f"force_{axis}" for axis in "xyz")
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
@@ -533,8 +531,6 @@ def likely_presets(path: Path) -> list[str]:
                 rows[name] = len(read_records(where, path, source, mapping.units))
     return [name for name, n in rows.items() if n == max(rows.values())]
 
-
-# What a row stands for: its position, its labels, its load.
 
 HEIGHT = ("zenith", "elevation")
 SPHERICAL = ("range", "azimuth", *HEIGHT)

@@ -160,8 +160,6 @@ class MappingTable(Table):
     join: JoinTable = key("a table", JoinTable())
 
 
-# Reads a mapping file and the presets: TOML → checked tables, the user's keys on top.
-
 # A key of [source.columns] with its unit cut off: what two keys for the same column share.
 _UNIT = re.compile(r"_[A-Za-z]+$")
 
@@ -223,8 +221,6 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
     tables = ("text", "names", "columns", "optional")
     return base | source | {part: base.get(part, {}) | source.get(part, {}) for part in tables}
 
-
-# Which column of an export fills which column of the measurement table, and in which unit.
 
 TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
 AUTO = "auto"
@@ -499,8 +495,6 @@ def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | No
     fitting = told if told and set(quantities(told)) & set(target.quantities) else None
     return replace(target, unit=stated or fitting or general or AUTO)
 
-
-# How numbers, times and units are written.
 
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"

@@ -25,8 +25,6 @@ from elastocal.model.chain import Chain
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array, BoolArray, pose_at
 
-# What a solid is to geometry: its hull, its support function and its coal shape.
-
 MESH_BYTES = 100_000_000
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
@@ -429,9 +427,6 @@ def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[s
     return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance
 
 
-# Where everything stands in a batch of poses, from the chain's one symbolic description.
-
-
 @dataclass(frozen=True)
 class Poses:
     """N poses: `q` (N, n), `force` (N, 3) N at the load point in the data's frame, and
@@ -566,8 +561,6 @@ def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> An
     return geometry
 
 
-# What the tracker sees: range, incidence on the reflector, free line of sight.
-
 # The beam ends this many of its radii before the marker: a reflector on a surface is then seen
 # at incidences up to acos(1/4) = 75° from the surface's normal.
 END = 4.0
@@ -645,9 +638,6 @@ def rope_angle(poses: Poses, axis: Array) -> Array:
     return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
 
 
-# How far a body can move during a part of a joint interpolation, at most.
-
-
 class MotionBound:
     """By how much the distance of a pair can change from an interval's middle to anywhere in it.
 
@@ -720,8 +710,6 @@ def _reach(bodies: Sequence[Body]) -> tuple[Array, Array]:
     radii = [np.full(len(own), (shape == "cylinder") * radius) for shape, own, radius in found]
     return np.concatenate([own for _, own, _ in found]), np.concatenate(radii)
 
-
-# Are joint interpolations free of collision?  Certified, not sampled.
 
 # A move that keeps its margins by less than this, in m, may be refused.
 RESOLUTION = 2.5e-5

@@ -248,9 +248,6 @@ class Turned(ScenarioCriterion):
         return Turned(self.base.softened(q), self.T)
 
 
-# Variances of linear functions of the parameters.
-
-
 @dataclass(frozen=True)
 class TraceCriterion(ScenarioCriterion):
     """Φ = tr(F V Fᵀ), L-optimality: the summed variance of the linear functions F (q, p) of y.
@@ -299,9 +296,6 @@ class TraceCriterion(ScenarioCriterion):
         if type(self).value is not TraceCriterion.value:
             return Turned(self, T)
         return replace(self, F=triangular(self.F @ T))
-
-
-# Eigenvalues of the covariance of the parameters of interest.
 
 
 @dataclass(frozen=True)
@@ -386,9 +380,6 @@ class MeanCriterion(SpectralCriterion):
 
     def phi_curvature(self, lam: Array) -> Array:
         return self.factor * mean_curvature(lam, self.order)
-
-
-# The criteria there are: variances of linear functions of the parameters.
 
 
 @dataclass(frozen=True)

@@ -103,8 +103,6 @@ from elastocal.planning.setup import (
 )
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# How a plan is searched for; what it is to be stands in the cell's [design].
-
 Effort = Literal["quick", "normal", "thorough", "batch"]
 
 
@@ -550,9 +548,6 @@ def _check_criterion(model: Model) -> None:
     for name in names:
         told = f"{wish('combination', f'{where}: [design] combination')} names {quoted(name)}"
         check_known(name, model.names, f"{told}, which is no parameter of the model")
-
-
-# Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:

@@ -28,8 +28,6 @@ def at_stops(cell: Cell) -> Motion:
     return replace(motion, dwell=motion.dwell + motion.reading * readings)
 
 
-# What a steady drift of tracker or base does to what the readings are evaluated for.
-
 DRIFT = 50e-6  # m, from the first reading to the last: a tracker or a base over an hour
 HARMLESS = 0.1  # of what noise leaves: adds half a per cent to the error
 
@@ -98,9 +96,6 @@ class Drifting:
     shortest: float
     noise: float
     at_test_poses: bool
-
-
-# The load states in turn, within a number of changes of load.
 
 
 def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> list[int]:

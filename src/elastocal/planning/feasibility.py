@@ -39,8 +39,6 @@ from elastocal.planning.collision import (
 )
 from elastocal.units import Array, BoolArray, IntArray
 
-# What a rule of the cell is, and those that bound a quantity of the pose.
-
 SAME = 1e-9  # rounding of a joint value that was set to its limit
 SHOWN = 3  # causes that a remedy names
 ADVICE = {
@@ -128,8 +126,6 @@ class Struck(Rule):
         off = [np.abs(poses.q - q).max(axis=1) for q in self._struck]
         return {"a pose struck out": np.asarray(np.min(off, axis=0) < NEARBY)}
 
-
-# Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
 
 # A pose keeps every margin by this much more, so that a move that ends there can be certified.
 POSE_SLACK = 1e-4  # m
@@ -755,6 +751,9 @@ class Moves:
 
 
 def approach_signs(chain: Chain, q: Array, lower: Array, upper: Array, by: float) -> IntArray:
+    """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first upwards
+    (+1), then down (−1), so that backlash and hysteresis show; both from the same side where the
+    other is beyond the limits."""
     below, above = q - by >= lower, q + by <= upper
     if not (below | above).all():
         i, j = (int(v) for v in np.argwhere(~(below | above))[0])

@@ -48,8 +48,6 @@ from elastocal.model.observations import SIZE, Observations, available_noise, ob
 from elastocal.simulation import marker_sigmas, simulate
 from elastocal.units import Array, BoolArray, IntArray
 
-# What a pose will be read as: its table rows, load states, and the covariance of its readings.
-
 Sight = Callable[[Array, Array], BoolArray]  # joints (N, n), force (3,) → (N, markers): seen?
 NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
@@ -125,8 +123,6 @@ def reading_noise(
         covariance = covariance + Z @ Z.T
     return sparse.csr_array(covariance)
 
-
-# From the symbolic model to information: whitened B of any pose.
 
 CHUNK_NUMBERS = 4_000_000  # numbers of a chunk's regressor held at once
 
@@ -223,8 +219,6 @@ class PoseInformation:
             covariance = covariance * (read[:, :, None] & read[:, None]) + never
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
-
-# What a plan can make certain: the parameters that some feasible pose shows, and their scale.
 
 SURE = 1e3  # standard deviations that a typical deviation counts for where a prior is stated
 # Share of a test point's motion that may lie outside what the poses show: rounding, not physics.
@@ -417,8 +411,6 @@ def evenly(group: IntArray, each: int) -> IntArray:
     members = [np.flatnonzero(group == g) for g in np.unique(group)]
     return np.sort(np.concatenate([own[:: -(-len(own) // each)] for own in members]))
 
-
-# Measurements already done: what they tell, so that a plan adds what they lack.
 
 IDENTIFIED = "the arm as identified from the measurements done"
 COMPUTED = 1e-9  # m: readings that scatter by less were not read

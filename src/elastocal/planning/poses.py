@@ -57,8 +57,6 @@ from elastocal.planning.plan import CandidateCounts
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
-
 
 @dataclass(frozen=True)
 class JointSpace:
@@ -116,8 +114,6 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     ((name, levels),) = wanted.items()
     return JointSpace(lower, upper, joint_index(name), levels)
 
-
-# Candidate poses: scrambled Sobol points within the limits that the cell allows.
 
 CHUNK = 2048  # a power of two, so that every chunk is balanced over the joint space
 GIVE_UP = 32 * CHUNK  # tries after which a group without any feasible pose counts as empty
@@ -250,8 +246,6 @@ def _checked(
             wave = islice(chunks, PER_TASK * effective_n_jobs(jobs))
             yield from pool([delayed(_check)(rules, forces, group, q) for q in wave])
 
-
-# How many poses a plan has at each level.
 
 DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
 
@@ -395,8 +389,6 @@ def _poses(table: Measurements) -> dict[str, int]:
     return found
 
 
-# A table of test poses: a machining path in joints, or in positions of the tool's point.
-
 TAKEN = ("q", "position", "rotation", "quaternion", "force")
 WEIGHT = Family("weight", "weights", {"weight": NO_UNIT})
 MOST_POSES = 10_000
@@ -428,8 +420,6 @@ def _columns(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> 
         )
     return columns
 
-
-# The test poses: where position must be right, under which load, at which point of the tool.
 
 # Where the user states none: fewer, and the plan serves just these, and harms what is between them.
 DEFAULT_COUNT = 100
@@ -664,9 +654,6 @@ class _Sources:
     def drawn_in(self, dimension: int, count: int) -> Array:
         drawn = sobol(dimension, self.seed).random_base2(int(np.ceil(np.log2(count))))
         return np.asarray(drawn[:count])
-
-
-# Where position must be right: A_t, how the parameters move the tool at the test poses.
 
 
 def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool = False) -> Array:

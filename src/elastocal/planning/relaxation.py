@@ -194,8 +194,6 @@ def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> fl
     return tangent.bound(problem.prior, float(sum(best)))
 
 
-# Column generation.
-
 GAP = 1e-4  # 1 − bound/Φ at which the relaxation ends
 EVEN = 0.05  # part of even weights in those that show where the support lies
 PER_PARAMETER = 4  # candidates of the first support per parameter, shared among the groups

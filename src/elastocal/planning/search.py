@@ -37,8 +37,6 @@ from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, p
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# What the stages of a design have finished.
-
 State = Mapping[str, Any]  # arrays and numbers, which become arrays
 KEY = "elastocal"  # the array that says of which design a file is
 
@@ -350,8 +348,6 @@ def distinct(q: Array, count: int) -> IntArray:
             chosen.append(i)
     return np.array(chosen, dtype=np.int64)
 
-
-# What a plan is sought by.
 
 POOL = 2000  # candidates where nobody asks for a number
 CLOSE, FINE = 1e-3, 1e-4  # gap of the relaxations that lead to the next one, and of the last

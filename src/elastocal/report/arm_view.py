@@ -333,8 +333,6 @@ def plan_arm(plan: Plan) -> say.Figure:
     return posed("poses", "The arm in the poses of the plan", caption, space)
 
 
-# The still picture
-
 MOST_NUMBERED = 80  # beyond that numbers hide each other
 LONGEST_NAME = 24
 SIGNS = ("o", "s", "^", "D", "v", "P")  # of groups, which differ in more than colour

@@ -134,8 +134,6 @@ def unfolded(blocks: Iterable[Block], which: Callable[[Fold], bool]) -> Iterator
             yield from unfolded(block.blocks(), which)
 
 
-# Numbers
-
 MOST_DECIMALS = 9
 
 
@@ -278,8 +276,6 @@ def first_stops(plan: Plan) -> dict[int, int]:
 def resource(name: str) -> str:
     return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
 
-
-# Effects in words
 
 # Places that are the only one their effects have: "base drift", not "base drift at base".
 SINGLE = ("base", "wrist", "load", "tracker", "arm")

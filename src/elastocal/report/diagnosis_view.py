@@ -155,9 +155,6 @@ def noise_floor_lines(
         yield f"{say.counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
 
 
-# The verdict, and what beside it
-
-
 NONE_NAMED = (
     "No effect is named: something may be missing, but nothing both stands out from the noise and "
     "lowers the error at poses left out of the fit"
@@ -339,9 +336,6 @@ def alike(d: Diagnosis) -> list[str]:
     return [say.together([told(e) for e in rivals]) for rivals in d.indistinguishable]
 
 
-# Tables
-
-
 def _budget(d: Diagnosis) -> say.Budget:
     steps = [step for step in d.budget if step.step != "noise_floor"]
     named = [(say.name_of(step.step), step.heldout_rms, step.ci95) for step in steps]
@@ -445,9 +439,6 @@ def location_table(d: Diagnosis) -> say.ShownTable:
     return say.ShownTable(("where", "probability"), rows, groups=groups)
 
 
-# Many causes at once: findings, and their places below them.
-
-
 def _error_of(c: ComponentShare) -> str:
     return FAMILIES.get(c.family, say.plain_name(c.family))
 
@@ -540,9 +531,6 @@ def curve_span(curve: Curve) -> str:
         return say.length(moved)
     shown, unit = say.display(moved, curve.y_unit)
     return f"{say.significant(shown)} {unit}"
-
-
-# Corrections that have no name.
 
 
 def _corrections(d: Diagnosis) -> Iterator[say.Block]:

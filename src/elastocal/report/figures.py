@@ -217,8 +217,6 @@ def waterfall(name: str, steps: say.Steps, floor: say.Floor, of: str) -> say.Fig
     return rows_of_dots(name, title, steps, "held-out rms error", caption, floor)
 
 
-# Panels of points, lines and bands
-
 Panel: TypeAlias = Callable[["Axes"], object]  # draws into its axes
 
 
@@ -291,8 +289,6 @@ def reach(values: Array) -> float:
 def _in_unit(kind: str, q: Array) -> tuple[Array, str]:
     return (np.degrees(q), "°") if kind == "revolute" else (q * 1e3, "mm")
 
-
-# Of a diagnosis and a plan
 
 LONGEST_ENTRY = 24  # what moves, written along the height of a small panel
 # Unit of a curve's axis → (factor, unit shown).
@@ -416,8 +412,6 @@ def plan_curve(plan: Plan) -> say.Figure:
 def _ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
     axes.set_xticks(places, names, rotation=90 if max(map(len, names)) > 2 else 0)
 
-
-# Of residuals
 
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
 MOST_LABELS = 20
@@ -572,8 +566,6 @@ class Residuals:
         heads = ("readings of", "number", "mean", "rms", "largest", "unit")
         return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
-
-# Over the work space
 
 CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told

@@ -335,9 +335,6 @@ def _influence_table(result: Calibration) -> say.ShownTable:
     return say.ShownTable(heads, rows, (0, 4), note=note)
 
 
-# The parameters as tables, and why some have no value of their own.
-
-
 def names_of(result: Calibration, standing: str) -> list[str]:
     found = findings.standings(result)
     return [printable(e.name) for e in result.ordinary if found[e.name] == standing]

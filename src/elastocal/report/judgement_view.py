@@ -524,9 +524,6 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
 
 
-# The smooth functions that were fitted.
-
-
 def smooth_table(result: Calibration) -> say.ShownTable:
     rows = []
     for part in (part for part in result.smooth if part.scale):

@@ -170,8 +170,6 @@ def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
     return table
 
 
-# Pages
-
 LIBRARIES = ("numpy", "scipy", "casadi")  # that the numbers depend on
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
 
@@ -264,8 +262,6 @@ style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
 </html>
 """
 
-
-# Blocks as HTML
 
 OPTION = re.compile(r"(?<!\S)\(?--[a-z][a-z-]+[.,:;)]*")
 VIEW = '<script type="application/json" class="view-data">'
@@ -375,9 +371,6 @@ def _picture(block: say.Figure) -> str:
         f'<figure class="view"><div class="still">{svg(block)}</div><div class="live" hidden></div>'
         f"{VIEW}{block.space.json}</script>{caption}</figure>"
     )
-
-
-# What goes with a page
 
 
 @cache

@@ -139,9 +139,6 @@ def _moves(c: Comparison) -> say.Figure:
     return rows_of_dots("moved", title, rows, "tool moved, rms", caption, noise)
 
 
-# Commands
-
-
 def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     from elastocal.compensation import summary
 
@@ -217,9 +214,6 @@ def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
     return say.ShownTable(("", "rms", "95 %", "max"), cells, title=title)
 
 
-# Readings
-
-
 def readings_blocks(table: Measurements) -> Iterator[say.Block]:
     rows = [
         (printable(name), str(len(np.unique(values.astype(str)))), "", "")
@@ -240,8 +234,6 @@ def readings_blocks(table: Measurements) -> Iterator[say.Block]:
         "", lambda: [rows_of_dots("joints", title, dots, axis, lengths=False)], figures=("joints",)
     )
 
-
-# The calibrated arm in a file
 
 WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 # At the start of a sentence and in a title.
@@ -311,8 +303,6 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
             "Next: if that matters, elastocal compensate corrects it with the same cell and result."
         )
 
-
-# What an import understood
 
 FIRST_ROWS = 5
 MOST_COLUMNS = 14  # of the first rows, on a wide terminal
@@ -605,8 +595,6 @@ def _poses(
             "the instrument's noise is included."
         )
 
-
-# The certificate as XML
 
 UNITS = {
     "m": "\\metre",
