@@ -40,17 +40,16 @@ DEEPEST = 32
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
-def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> int:
-    """The size of an existing regular file of at most `max_bytes`; `what` names it in messages."""
+def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> None:
+    """An existing regular file of at most `max_bytes`; `what` names it in messages."""
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
-        kind = _kind(found.st_mode)
+        kind = KINDS.get(stat.S_IFMT(found.st_mode), "a device")
         require(kind != FOLDER, f"{path}: is a directory; give the {what} itself")
         told = f"is {kind}, not a regular file; save the {what} to disk first"
         require(not kind, f"{path}: {told}")
     check_size(path, what, found.st_size, max_bytes)
-    return found.st_size
 
 
 # What is read by place → endings that tell of a file in another's place.
@@ -96,15 +95,10 @@ def _read_errors(path: str | Path, what: str) -> Iterator[None]:
 
 
 FOLDER = "a directory"
-KINDS = {
+KINDS = {  # of what is no regular file; empty of one
     stat.S_IFREG: "", stat.S_IFDIR: FOLDER, stat.S_IFIFO: "a pipe (FIFO)",
     stat.S_IFSOCK: "a socket",
 }  # fmt: skip
-
-
-def _kind(mode: int) -> str:
-    """What is no regular file; empty of one."""
-    return KINDS.get(stat.S_IFMT(mode), "a device")
 
 
 PIECE = 1 << 20  # bytes read at once
@@ -171,7 +165,7 @@ def check_exists(path: Path, key: str, owner: Path) -> Path:
     named, kind = f"{owner}: key {key} names {str(path)!r}", "missing"
     with suppress(OSError, InputError):
         _check_path(path)
-        kind = _kind(os.stat(path).st_mode)
+        kind = KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "a device")
     told = "does not exist or cannot be reached; paths are relative to the cell file"
     require(kind != "missing", f"{named}, which {told}")
     require(kind != FOLDER, f"{named}, a directory; name the file itself")

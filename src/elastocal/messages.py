@@ -17,7 +17,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from decimal import Decimal
 from difflib import get_close_matches
 from pathlib import Path
@@ -296,22 +296,15 @@ def option(keyword: str, value: object = None) -> str:
 
 
 @contextmanager
-def _saying(**how: Any) -> Iterator[None]:
+def saying(**how: Any) -> Iterator[None]:
+    """Within it messages name options by their `flags`, as the command line has them, and those
+    that are `given` in the place of a key of the cell where `wish` names that."""
     before = _said.copy()
     _said.update(how)
     try:
         yield
     finally:
         _said.update(before)
-
-
-def options_as_flags() -> AbstractContextManager[None]:
-    return _saying(flags=True)
-
-
-def options_given(keywords: Iterable[str]) -> AbstractContextManager[None]:
-    """Within it messages that name a key by `wish` name the option that is given in its place."""
-    return _saying(given=frozenset(keywords))
 
 
 def wish(keyword: str, key: str) -> str:

@@ -46,23 +46,24 @@ def _spelt(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error("elastocal", _spelt)
 
 
-def prepare_streams() -> None:
-    """Have stdout and stderr spell out what their encoding lacks, instead of failing."""
+@contextmanager
+def spelling() -> Iterator[None]:
+    """Within it stdout and stderr spell out what their encoding lacks, instead of failing; then
+    what is left is written, and a reader that went away (… | head) is no error."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="elastocal")
-
-
-def close_streams() -> None:
-    """Write what is left; a reader that went away (… | head) is no error."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            if stream is not None:
-                stream.flush()
-        except (OSError, ValueError):
-            # Python flushes once more at its end, and would complain.
-            with suppress(OSError, ValueError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                if stream is not None:
+                    stream.flush()
+            except (OSError, ValueError):
+                # Python flushes once more at its end, and would complain.
+                with suppress(OSError, ValueError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 # Ctrl-C: noted besides being raised, since libraries swallow it or make another error of it.

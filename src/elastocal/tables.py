@@ -415,17 +415,6 @@ class RawTable:
             f"drop the {self.noun}"
         )
 
-    def check_labels(self) -> None:
-        for column in (c for own in self.columns.values() for c in own if c.is_label):
-            labels = self.labels[column.header]
-            for code, name in enumerate(labels.names):
-                if not is_label(name) and (name or not column.may_be_blank):
-                    i = int(np.argmax(labels.codes == code))
-                    what = f"{quoted(name)} has control characters" if name else "empty cell"
-                    raise InputError(
-                        f"{self.where(i, column.header)}: {what}; write a name or number"
-                    )
-
 
 PARQUET = (".parquet", ".pq")
 
@@ -447,7 +436,13 @@ def read_table(
         with open_input(path, what, most) if text is None else BytesIO(text.encode()) as handle:
             header, commas, rows = csv_lines(source, handle, what, comments)
             table = _read(source, "line", header, rows, choose, commas)
-    table.check_labels()
+    for column in (c for own in table.columns.values() for c in own if c.is_label):
+        labels = table.labels[column.header]
+        for code, name in enumerate(labels.names):
+            if not is_label(name) and (name or not column.may_be_blank):
+                where = table.where(int(np.argmax(labels.codes == code)), column.header)
+                what = f"{quoted(name)} has control characters" if name else "empty cell"
+                raise InputError(f"{where}: {what}; write a name or number")
     return table
 
 

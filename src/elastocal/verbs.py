@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 from elastocal.above import checked_arguments, later, shown, whole
-from elastocal.messages import InputError, option, options_given, quoted, require
+from elastocal.messages import InputError, option, quoted, require, saying
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -196,7 +196,7 @@ def design_request(
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
     named = tuple(name for name, given in asked.items() if given is not None)
-    with options_given(named):
+    with saying(given=named):
         cell = replace(cell, design=_design_of(cell, asked))
         cell.check()
     for number in curve:

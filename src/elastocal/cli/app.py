@@ -52,17 +52,16 @@ from elastocal.messages import (
     explained,
     flag_of,
     json_text,
-    options_as_flags,
     require,
+    saying,
 )
 from elastocal.screen import (
-    close_streams,
     complain,
     interrupts,
-    prepare_streams,
     progress_line,
     safe_console,
     say,
+    spelling,
 )
 
 if TYPE_CHECKING:
@@ -112,7 +111,7 @@ class Told(TyperGroup):
         left to typer, which takes an EOFError for an interrupt."""
         before = len(interrupts)  # of an earlier command in this process
         try:
-            with options_as_flags(), warnings.catch_warnings():
+            with saying(flags=True), warnings.catch_warnings():
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
                 warnings.simplefilter("ignore", RuntimeWarning)
                 return super().invoke(ctx)
@@ -172,12 +171,11 @@ def run_app() -> None:
     gc.set_threshold(COLLECT_AFTER)
     # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    prepare_streams()
     try:
-        # The same name however it is called: completion scripts are made of it.
-        app(prog_name="elastocal")
+        with spelling():
+            # The same name however it is called: completion scripts are made of it.
+            app(prog_name="elastocal")
     finally:
-        close_streams()
         # Python ends by looking for garbage once more, which takes 0.17 s, as long as fitting a
         # small table does.
         gc.freeze()

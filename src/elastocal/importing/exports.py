@@ -109,10 +109,6 @@ def table_rows(
     guess = NumberCells("auto", settings.thousands, settings.missing, ())
     numbers = (c.at[0] for c in asked if c.required and c.quantities)
     places = [at for at in numbers if isinstance(at, int)]
-
-    def is_data(cells: Sequence[str]) -> bool:
-        return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
-
     named = any(isinstance(part, str) for c in asked if c.required for part in c.at)
     content, comments, ignored = _sorted_lines(source, lines, settings)
     tried = _by_numbers(content) if settings.delimiter == "auto" else [settings.delimiter]
@@ -128,7 +124,11 @@ def table_rows(
             break
     table = list(_split(source, delimiter, content))
     if not named:
-        first = next((k for k, row in enumerate(table[:SAMPLE]) if is_data(row[1])), None)
+        first = next(
+            (k for k, (_, cells) in enumerate(table[:SAMPLE])
+             if all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)),
+            None,
+        )  # fmt: skip
         if first is None:
             number, line = content[0]
             raise InputError(

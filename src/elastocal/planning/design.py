@@ -26,10 +26,10 @@ from elastocal.messages import (
     length,
     listed,
     option,
-    options_given,
     quoted,
     require,
     rounded,
+    saying,
     wish,
 )
 from elastocal.model.chain import (
@@ -154,7 +154,7 @@ def design(
     on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
-    with options_given(options.asked):
+    with saying(given=options.asked):
         read = options.done.marker_names if options.done else ()
         if options.done is not None and lacks_noise(cell):
             progress("noise of the measurements done")
