@@ -492,7 +492,17 @@ class Collisions:
         import pinocchio as pin
 
         self._margins = np.array([pair.margin for pair in pairs])
-        model = arm_model(kinematics, free)
+        chain, model, parent = kinematics.chain, pin.Model(), 0
+        for i, joint in enumerate(chain.joints):
+            placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
+            moving = getattr(pin, f"JointModel{joint.kind.capitalize()}Unaligned")(
+                joint.axis.copy()
+            )
+            parent = model.addJoint(parent, moving, pin.SE3(np.array(placement)), f"joint{i + 1}")
+        load_point = (chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
+        model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(pose_at(load_point)), "hanging")
+        for i in range(free):
+            model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
         geometry = geometry_of(kinematics, [item for p in pairs for item in (p.body, p.other)])
         hangs = np.array([pair.hangs for pair in pairs], dtype=bool)
         self._pools = []
@@ -524,21 +534,6 @@ class Collisions:
             rows = configuration[left].T
             found[left] = np.array(pin.computeCollisionsInParallel(1, pool, rows, True))
         return found
-
-
-def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
-    import pinocchio as pin
-
-    model, parent = pin.Model(), 0
-    for i, joint in enumerate(kinematics.chain.joints):
-        placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
-        moving = getattr(pin, f"JointModel{joint.kind.capitalize()}Unaligned")(joint.axis.copy())
-        parent = model.addJoint(parent, moving, pin.SE3(np.array(placement)), f"joint{i + 1}")
-    load_point = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
-    model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(pose_at(load_point)), "hanging")
-    for i in range(free):
-        model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
-    return model
 
 
 def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> Any:
