@@ -107,12 +107,10 @@ def key(takes: str, default: Any = None) -> Any:
 
 @dataclass(frozen=True)
 class Key:
-    """A key of a file; `takes` completes the sentence 'key … takes …'.
-
-    `form`: the type of its value there, None where it is the field's.  `into`: makes the field's
-    value of it, its table and its name; None converts from the unit that the name ends with.
-    `kind`: the type that is checked, as `fields_of` finds it.
-    """
+    """A key of a file; `takes` completes the sentence 'key … takes …'.  `form`: the type of its
+    value there, None where it is the field's.  `into`: makes the field's value of it, its table and
+    its name; None converts from the unit that the name ends with.  `kind`: the type that is
+    checked, as `fields_of` finds it."""
 
     name: str = ""
     takes: str = ""
@@ -142,11 +140,9 @@ def keyed(
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, keyed))
 def record(cls: type[Record]) -> type[Record]:
-    """Make a class a frozen dataclass whose fields are checked, in SI units.
-
-    A wrong argument is an InputError that names class, field, what it takes and what was found.
-    Records are compared as `ByValue` does.
-    """
+    """Make a class a frozen dataclass whose fields are checked, in SI units, and compared as
+    `ByValue` does.  A wrong argument is an InputError that names class, field, what it takes and
+    what was found."""
     made: Any = pydantic_dataclass(frozen=True, eq=False, config=STRICT)(cls)
     for name in ("_compared", "__eq__", "__hash__"):
         setattr(made, name, vars(ByValue)[name])
@@ -279,10 +275,8 @@ def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[s
 
 @dataclass(frozen=True)
 class Spot:
-    """A table of the file `path`, whose top level is `root`: the keys that lead to it.
-
-    `named`: the last of them is a name that the user chose.
-    """
+    """A table of the file `path`, whose top level is `root`: the keys that lead to it, the last a
+    name that the user chose where `named`."""
 
     path: Any
     keys: tuple[str | int, ...] = ()
@@ -293,16 +287,13 @@ class Spot:
         return replace(self, keys=(*self.keys, part), named=False)
 
     def key(self, name: str) -> str:
-        """The key `name` of this table as a message names it."""
         return place(*self.keys, name)
 
     def require(self, condition: object, sentence: str) -> None:
-        """Raises InputError with the file and `sentence` unless `condition` holds."""
         require(condition, f"{self.path}: {sentence}")
 
 
 def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> Record:
-    """Parsed TOML as a table or record; `where` names its source in messages."""
     found: Record = _table(table, data, Spot(where, root=table), "a table")
     return found
 
@@ -401,9 +392,8 @@ def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[A
 def joint_values(
     table: Mapping[str, Sequence[float]], spot: Spot, name: str, others: tuple[str, ...] = ()
 ) -> dict[str, tuple[float, ...]]:
-    """Values in SI units per joint name, from keys such as joint2_deg of the table `name`, whose
-    further keys are the `others`.  A joint may be named as in the robot's file:
-    `model.joint_names`."""
+    """In SI units per joint name, from keys such as joint2_deg of the table `name`, whose further
+    keys are the `others`.  Joints may be named as in the robot's file: `model.joint_names`."""
     values: dict[str, tuple[float, ...]] = {}
     above = spot.key(name)
     for key, stated_values in table.items():
@@ -435,8 +425,7 @@ def dotted(keys: Sequence[str]) -> str:
 
 
 def header(keys: Sequence[str | int]) -> str:
-    """A table as a message names it: [design], or [[design.test_pose]] no. 2, by a number (from 0)
-    after its key."""
+    """[design], or [[design.test_pose]] no. 2, by a number (from 0) after its key."""
     names = dotted([k for k in keys if isinstance(k, str)])
     if keys and isinstance(keys[-1], int):
         return f"[[{names}]] no. {keys[-1] + 1}"
@@ -444,7 +433,7 @@ def header(keys: Sequence[str | int]) -> str:
 
 
 def place(*keys: str | int) -> str:
-    """A key as a message names it: design.poses, or q_deg of [[design.test_pose]] no. 2."""
+    """design.poses, or q_deg of [[design.test_pose]] no. 2."""
     last = max((i for i, k in enumerate(keys) if isinstance(k, int)), default=-1)
     rest = dotted([k for k in keys[last + 1 :] if isinstance(k, str)])
     if last < 0:

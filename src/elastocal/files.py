@@ -115,7 +115,7 @@ def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
-    """The text of a UTF-8 file (a byte order mark is dropped) of at most `max_bytes`."""
+    """Of a UTF-8 file; a byte order mark is dropped."""
     return decoded(str(path), read_bytes(path, what, max_bytes), f"save the {what} as UTF-8")
 
 
@@ -205,10 +205,8 @@ _written: list[tuple[Path, Path]] | None = None
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Files that are written in the `with` block appear at its end, all of them.
-
-    Where the block fails none does, and what stood there before is untouched.
-    """
+    """Files that are written within it appear at its end, all of them; where it fails none does,
+    and what stood there before is untouched."""
     global _written
     _written = written = list[tuple[Path, Path]]()
     try:

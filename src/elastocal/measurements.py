@@ -290,15 +290,12 @@ def first_of_visit(table: Measurements) -> IntArray:
 
 
 def with_moves(table: Measurements) -> Measurements:
-    """The table with the way the arm came to each visit, by the order of its visits.
-
-    `move` (n, joints) is the commanded q of the visit minus that of the visit before, in rad or m:
-    by the columns `before_1 …` where they are recorded, else with the visits in order of time, or
-    of the rows where there is none, which is an assumption (`order_contradicted`).  A
-    visit that moved no joint keeps the move before it, and the first has none.  `direction`
-    (n, joints) is the sign of each joint's own last motion, 0 where it has not moved yet.  All
-    rows of a visit have those of its first row.
-    """
+    """The table with the way the arm came to each visit, by the order of its visits.  `move` (n,
+    joints) is the commanded q of the visit minus that of the visit before, in rad or m: by the
+    columns `before_1 …` where they are recorded, else with the visits in order of time, or of the
+    rows where there is none, which is an assumption (`order_contradicted`).  A visit that moved no
+    joint keeps the move before it, and the first has none.  `direction` (n, joints) is the sign of
+    each joint's own last motion, 0 where it has not moved yet."""
     n = len(table)
     if n == 0 or table.q.shape[1] == 0:
         return replace(table, move=None, direction=None)
@@ -338,10 +335,8 @@ FOLLOWING = 3.3  # standard deviations of chance: one joint in a thousand
 
 def in_any_order(table: Measurements) -> bool:
     """Whether no joint's value goes with the row: where it does (a grid, a sorted table), what
-    changes between rows is not to be told from what depends on the pose.
-
-    The correlation of successive visits' values; √n ρ is N(0, 1) in random order.
-    """
+    changes between rows is not to be told from what depends on the pose.  The correlation of
+    successive visits' values; √n ρ is N(0, 1) in random order."""
     q = table.q[np.unique(first_of_visit(table))]
     q = q - q.mean(axis=0)
     square = (q**2).sum(axis=0)

@@ -57,7 +57,6 @@ def some(names: Iterable[str], most: int, joint: str = ", ", more: str = " and {
 
 
 def counted(n: int, one: str, many: str | None = None) -> str:
-    """ "1 pose", "2 poses"."""
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
@@ -69,7 +68,6 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def rounded(value: float, digits: int = 3) -> str:
-    """The same without zeros at its end: 1830, 0.12, 1."""
     told = significant(value, digits)
     return told.rstrip("0").rstrip(".") if "." in told and "e" not in told else told
 
@@ -84,7 +82,6 @@ def p_value(p: float) -> str:
 
 
 def size_of(p: float) -> str:
-    """ "p = 0.02", "p < 0.0001"."""
     text = p_value(p)
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
@@ -161,9 +158,8 @@ _NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", r
 
 
 def cell_text(cell: object) -> object:
-    """A cell of a table as it is written: text that begins with = + - @ and is no number gets an
-    apostrophe before it, so that no spreadsheet takes it for a formula; `cell_meaning` takes it
-    off."""
+    """As a table is written: text that begins with = + - @ and is no number gets an apostrophe, so
+    that no spreadsheet takes it for a formula; `cell_meaning` takes it off."""
     if not isinstance(cell, str) or _NUMBER.fullmatch(cell):
         return cell
     return f"'{printable(cell)}" if _FORMULA.match(cell) else printable(cell)
@@ -234,7 +230,6 @@ _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
 
 
 def bounded(message: str) -> str:
-    """A message whose words, keys and names of files among them, have an end."""
     short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
     half = LONGEST_MESSAGE // 2
     return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
@@ -283,8 +278,8 @@ def flag_of(keyword: str) -> str:
 
 def option(keyword: str, value: object = None) -> str:
     """An option of a verb as a message names it: in Python its keyword argument, `seed` or
-    outliers='drop'; within `options_as_flags` its flag, --seed or --outliers drop.  It is worded
-    where the message is made, since messages end in results, their files and reports too."""
+    outliers='drop'; where flags are said --seed or --outliers drop.  It is worded where the message
+    is made, since messages end in results, their files and reports too."""
     if _said["flags"]:
         flag = flag_of(keyword)
         if value is False:
@@ -391,7 +386,6 @@ def require(condition: object, message: str) -> None:
 
 
 def check_known(name: str, there: Collection[str], told: str, them: str = "there are") -> None:
-    """Behind what is `told` of an unknown name stand the nearest of those that are `there`, and
-    all."""
+    """Behind what is `told` of an unknown name stand the nearest of what is `there`, and all."""
     if name not in there:
         raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there) or 'none'}")

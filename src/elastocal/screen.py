@@ -73,10 +73,8 @@ interrupts: list[int] = []
 
 @contextmanager
 def noting_interrupts() -> Iterator[list[int]]:
-    """In a `with` block a SIGINT that would raise KeyboardInterrupt is noted too.
-
-    Where code that cannot raise (Cython's, a finaliser's) swallows one, it comes again.
-    """
+    """A SIGINT that would raise KeyboardInterrupt is noted too; where code that cannot raise
+    (Cython's, a finaliser's) swallows one, it comes again."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # not ignored, as under nohup
         signal.signal(signal.SIGINT, _note)
@@ -112,12 +110,10 @@ GRACE = 30.0  # s that running tasks of a study are waited for
 
 
 class StudyStop:
-    """Ctrl-C and SIGTERM: in a `with` block, `asked` says that no more tasks may be handed out.
-
-    A second signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check`
-    raises it again: a task's library may catch one and return where its search stood, and such a
-    result must not be kept.
-    """
+    """Ctrl-C and SIGTERM: within it `asked` says that no more tasks may be handed out.  A second
+    signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check` raises it
+    again: a task's library may catch one and return where its search stood, and such a result must
+    not be kept."""
 
     def __init__(self, grace: float = GRACE, tell: Callable[[str], None] | None = None) -> None:
         self.asked = self._now = False

@@ -96,11 +96,9 @@ class StudyFile(Table):
 @dataclass(frozen=True)
 class Sources:
     """The .py files of a study's folder and the files that study.toml names, by their names, and
-    what it states, with options and seed settled.
-
-    Sent to each worker: one that has the same folder with the same contents uses it there, any
-    other unpacks this one, so a cluster needs no shared file system.
-    """
+    what it states, with options and seed settled.  Sent to each worker: one that has the same
+    folder with the same contents uses it there, any other unpacks this one, so a cluster needs no
+    shared file system."""
 
     folder: Path
     contents: Mapping[str, bytes]
@@ -493,12 +491,10 @@ def _lines(
     study: Study, tasks: Sequence[Row], stop: StudyStop, submit: Callable[..., Future[Row]],
     room: Callable[[], int],
 ) -> Lines:  # fmt: skip
-    """The lines as they come, none twice; no task begins once `stop` is asked for.
-
-    Where a process dies joblib ends them all: what ran is repeated, one task after the other, so
-    that it is known whose process dies each time.  Dask gives the tasks of a dead worker to
-    another, and gives up a task that killed more than distributed.scheduler.allowed-failures.
-    """
+    """None twice; no task begins once `stop` is asked for.  Where a process dies joblib ends them
+    all: what ran is repeated, one task after the other, so that it is known whose process dies each
+    time.  Dask gives the tasks of a dead worker to another, and gives up a task that killed more
+    than distributed.scheduler.allowed-failures."""
     waiting, out, died = deque(tasks), dict[Future[Row], Row](), Counter[int]()
     while out or (waiting and not stop.asked):
         most = room() if waiting and not stop.asked else 0
@@ -526,12 +522,10 @@ def _lines(
 def _security(
     distributed: Any, address: str, unencrypted: bool = False, **files: Path | None
 ) -> Any:
-    """Dask's Security for a client of `address`: with the `files` tls_ca, tls_cert and tls_key
-    (PEM) or those of Dask's configuration.
-
-    Whoever stands between could run code of their own here and there: tasks and results are
-    pickles.  So another host is reached by TLS only, unless `unencrypted` allows it.
-    """
+    """For a client of `address`: with the `files` tls_ca, tls_cert and tls_key (PEM) or those of
+    Dask's configuration.  Whoever stands between could run code of their own here and there: tasks
+    and results are pickles.  So another host is reached by TLS only, unless `unencrypted` allows
+    it."""
     given = {name: path for name, path in files.items() if path is not None}
     for name, path in given.items():
         read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)

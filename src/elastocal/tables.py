@@ -57,9 +57,8 @@ Row = tuple[int, list[str]]  # number of the line, its cells
 def csv_lines(
     source: str, handle: BinaryIO, what: str = "table", comments: bool = False
 ) -> tuple[tuple[str, ...], bool, Iterator[Row]]:
-    """The header, whether decimal commas may be used, and the other lines, each with as many cells
-    as the header.  `comments`: lines that begin with # are passed over, and lines of empty
-    cells."""
+    """The header, whether decimal commas may be used, and the other lines, each with as many cells.
+    `comments`: lines that begin with # are passed over, and lines of empty cells."""
     remedy = "save the table as CSV in UTF-8"
     lines = (
         (number, decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n"))
@@ -142,10 +141,9 @@ def first_bad_cell(
     source: str, rows: Iterable[Row], columns: Mapping[int, str], comma_allowed: bool,
     blanks: Container[str] = (), marks: dict[str, str] | None = None, noun: str = "line",
 ) -> InputError | None:  # fmt: skip
-    """What is wrong with the first bad cell.  `columns`: field index → header of the number
-    columns; `comma_allowed`: decimal commas may be used, then everywhere in the file; `blanks`:
-    headers of columns whose cells may be empty; `marks`: where decimal points and commas were found
-    in earlier rows."""
+    """`columns`: field index → header of the number columns; `comma_allowed`: decimal commas may be
+    used, then everywhere in the file; `blanks`: headers of columns whose cells may be empty;
+    `marks`: where decimal points and commas were found in earlier rows."""
     marks = {} if marks is None else marks
     for number, cells in rows:
         for i, header in columns.items():
@@ -288,9 +286,8 @@ def check_columns(
     needed: Sequence[Sequence[str]] = (), needed_by: str = "",
     exclusive: Sequence[tuple[str, str]] = (),
 ) -> Columns:  # fmt: skip
-    """The columns, where no family is there in part.  `needed`: of each entry one family must be
-    there, because `needed_by` (as in "a DH table needs"); `exclusive`: pairs of families that say
-    the same."""
+    """No family is there in part.  `needed`: of each entry one family must be there, because
+    `needed_by` (as in "a DH table needs"); `exclusive`: pairs of families that say the same."""
     for name, found in columns.items():
         family, unit, stems = known[name], found[0].unit, [c.stem for c in found]
         absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
@@ -517,7 +514,6 @@ def write_csv(
     handle: TextIO, header: Iterable[str], rows: Iterable[Iterable[object]],
     comments: Iterable[str] = (),
 ) -> None:  # fmt: skip
-    """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
     handle.writelines(f"# {printable(comment)}\n" for comment in comments)
     writer = csv.writer(handle, lineterminator="\n")
     writer.writerow(map(cell_text, header))

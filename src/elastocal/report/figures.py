@@ -85,7 +85,6 @@ WIDTH = 5.6  # inches
 
 
 def style() -> AbstractContextManager[None]:
-    """Defaults of matplotlib with this package's colours, whatever the user has configured."""
     import matplotlib.style
     from cycler import cycler
 
