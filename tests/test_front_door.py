@@ -21,7 +21,7 @@ from elastocal import plugins
 from elastocal.cell_tables import DesignSpec
 from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.identification.start import Options
-from elastocal.messages import options_as_flags
+from elastocal.messages import saying
 from elastocal.planning.design import DesignOptions
 from elastocal.report.renderers import FRAMES
 from elastocal.saving import WRITERS
@@ -178,7 +178,7 @@ def test_diagnose_is_that_of_the_command_line(folder):
     given = ("cell.toml", "data.csv", "-o", "line.json", "--cell-out", "line.toml", "--seed", "1")
     done = command("diagnose", *given, "-q")
     assert done.exit_code == 0, done.output
-    with options_as_flags():  # its remedies name options
+    with saying(flags=True):  # its remedies name options
         why.save("front.json")
     assert Path("front.json").read_text() == Path("line.json").read_text()
     assert why.budget and why.verdict == "nothing_significant"  # nothing is missing in the demo

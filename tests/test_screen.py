@@ -58,7 +58,7 @@ def test_a_message_is_one_line(capsys):
 
 
 def test_streams_without_the_letters_spell_them_out():
-    program = "from elastocal.screen import *; prepare_streams(); say('σ ≤ 3 µm, 20 °, é, \\u202e')"
+    program = "from elastocal.screen import *\nwith spelling(): say('σ ≤ 3 µm, 20 °, é, \\u202e')"
     environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment)
     assert done.stdout == b"sigma <= 3 um, 20 deg, \\xe9, \\u202e\n"

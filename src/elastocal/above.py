@@ -198,8 +198,6 @@ class Result(Saved):
         return import_module(VIEWS).frame(self)
 
 
-# Arguments
-
 # numpy is loaded where a value is looked at: the command line reads the kinds alone, for --help.
 
 MOST = 10_000_000  # of anything that is counted: more is a slip of the key
@@ -226,8 +224,7 @@ def _array(value: Any) -> bool:
 
 
 def _values(value: Any) -> bool:
-    """Numbers, complex ones too; whether they can be computed with is for what computes with
-    them."""
+    """Numbers, complex ones too; what computes with them says whether it can."""
     import numpy as np
 
     try:

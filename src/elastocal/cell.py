@@ -314,11 +314,6 @@ def _check_names(table: Any, spot: Spot) -> None:
             places[name] = here
 
 
-# The space around the arm: bodies, obstacles, keep-out, sight, load (DESIGN: [workspace]).
-
-KnownEffects = Collection[str]
-
-
 class PluginsTable(Table):
     """Effects, criteria and noise models of the user's own."""
 
@@ -455,7 +450,7 @@ class Cell:
             )
 
     @classmethod
-    def read(cls, path: str | Path, known_effects: KnownEffects | None = None) -> Cell:
+    def read(cls, path: str | Path, known_effects: Collection[str] | None = None) -> Cell:
         """Returns the cell that a TOML file describes, in SI units.
 
         Args:
@@ -486,7 +481,7 @@ class Cell:
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         return {"path": spot.path, "name": table.get("name") or spot.path.stem}
 
-    def check(self, known_effects: KnownEffects | None = None) -> None:
+    def check(self, known_effects: Collection[str] | None = None) -> None:
         """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
 
         Args:

@@ -757,7 +757,6 @@ class DesignSpec:
 def _per_level(
     given: int | list[int] | None, levels: dict[str, tuple[float, ...]], spot: Spot
 ) -> tuple[int, ...]:
-    """The number of poses of each level of the one joint that has levels, () where not stated."""
     if given is None or len(levels) > 1:
         return ()
     spot.require(

@@ -58,8 +58,6 @@ from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.tables import column, csv_text
 from elastocal.units import Array, BoolArray, IntArray
 
-# Targets: where the tool is to be, and in which frame that is stated.
-
 NEITHER = 1e-12  # the side that a joint came from where no move of it is known; 0 is a first visit
 
 Frame = Literal["base", "tracker"]
@@ -176,14 +174,12 @@ def nominal_path(
     chain: Chain, position: Array, rotation: Array | None, point: Array,
     limits: tuple[Array, Array], near: Array | None, seed: int = 0,
 ) -> tuple[Array, BoolArray]:  # fmt: skip
-    """Nominal joints (n, joints) that bring `point` (3,) of the flange to places along a path, and
-    whether the nominal arm reaches each place (n,); where not, the nearest posture stands there.
-
-    `position` (n, 3) m and `rotation` (n, 3, 3) of the flange, or None for any, in the base
-    frame.  The first place is reached in the posture nearest to `near` (default: the middle of the
-    joint ranges), every other from the one before it, so that neighbouring places have neighbouring
-    joints.  Where that fails, or takes a large step, the nearest of many postures is taken.
-    """
+    """Nominal joints (n, joints) that bring `point` (3,) of the flange to places (n, 3) m along a
+    path, `rotation` (n, 3, 3) of the flange or None for any, in the base frame; and whether each is
+    reached (n,): where not, the nearest posture stands there.  The first place is reached in the
+    posture nearest to `near` (default: the middle of the joint ranges), every other from the one
+    before it, so that neighbouring places have neighbouring joints.  Where that fails, or takes a
+    large step, the nearest of many postures is taken."""
     n = len(position)
     q, reached = np.zeros((n, chain.n_joints)), np.zeros(n, dtype=bool)
     task = Reaching(chain, position, rotation, point, None, *limits)
@@ -220,7 +216,6 @@ def nominal_path(
 def _nearest(
     task: Reaching, chain: Chain, found: Postures, k: int, place: int, near: Array | None
 ) -> tuple[Array, bool]:
-    """Of row k of the postures found the nearest to `near`, or what comes nearest to the place."""
     q, good = found.q[k], found.reached[k]
     if near is None or not good.any():
         return q[0], bool(good[0])
@@ -232,11 +227,9 @@ def _nearest(
 
 
 def jumps(task: Reaching, q: Array, usable: BoolArray) -> IntArray:
-    """Rows i whose joints leave those of row i − 1 by much more than the tool's motion asks for.
-
-    q (n, joints); rows that are not `usable` are passed over.  The measure is the step of least
-    norm that the tool's motion asks for, J⁺r, at either end; steps below 20° never count.
-    """
+    """Rows (of the `usable`) whose joints leave those of the row before by much more than the
+    tool's motion asks for: than the step of least norm J⁺r at either end; steps below 20° never
+    count."""
     rows = np.flatnonzero(usable)
     if len(rows) < 2:
         return np.zeros(0, dtype=np.int64)
@@ -273,12 +266,9 @@ class Goals:
 
 
 class Commanding(BoundedSearch):
-    """r(q) of the calibrated tool against its goals, searched within the joint limits.
-
-    Levenberg–Marquardt of `BoundedSearch` with the derivative through the equilibrium.  Its steps
+    """r(q) of the calibrated tool against its goals, searched within the joint limits.  Its steps
     have the least norm, so that from nominal commands, from which those wanted are a few
-    milliradians away, an arm with more joints than the task has equations stays next to them.
-    """
+    milliradians away, an arm with more joints than the task has equations stays next to them."""
 
     def __init__(
         self, tool: CalibratedTool, rows: list[NDArray], goals: Goals, lower: Array, upper: Array
@@ -298,7 +288,6 @@ class Commanding(BoundedSearch):
         return np.column_stack([np.linalg.norm(r[:, :3], axis=1), turn])
 
     def commands(self, nominal: Array, target: IntArray) -> tuple[Array, Array]:
-        """Commands (R, joints) for the targets near nominal ones, and what they miss (R, 2)."""
         q = self.solve(nominal, target)[0]
         return q, self.misses(q, target)
 
@@ -435,7 +424,6 @@ def compensate(
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
-    """The targets in the data's frame, from that of the base by T (n, 4, 4)."""
     if targets.position is not None:
         _check_unit(targets, targets.position, chain, T)
         goals = Goals(targets.position, targets.rotation)
@@ -478,8 +466,8 @@ def _other_postures(
     search: Commanding, chain: Chain, position: Array, flange: Array | None, place: Array,
     lost: IntArray, nominal: Array, seed: int,
 ) -> Array:  # fmt: skip
-    """Nominal commands (lost, joints) of the targets `lost`, in another posture where the
-    calibrated arm reaches them from one: the nearest to the old command."""
+    """Nominal commands (lost, joints) in another posture where the calibrated arm reaches the
+    target from one: the nearest to the old command."""
     limits = search.lower, search.upper
     found = inverse_kinematics(chain, position, limits, rotation=flange, point=place, seed=seed)
     n, count, joints = found.q.shape
@@ -650,8 +638,6 @@ def _rows(targets: Targets, which: NDArray) -> str:
     return some((targets.place(int(row)) for row in rows), 1)
 
 
-# Commands as files: the table that a robot program is made from, and a summary.
-
 SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
 DIGITS = 9
@@ -690,11 +676,8 @@ def check_status(
 
 
 def commands_csv(result: Compensation) -> str:
-    """The commands, one row per target in the order of the targets.
-
-    Joints and corrections of a row that is not reached are left empty.  Forces stand in the
-    data's frame, as in every plan, so that `simulate` can read the table.
-    """
+    """One row per target, empty where it is not reached.  Forces stand in the data's frame, as in
+    every plan, so that `simulate` can read the table."""
     held, kinds = np.where(result.reached[:, None], 1.0, np.nan), result.chain.kinds
     blocks = [(joint_columns(kinds), held * in_file_units(result.q, kinds), f".{DIGITS}f")]
     table = result.targets.table
@@ -721,8 +704,8 @@ def commands_csv(result: Compensation) -> str:
 def table_csv(
     blocks: Sequence[tuple[list[str], Array, str]], status: Sequence[str], **texts: Sequence[str]
 ) -> str:
-    """Columns of texts, of numbers (headers, values (n, headers), format), and the status; NaN is
-    left empty."""
+    """Columns of texts, of numbers (headers, values (n, headers), format; NaN is left empty), and
+    the status."""
     header = [*texts, *(head for heads, _, _ in blocks for head in heads), "status"]
     rows = []
     for i, told in enumerate(status):
@@ -769,7 +752,7 @@ def summary(result: Compensation, commands: bool) -> dict[str, Any]:
 
 
 def spread(values: Array) -> dict[str, float | None]:
-    """rms, 95 % quantile and maximum of values in m (rad), in µm (µrad); None without values."""
+    """Of values in m (rad), in µm (µrad)."""
     known = values[np.isfinite(values)] * 1e6
     if not len(known):
         return {"rms": None, "p95": None, "max": None}

@@ -107,12 +107,10 @@ def key(takes: str, default: Any = None) -> Any:
 
 @dataclass(frozen=True)
 class Key:
-    """A key of a file; `takes` completes the sentence 'key … takes …'.
-
-    `form`: the type of its value there, None where it is the field's.  `into`: makes the field's
-    value of it, its table and its name; None converts from the unit that the name ends with.
-    `kind`: the type that is checked, as `fields_of` finds it.
-    """
+    """A key of a file; `takes` completes the sentence 'key … takes …'.  `form`: the type of its
+    value there, None where it is the field's.  `into`: makes the field's value of it, its table and
+    its name; None converts from the unit that the name ends with.  `kind`: the type that is
+    checked, as `fields_of` finds it."""
 
     name: str = ""
     takes: str = ""
@@ -132,23 +130,19 @@ def keyed(
     keys: Sequence[Key] = (), required: bool = False, **default: Any,
 ) -> Any:  # fmt: skip
     """A field of a record that a file states; `default` or `default_factory` as of `field`.
-
-    `names` of its key, which end with their unit, {} in `takes`; none is the field's own name, and
-    of several the user chooses one.  Without `takes` it is one of a Literal, or true or false.
-    `keys` in their place where several state the field together; then `from_keys` of the record
-    puts them together.  The others are as of `Key`.
-    """
+    `names` of its key end with their unit, {} in `takes`; none is the field's own name, and of
+    several the user chooses one.  Without `takes` it is one of a Literal, or true or false.  `keys`
+    in their place where several state the field together; then `from_keys` of the record puts them
+    together."""
     own = [Key(name, takes, form, into, required) for name in names or ("",)]
     return field(metadata={"keys": tuple(keys or own)}, **default)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field, keyed))
 def record(cls: type[Record]) -> type[Record]:
-    """Make a class a frozen dataclass whose fields are checked, in SI units.
-
-    A wrong argument is an InputError that names class, field, what it takes and what was found.
-    Records are compared as `ByValue` does.
-    """
+    """Make a class a frozen dataclass whose fields are checked, in SI units, and compared as
+    `ByValue` does.  A wrong argument is an InputError that names class, field, what it takes and
+    what was found."""
     made: Any = pydantic_dataclass(frozen=True, eq=False, config=STRICT)(cls)
     for name in ("_compared", "__eq__", "__hash__"):
         setattr(made, name, vars(ByValue)[name])
@@ -258,7 +252,6 @@ def tables_in(kind: Any) -> list[tuple[Any, bool]]:
 
 
 def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """The parsed TOML file of at most `max_bytes`; `what` names it in messages."""
     text = read_text(path, what, max_bytes)
     if found := _DOTTED.search(text):
         line = text.count("\n", 0, found.end()) + 1
@@ -282,10 +275,8 @@ def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[s
 
 @dataclass(frozen=True)
 class Spot:
-    """A table of the file `path`, whose top level is `root`: the keys that lead to it.
-
-    `named`: the last of them is a name that the user chose.
-    """
+    """A table of the file `path`, whose top level is `root`: the keys that lead to it, the last a
+    name that the user chose where `named`."""
 
     path: Any
     keys: tuple[str | int, ...] = ()
@@ -296,16 +287,13 @@ class Spot:
         return replace(self, keys=(*self.keys, part), named=False)
 
     def key(self, name: str) -> str:
-        """The key `name` of this table as a message names it."""
         return place(*self.keys, name)
 
     def require(self, condition: object, sentence: str) -> None:
-        """Raises InputError with the file and `sentence` unless `condition` holds."""
         require(condition, f"{self.path}: {sentence}")
 
 
 def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> Record:
-    """Parsed TOML as a table or record; `where` names its source in messages."""
     found: Record = _table(table, data, Spot(where, root=table), "a table")
     return found
 
@@ -335,7 +323,7 @@ _adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}  # by what is kept besid
 
 
 def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any:
-    """What stands at a spot as a `kind`: tables within it are read one by one."""
+    """Tables within what stands at a spot are read one by one."""
     members = list(alternatives(kind))
     for member in members:
         inner, origin = get_args(member), get_origin(member)
@@ -367,10 +355,8 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
 
 def from_table(cls: type[Record], table: Mapping[str, Any], spot: Spot, **values: Any) -> Record:
     """The record that the checked values of a table state, in SI units; `values` are known.
-
     `cls.from_keys(table, spot)`, where there is one, gives the fields that several keys state
-    together; each other field is stated by one of its keys.
-    """
+    together; each other field is stated by one of its keys."""
     known: Any = cls
     values |= known.from_keys(table, spot) if hasattr(cls, "from_keys") else {}
     for name, keys in fields_of(known).items():
@@ -406,11 +392,8 @@ def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[A
 def joint_values(
     table: Mapping[str, Sequence[float]], spot: Spot, name: str, others: tuple[str, ...] = ()
 ) -> dict[str, tuple[float, ...]]:
-    """Values in SI units per joint name, from keys such as joint2_deg of the table `name`.
-
-    `others`: further keys of that table, which a misspelt one may have been meant for.  A joint may
-    be named as in the robot's file, which `model.joint_names` looks into.
-    """
+    """In SI units per joint name, from keys such as joint2_deg of the table `name`, whose further
+    keys are the `others`.  Joints may be named as in the robot's file: `model.joint_names`."""
     values: dict[str, tuple[float, ...]] = {}
     above = spot.key(name)
     for key, stated_values in table.items():
@@ -442,10 +425,7 @@ def dotted(keys: Sequence[str]) -> str:
 
 
 def header(keys: Sequence[str | int]) -> str:
-    """A table as a message names it: [design], or [[design.test_pose]] no. 2.
-
-    A number (from 0) after a key says which of its tables [[…]] is meant.
-    """
+    """[design], or [[design.test_pose]] no. 2, by a number (from 0) after its key."""
     names = dotted([k for k in keys if isinstance(k, str)])
     if keys and isinstance(keys[-1], int):
         return f"[[{names}]] no. {keys[-1] + 1}"
@@ -453,7 +433,7 @@ def header(keys: Sequence[str | int]) -> str:
 
 
 def place(*keys: str | int) -> str:
-    """A key as a message names it: design.poses, or q_deg of [[design.test_pose]] no. 2."""
+    """design.poses, or q_deg of [[design.test_pose]] no. 2."""
     last = max((i for i, k in enumerate(keys) if isinstance(k, int)), default=-1)
     rest = dotted([k for k in keys[last + 1 :] if isinstance(k, str)])
     if last < 0:
@@ -501,11 +481,9 @@ def is_number(value: object) -> bool:
 def numbers(
     *shape: int | None, least: float = -np.inf, above: float = -np.inf, one_for_all: bool = False
 ) -> PlainValidator:
-    """The validator of finite numbers in lists, or lists of lists, which become an array.
-
-    In its `shape`, by default (None,), None stands for any number but zero.  `one_for_all` takes a
-    single number too, as that of all.  Each is at least `least` and greater than `above`.
-    """
+    """The validator of finite numbers in lists, or lists of lists, which become an array.  In its
+    `shape` None stands for any number but zero; `one_for_all` takes a single number too, as that of
+    all.  Each is at least `least` and greater than `above`."""
     n, *columns = wanted = shape or (None,)
     kind, takes = "numbers", f"{n or 'a list of'} {'positive ' * (above == 0)}numbers"
     if columns:

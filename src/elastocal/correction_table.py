@@ -166,8 +166,8 @@ def _mostly_inexact(
     arm: CalibratedArm, grid: CorrectionGrid, status: tuple[str, ...], point: ToolPoint,
     force: Array | None, seed: int,
 ) -> str:  # fmt: skip
-    """Why most points are not exact: some of them are tried again away from the joint limits, and
-    then with one joint moved, to see what helps."""
+    """Some of the points are tried again away from the joint limits, and then with one joint moved,
+    to see what helps."""
     told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: for most others "
     chain, beyond = arm.model.chain, "the command is out of the joint limits"
     if grid.joints:
@@ -243,7 +243,6 @@ def _corrections(
 
 
 def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> single.Goals:
-    """Where the calibrated tool is at joints q, in the base frame."""
     rows = tool.rows(result.targets.moved(q, result.force))
     return single.Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
 
@@ -279,9 +278,6 @@ def _with_table(
         off = _between(_achieved(tool, check, joints), aimed)[known]
         errors.append(np.column_stack([np.linalg.norm(off[:, k : k + 3], axis=1) for k in (0, 3)]))
     return errors[0], errors[1]
-
-
-# As the command line states and writes them.
 
 
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:

@@ -40,17 +40,16 @@ DEEPEST = 32
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
-def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> int:
-    """The size of an existing regular file of at most `max_bytes`; `what` names it in messages."""
+def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> None:
+    """An existing regular file of at most `max_bytes`; `what` names it in messages."""
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
-        kind = _kind(found.st_mode)
+        kind = KINDS.get(stat.S_IFMT(found.st_mode), "a device")
         require(kind != FOLDER, f"{path}: is a directory; give the {what} itself")
         told = f"is {kind}, not a regular file; save the {what} to disk first"
         require(not kind, f"{path}: {told}")
     check_size(path, what, found.st_size, max_bytes)
-    return found.st_size
 
 
 # What is read by place → endings that tell of a file in another's place.
@@ -63,7 +62,6 @@ OTHERS = {
 
 @contextmanager
 def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
-    """An existing regular file of at most `max_bytes`, opened for binary reading."""
     told = f"the {what} is given by its path; found {type(path).__name__}"
     require(isinstance(path, str | Path), told)
     ending = Path(path).suffix.lower()
@@ -97,22 +95,16 @@ def _read_errors(path: str | Path, what: str) -> Iterator[None]:
 
 
 FOLDER = "a directory"
-KINDS = {
+KINDS = {  # of what is no regular file; empty of one
     stat.S_IFREG: "", stat.S_IFDIR: FOLDER, stat.S_IFIFO: "a pipe (FIFO)",
     stat.S_IFSOCK: "a socket",
 }  # fmt: skip
-
-
-def _kind(mode: int) -> str:
-    """What is no regular file; empty of one."""
-    return KINDS.get(stat.S_IFMT(mode), "a device")
 
 
 PIECE = 1 << 20  # bytes read at once
 
 
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    """The content of a regular file of at most `max_bytes`, sized before it is read."""
     data = bytearray()
     with open_input(path, what, max_bytes) as handle:
         # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
@@ -123,15 +115,13 @@ def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
-    """The text of a UTF-8 file (a byte order mark is dropped) of at most `max_bytes`."""
+    """Of a UTF-8 file; a byte order mark is dropped."""
     return decoded(str(path), read_bytes(path, what, max_bytes), f"save the {what} as UTF-8")
 
 
 def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
-    """What a JSON file of at most `max_bytes` holds; whole numbers too long for that are floats.
-
-    Raises InputError, with `remedy`, where it is no strict JSON: names the line where there is one.
-    """
+    """Strict JSON; whole numbers too long for it become floats.  What is wrong is told with the
+    line, where there is one, and the `remedy`."""
     text = read_text(path, what, max_bytes)
 
     def number(digits: str) -> float:
@@ -159,11 +149,8 @@ def decoded(
     source: str, data: bytes, remedy: str, codec: str = "utf-8-sig", name: str = "UTF-8",
     line: int = 1,
 ) -> str:  # fmt: skip
-    """The text of `data`, which begins in `line` of a file, in the encoding `codec`.
-
-    Raises InputError that names line and byte where `data` is no such text; `name` is what people
-    call the encoding, `remedy` what they can do.
-    """
+    """The text of `data`, which begins in `line` of a file; `name` is what people call the encoding
+    `codec`, `remedy` what they can do."""
     try:
         return data.decode(codec)
     except UnicodeDecodeError as error:
@@ -178,7 +165,7 @@ def check_exists(path: Path, key: str, owner: Path) -> Path:
     named, kind = f"{owner}: key {key} names {str(path)!r}", "missing"
     with suppress(OSError, InputError):
         _check_path(path)
-        kind = _kind(os.stat(path).st_mode)
+        kind = KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "a device")
     told = "does not exist or cannot be reached; paths are relative to the cell file"
     require(kind != "missing", f"{named}, which {told}")
     require(kind != FOLDER, f"{named}, a directory; name the file itself")
@@ -218,10 +205,8 @@ _written: list[tuple[Path, Path]] | None = None
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Files that are written in the `with` block appear at its end, all of them.
-
-    Where the block fails none does, and what stood there before is untouched.
-    """
+    """Files that are written within it appear at its end, all of them; where it fails none does,
+    and what stood there before is untouched."""
     global _written
     _written = written = list[tuple[Path, Path]]()
     try:
@@ -238,11 +223,8 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
-    """A handle (text in UTF-8) whose content appears under `path` only when all of it is written.
-
-    Raises InputError as `check_output` does; whatever fails within the `with` block leaves no
-    temporary file and the old content of `path` untouched.
-    """
+    """A handle (text in UTF-8) whose content appears under `path` only when all of it is written;
+    whatever fails leaves no temporary file, and the old content of `path` untouched."""
     check_output(path)
     mode = "b" if binary else ""
     how: dict[str, Any] = {} if binary else {"encoding": "utf-8", "newline": "\n"}
@@ -282,7 +264,6 @@ def _write_errors(path: str | Path) -> Iterator[None]:
 
 
 def atomic_write(path: str | Path, content: str | bytes) -> None:
-    """Write text (as UTF-8) or bytes under `path`, whole or not at all."""
     with atomic_writer(path, isinstance(content, bytes)) as handle:
         handle.write(content)
 
@@ -324,8 +305,6 @@ def _runs(process: int) -> bool:
     return True
 
 
-# Plug-ins.
-
 GROUP = "elastocal.plugins"
 MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
@@ -338,14 +317,10 @@ REGISTERED: set[type] = set()  # the classes of effects, noise models and criter
 def load_plugins(
     cell: Path | None = None, modules: Sequence[str] = (), asked: bool = True, fresh: bool = True
 ) -> None:
-    """Run the plug-ins of installed packages, and the `modules` that the file `cell` names.
-
-    A name that ends with .py is the path of a file; any other is a module that can be imported.
-    What has been run is not run again, but where `fresh` for a file that has changed.  `asked`:
-    whether the user said that they may run, as the environment variable TRUSTED says of folders.
-
-    Raises InputError that names the plug-in, its file and the line, where one cannot be run.
-    """
+    """Run the plug-ins of installed packages, and the `modules` that the file `cell` names: paths
+    of files (.py) or modules that can be imported.  What has been run is not run again, but where
+    `fresh` for a file that has changed.  `asked`: whether the user said that they may run, as the
+    environment variable TRUSTED says of folders."""
     load_installed()
     owner = cell or Path("plug-ins")
     for k, name in enumerate(modules):
@@ -404,8 +379,7 @@ def load_installed() -> None:
 
 @cache
 def _load_installed_in(folders: tuple[str, ...]) -> None:
-    """Of packages in these folders: looking for them reads what every package says of itself, so it
-    is done once in a process."""
+    """Once in a process: looking for them reads what every package says of itself."""
     from importlib.metadata import entry_points
 
     for point in entry_points(group=GROUP):
@@ -482,11 +456,7 @@ def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
         raise InputError(f"{where}: {file}, line {line}: {text}; correct the plug-in") from error
 
 
-# What may be registered, whatever it is.
-
-
 def check_registered(thing: object, base: type, what: str, example: str) -> None:
-    """InputError unless `thing` is an object of a class derived from `base`, with a name."""
     if isinstance(thing, type) and issubclass(thing, base):
         raise InputError(f"register {what}, {thing.__name__}(), not its class")
     kind = type(thing)

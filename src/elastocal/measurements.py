@@ -273,7 +273,7 @@ def numbered(*columns: NDArray[Any]) -> IntArray:
 
 
 def load_states(force: Array) -> IntArray:
-    """Number (n,) of each force (n, 3) in N, alike to a µN."""
+    """Of forces (n, 3) in N, alike to a µN."""
     with np.errstate(over="ignore"):  # of forces beyond all measure
         return numbered(*np.round(force, 6).T)
 
@@ -290,15 +290,12 @@ def first_of_visit(table: Measurements) -> IntArray:
 
 
 def with_moves(table: Measurements) -> Measurements:
-    """The table with the way the arm came to each visit, by the order of its visits.
-
-    `move` (n, joints) is the commanded q of the visit minus that of the visit before, in rad or m:
-    by the columns `before_1 …` where they are recorded, else with the visits in order of time, or
-    of the rows where there is none, which is an assumption (`order_contradicted`).  A
-    visit that moved no joint keeps the move before it, and the first has none.  `direction`
-    (n, joints) is the sign of each joint's own last motion, 0 where it has not moved yet.  All
-    rows of a visit have those of its first row.
-    """
+    """The table with the way the arm came to each visit, by the order of its visits.  `move` (n,
+    joints) is the commanded q of the visit minus that of the visit before, in rad or m: by the
+    columns `before_1 …` where they are recorded, else with the visits in order of time, or of the
+    rows where there is none, which is an assumption (`order_contradicted`).  A visit that moved no
+    joint keeps the move before it, and the first has none.  `direction` (n, joints) is the sign of
+    each joint's own last motion, 0 where it has not moved yet."""
     n = len(table)
     if n == 0 or table.q.shape[1] == 0:
         return replace(table, move=None, direction=None)
@@ -338,10 +335,8 @@ FOLLOWING = 3.3  # standard deviations of chance: one joint in a thousand
 
 def in_any_order(table: Measurements) -> bool:
     """Whether no joint's value goes with the row: where it does (a grid, a sorted table), what
-    changes between rows is not to be told from what depends on the pose.
-
-    The correlation of successive visits' values; √n ρ is N(0, 1) in random order.
-    """
+    changes between rows is not to be told from what depends on the pose.  The correlation of
+    successive visits' values; √n ρ is N(0, 1) in random order."""
     q = table.q[np.unique(first_of_visit(table))]
     q = q - q.mean(axis=0)
     square = (q**2).sum(axis=0)
@@ -379,9 +374,6 @@ def order_contradicted(table: Measurements) -> str | None:
         f"{table.source}: from which side the joints came, by approach_1 …, is in {share:.0%} of "
         "the visits what the order of the rows says: the order is not that of the campaign"
     )
-
-
-# Its columns
 
 
 def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
@@ -431,11 +423,8 @@ def columns_of(
     source: str, header: Sequence[str], joint_kinds: Sequence[str], observe: str,
     extra: Sequence[Family] = (),
 ) -> Columns:  # fmt: skip
-    """What the columns of a table mean.
-
-    `joint_kinds`: "revolute" or "prismatic" per joint; `observe` decides what must be there;
-    `extra`: families that this table may have besides.
-    """
+    """What the columns of a table mean; `observe` decides what must be there, `extra` are families
+    that this table may have besides."""
     known = families(joint_kinds) | {family.name: family for family in extra}
     found = tables.match_columns(
         source,
@@ -473,8 +462,6 @@ def _wrong_count(header: Sequence[str], family: Family) -> str:
         "drop the columns too many, or use the cell of the right robot")  # fmt: skip
     return f"{len(stems)} joint columns{names}, but the robot has {n} joints; {way}"
 
-
-# Reading
 
 READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured
 
@@ -608,9 +595,6 @@ def _check_duplicates(raw: RawTable, table: Measurements) -> None:
         )
 
 
-# Writing
-
-
 def write_measurements(measurements: Measurements, path: str | Path) -> None:
     """Write the table as CSV, or Parquet where the ending says so (.parquet, .pq); it reads back
     bit for bit.  Whole or not at all."""
@@ -633,9 +617,6 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
     rows = (zip(*(v[some].tolist() for v in columns.values()), strict=True) for some in pieces)
     with atomic_writer(path) as handle:
         tables.write_csv(handle, columns, chain.from_iterable(rows))
-
-
-# A covariance of their noise.
 
 
 def read_matrix(path: str | Path, what: str) -> Array:

@@ -17,7 +17,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from decimal import Decimal
 from difflib import get_close_matches
 from pathlib import Path
@@ -27,10 +27,8 @@ SHOWN = 60
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str | None:
-    """The valid name closest to `name`, upper and lower case alike; None where none is near.
-
-    Names that begin with `name` come first, the shortest of them: it was not typed to its end.
-    """
+    """The valid name closest to `name`, upper and lower case alike.  Names that begin with `name`
+    come first, the shortest of them: it was not typed to its end."""
     by_lower = {v.lower(): v for v in reversed(list(valid))}
     # difflib is quadratic, and a name this long is no typing error anyway.
     typed = name[:SHOWN].lower()
@@ -59,7 +57,6 @@ def some(names: Iterable[str], most: int, joint: str = ", ", more: str = " and {
 
 
 def counted(n: int, one: str, many: str | None = None) -> str:
-    """ "1 pose", "2 poses"."""
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
@@ -71,7 +68,6 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def rounded(value: float, digits: int = 3) -> str:
-    """The same without zeros at its end: 1830, 0.12, 1."""
     told = significant(value, digits)
     return told.rstrip("0").rstrip(".") if "." in told and "e" not in told else told
 
@@ -80,14 +76,12 @@ SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
 
 
 def p_value(p: float) -> str:
-    """Two digits, or that it is below the smallest that is told."""
     if not math.isfinite(p):
         return "–"
     return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
 
 
 def size_of(p: float) -> str:
-    """ "p = 0.02", "p < 0.0001"."""
     text = p_value(p)
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
@@ -110,7 +104,6 @@ def length(metres: float, digits: int = 3) -> str:
 
 
 def newtons(force: Iterable[float]) -> str:
-    """ "(0, 0, -2600) N"."""
     return f"({', '.join(rounded(v, 6) for v in force)}) N"
 
 
@@ -119,7 +112,6 @@ def load_text(force: Iterable[float]) -> str:
 
 
 def together(parts: Sequence[str], last: str = "and") -> str:
-    """ "a, b and c"."""
     return f" {last} ".join([p for p in (", ".join(parts[:-1]), *parts[-1:]) if p])
 
 
@@ -145,10 +137,7 @@ def quoted(found: object) -> str:
 
 def printable(text: str) -> str:
     """`text` with what a terminal would obey or a reader could not see as escapes: \\x1b, \\u202e.
-
-    The one way in which names from files and arguments are shown.  Text that is shown already
-    stays as it is.
-    """
+    Names from files and arguments are shown in no other way."""
     if text.isprintable():
         return text
     return "".join(
@@ -159,8 +148,7 @@ def printable(text: str) -> str:
 
 
 def is_label(text: str) -> bool:
-    """Can this text stand in a table cell and be read back as it is shown: one line, no blanks at
-    its ends, nothing that cannot be seen?"""
+    """One line, no blanks at its ends, nothing that cannot be seen: a cell that reads back."""
     return bool(text) and text == text.strip() == printable(text)
 
 
@@ -170,11 +158,8 @@ _NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", r
 
 
 def cell_text(cell: object) -> object:
-    """A cell of a table as it is written: text that no spreadsheet takes for a formula.
-
-    Text that begins with = + - @ and is no number gets an apostrophe before it, as spreadsheets
-    write such text; `cell_meaning` takes it off again.
-    """
+    """As a table is written: text that begins with = + - @ and is no number gets an apostrophe, so
+    that no spreadsheet takes it for a formula; `cell_meaning` takes it off."""
     if not isinstance(cell, str) or _NUMBER.fullmatch(cell):
         return cell
     return f"'{printable(cell)}" if _FORMULA.match(cell) else printable(cell)
@@ -210,11 +195,7 @@ def plain(value: Any) -> Any:
 
 
 def json_text(value: Any) -> str:
-    """`value` as strict JSON over several lines, without a newline at its end.
-
-    Numbers that do not exist become null; documentation of each key says what its null means.
-    Raises TypeError for what JSON has no form for.
-    """
+    """Strict JSON over several lines; numbers that do not exist become null."""
     return json.dumps(plain(value), indent=1, allow_nan=False)
 
 
@@ -249,7 +230,6 @@ _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
 
 
 def bounded(message: str) -> str:
-    """A message whose words, keys and names of files among them, have an end."""
     short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
     half = LONGEST_MESSAGE // 2
     return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
@@ -297,12 +277,9 @@ def flag_of(keyword: str) -> str:
 
 
 def option(keyword: str, value: object = None) -> str:
-    """An option of a verb as a message names it.
-
-    In Python its keyword argument, `seed` or outliers='drop'; within `options_as_flags`, on the
-    command line, its flag: --seed or --outliers drop.  It is worded where the message is made,
-    since messages end in results, their files and reports as well as in exceptions.
-    """
+    """An option of a verb as a message names it: in Python its keyword argument, `seed` or
+    outliers='drop'; where flags are said --seed or --outliers drop.  It is worded where the message
+    is made, since messages end in results, their files and reports too."""
     if _said["flags"]:
         flag = flag_of(keyword)
         if value is False:
@@ -314,7 +291,9 @@ def option(keyword: str, value: object = None) -> str:
 
 
 @contextmanager
-def _saying(**how: Any) -> Iterator[None]:
+def saying(**how: Any) -> Iterator[None]:
+    """Within it messages name options by their `flags`, as the command line has them, and those
+    that are `given` in the place of a key of the cell where `wish` names that."""
     before = _said.copy()
     _said.update(how)
     try:
@@ -323,20 +302,8 @@ def _saying(**how: Any) -> Iterator[None]:
         _said.update(before)
 
 
-def options_as_flags() -> AbstractContextManager[None]:
-    """Within it messages name options by their flags, as the command line has them."""
-    return _saying(flags=True)
-
-
-def options_given(keywords: Iterable[str]) -> AbstractContextManager[None]:
-    """Within it messages on a key of the cell in whose place one of these options is given name the
-    option, where they name the key by `wish`."""
-    return _saying(given=frozenset(keywords))
-
-
 def wish(keyword: str, key: str) -> str:
-    """What the user asks for as messages name it: the option where one is given in the place of a
-    key of the cell, else the `key`."""
+    """The option where one is given in the place of a key of the cell, else the `key`."""
     return option(keyword) if keyword in _said["given"] else key
 
 
@@ -346,11 +313,9 @@ INTERNAL = 70  # what sysexits.h calls a fault of the software
 
 
 def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
-    """What a library raised as a sentence that names the files `read`, and the exit code.
-
-    Memory that ends and numbers that cannot be computed with come from the input; whatever else
-    is raised by code of elastocal is a fault of its own, and asked to be reported.
-    """
+    """What a library raised as a sentence that names the files `read`, and the exit code.  Memory
+    that ends and numbers that cannot be computed with come from the input; whatever else code of
+    elastocal raises is a fault of its own, and asked to be reported."""
     what = f"{type(error).__name__}: {error}".rstrip(": ")
     if plugin := _of_plugin(error, what):
         return plugin, 2
@@ -409,7 +374,6 @@ def _of_plugin(error: Exception, what: str) -> str:
 
 @contextmanager
 def said_of(where: object) -> Iterator[None]:
-    """Within it an InputError says first what it is said of: a file, or an option."""
     try:
         yield
     except InputError as error:
@@ -422,7 +386,6 @@ def require(condition: object, message: str) -> None:
 
 
 def check_known(name: str, there: Collection[str], told: str, them: str = "there are") -> None:
-    """Raise InputError unless `name` is one of those that are `there`: behind what is `told` of it
-    stand the nearest of them, and all."""
+    """Behind what is `told` of an unknown name stand the nearest of what is `there`, and all."""
     if name not in there:
         raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there) or 'none'}")

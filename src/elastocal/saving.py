@@ -52,10 +52,7 @@ LARGEST_SUMMARY = 200_000_000  # bytes
 
 @checked_arguments
 def save(result: Any, path: str | Path, **how: Any) -> None:
-    """Write a result or a calibrated arm; class and ending decide what, `how` are its options.
-
-    A name without ending is of the first kind that there is.
-    """
+    """`how`: options of the writer.  A name without ending is of the first kind that there is."""
     path, kind = Path(path), type(result).__name__
     by_ending = WRITERS[kind]
     write = by_ending.get(path.suffix.lower() or next(iter(by_ending)), by_ending.get(ANY))
@@ -95,10 +92,8 @@ def beside(path: Path) -> Path:
 
 
 def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
-    """plan.csv, which people measure by, and plan.json (schema elastocal/plan/1) beside it.
-
-    `command` is the command line that repeats the design.  Raises InputError as `beside` does.
-    """
+    """plan.csv, which people measure by, and plan.json (schema elastocal/plan/1) beside it;
+    `command` is the command line that repeats the design."""
     from elastocal.planning.plan import SCHEMA, write_plan
 
     summary = beside(path)
@@ -108,10 +103,7 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
 
 
 def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
-    """The cell file that was diagnosed with the effects found added; it is returned as written.
-
-    Raises InputError where the cell was built in Python or changed after it was read.
-    """
+    """The cell file that was diagnosed with the effects found added; it is returned as written."""
     from elastocal.cell import read_cell
     from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.model.chain import numbered
@@ -132,11 +124,8 @@ def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
 
 
 def save_compensation(found: Compensation, path: Path, partial: bool = False) -> None:
-    """The table of commands (CSV).
-
-    Raises InsufficientDataError where targets are not reached, unless `partial`: their rows are
-    then left empty.
-    """
+    """The rows of targets that are not reached stay empty where `partial`; else they are an
+    error."""
     from elastocal.compensation import check_reached, commands_csv
 
     if not partial:
@@ -145,12 +134,7 @@ def save_compensation(found: Compensation, path: Path, partial: bool = False) ->
 
 
 def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
-    """The calibrated arm for other programs; `how` as for `Wish`.
-
-    Raises InputError where the format cannot be written for this robot, InsufficientDataError
-    where no random pose has a static equilibrium under the load, and ElastocalError where the
-    text, read back, is another arm than the model.
-    """
+    """`how` as for `Wish`."""
     from elastocal.export.export import Wish, export, write
 
     correction = how.pop("joint_correction", None)
@@ -158,11 +142,8 @@ def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
 
 
 def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str]) -> None:
-    """Write visits (rows of `plan`, in the order of measuring) as plan.csv, which `simulate` reads.
-
-    Angles in degrees, travel in mm, force, approach direction and time where the plan has them.  A
-    pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
-    """
+    """Visits (rows of `plan`, in the order of measuring) as plan.csv, which `simulate` reads.  A
+    pose that is visited again under the same force is a configuration of its own: 4, 4/2, …."""
     from elastocal.planning.plan import write_plan
 
     names = []
@@ -240,8 +221,7 @@ def load(path: str | Path, cell: str | Path | None = None) -> Model | Calibrated
 
 
 def plain(text: str) -> str:
-    """One line of printable ASCII without quotation marks, for comments and strings of
-    controllers."""
+    """One line of printable ASCII without quotation marks, as controllers take it."""
     line = " ".join(text.split()).replace('"', "'").replace("\\", "/")[:LONGEST]
     return "".join(c if c.isascii() and c.isprintable() else "?" for c in line)
 
@@ -250,8 +230,6 @@ def number(value: float, digits: int) -> str:
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
 
-
-# An execution as a list of what a robot program does: move, have the load changed, measure.
 
 AXES = 6
 TAKE_OFF = "take the load off"
@@ -336,8 +314,6 @@ def limits_text(lower: Array, upper: Array) -> str:
     return ", ".join(shown)
 
 
-# What was written, read back.
-
 SAME = 1e-6  # rad, between a value of the plan and of the program
 DIGIT = 1e-8  # rad, more than half of the last digit of a program, 1e-6° or 1e-9 rad
 LONGEST_STOP = 86_400.0  # s
@@ -413,9 +389,8 @@ def robot_program(
     suffix: str, execution: Execution, chain: Chain, configurations: Sequence[str],
     forces: Array, limits: tuple[Array, Array], name: str,
 ) -> str:  # fmt: skip
-    """The text of NAME.src (KRL) or NAME.script (URScript): moves, stops in which the tracker
-    measures, and halts for the load; joint values inside `limits` (lower, upper) in rad, in the
-    order of the chain.  Read back, it is the plan, or an ElastocalError."""
+    """The text of NAME.src (KRL) or NAME.script (URScript); joint values inside `limits` (lower,
+    upper) in rad, in the order of the chain.  Read back, it is the plan, or an ElastocalError."""
     language, write = LANGUAGES[suffix.lower()]
     check_six_axes(chain, language)
     steps = driven(steps_of(execution, configurations, forces), *limits)

@@ -37,7 +37,6 @@ SPELT = {
 
 
 def _spelt(error: UnicodeError) -> tuple[str, int]:
-    """The error handler of streams: letters spelt out, or as escapes."""
     if not isinstance(error, UnicodeEncodeError):
         raise error
     part = error.object[error.start : error.end]
@@ -47,23 +46,24 @@ def _spelt(error: UnicodeError) -> tuple[str, int]:
 codecs.register_error("elastocal", _spelt)
 
 
-def prepare_streams() -> None:
-    """Have stdout and stderr spell out what their encoding lacks, instead of failing."""
+@contextmanager
+def spelling() -> Iterator[None]:
+    """Within it stdout and stderr spell out what their encoding lacks, instead of failing; then
+    what is left is written, and a reader that went away (… | head) is no error."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="elastocal")
-
-
-def close_streams() -> None:
-    """Write what is left; a reader that went away (… | head) is no error."""
-    for stream in (sys.stdout, sys.stderr):
-        try:
-            if stream is not None:
-                stream.flush()
-        except (OSError, ValueError):
-            # Python flushes once more at its end, and would complain.
-            with suppress(OSError, ValueError):
-                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+    try:
+        yield
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            try:
+                if stream is not None:
+                    stream.flush()
+            except (OSError, ValueError):
+                # Python flushes once more at its end, and would complain.
+                with suppress(OSError, ValueError):
+                    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 # Ctrl-C: noted besides being raised, since libraries swallow it or make another error of it.
@@ -73,10 +73,8 @@ interrupts: list[int] = []
 
 @contextmanager
 def noting_interrupts() -> Iterator[list[int]]:
-    """In a `with` block a SIGINT that would raise KeyboardInterrupt is noted too.
-
-    Where code that cannot raise (Cython's, a finaliser's) swallows one, it comes again.
-    """
+    """A SIGINT that would raise KeyboardInterrupt is noted too; where code that cannot raise
+    (Cython's, a finaliser's) swallows one, it comes again."""
     before = signal.getsignal(signal.SIGINT)
     if before is signal.default_int_handler:  # not ignored, as under nohup
         signal.signal(signal.SIGINT, _note)
@@ -112,12 +110,10 @@ GRACE = 30.0  # s that running tasks of a study are waited for
 
 
 class StudyStop:
-    """Ctrl-C and SIGTERM: in a `with` block, `asked` says that no more tasks may be handed out.
-
-    A second signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check`
-    raises it again: a task's library may catch one and return where its search stood, and such a
-    result must not be kept.
-    """
+    """Ctrl-C and SIGTERM: within it `asked` says that no more tasks may be handed out.  A second
+    signal, or `grace` seconds after the first, raises KeyboardInterrupt, and `check` raises it
+    again: a task's library may catch one and return where its search stood, and such a result must
+    not be kept."""
 
     def __init__(self, grace: float = GRACE, tell: Callable[[str], None] | None = None) -> None:
         self.asked = self._now = False
@@ -166,7 +162,6 @@ def end_at_once() -> None:
 
 
 def shown(text: str) -> str:
-    """`text` of several lines, each as it can be read."""
     return "\n".join(map(printable, text.split("\n")))
 
 

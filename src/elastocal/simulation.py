@@ -92,12 +92,10 @@ def _usual(model: Model, p: Parameter) -> float:
 
 
 def _sizes_shown(model: Model) -> Array:
-    """A size (parameters,) that moves a reading by 1 mm where it moves one most; 0 for none.
-
-    Read at random poses within the joint limits, with the largest load of the cell (or the one that
+    """A size (parameters,) that moves a reading by 1 mm where it moves one most; 0 for none.  Read
+    at random poses within the joint limits, with the largest load of the cell (or the one that
     suits an arm of this reach) along x, y and z: not in the plan's poses, so that two tables of one
-    cell are of one arm.
-    """
+    cell are of one arm."""
     unsized = {p.effect for p in model.parameters if p.typical is None}
     cell = model.cell
     own = tuple(choice for choice in cell.model.effects if choice.name in unsized)
@@ -255,8 +253,6 @@ def _standard(model: Model, rng: np.random.Generator, shape: tuple[int, ...]) ->
         return rng.normal(size=shape)
     return np.asarray(rng.standard_t(dof, shape) * np.sqrt(1 - 2 / dof))
 
-
-# The worked example.
 
 DEMO = Path(__file__).parent / "demo"  # its files
 LOAD_N = (0.0, 0.0, -2600.0)  # 265 kg: the paper hung 250 to 280 kg

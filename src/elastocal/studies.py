@@ -96,11 +96,9 @@ class StudyFile(Table):
 @dataclass(frozen=True)
 class Sources:
     """The .py files of a study's folder and the files that study.toml names, by their names, and
-    what it states, with options and seed settled.
-
-    Sent to each worker: one that has the same folder with the same contents uses it there, any
-    other unpacks this one, so a cluster needs no shared file system.
-    """
+    what it states, with options and seed settled.  Sent to each worker: one that has the same
+    folder with the same contents uses it there, any other unpacks this one, so a cluster needs no
+    shared file system."""
 
     folder: Path
     contents: Mapping[str, bytes]
@@ -219,10 +217,7 @@ def _json(where: str, value: Any) -> str:
 
 
 def load(sources: Sources) -> ModuleType:
-    """Returns the module study.py, imported once per process as long as no other study comes.
-
-    Raises InputError with file and line where importing it fails.
-    """
+    """The module study.py, imported once per process as long as no other study comes."""
     global _here
     with _LOCK:
         if _here is None or _here[0] != sources.digest:
@@ -284,11 +279,8 @@ def line_of(
 
 
 def execute(sources: Sources, task: Row) -> Row:
-    """The line of results that came of the task.
-
-    Its draws are those of child `task` of SeedSequence(seed), whoever computes it and however many
-    there are.
-    """
+    """The line of results of a task, whose draws are those of child `task` of SeedSequence(seed),
+    whoever computes it and however many there are."""
     begun, rows, error, trace = time.perf_counter(), list[Row](), None, None
     draws = np.random.SeedSequence(sources.stated.seed, spawn_key=(task["task"],))
     try:
@@ -455,8 +447,7 @@ class ClusterLostError(ElastocalError):
 
 
 def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int | None) -> Lines:
-    """Lines of results of joblib's processes, by default one per core; where one alone is asked for
-    it is this process, for a debugger."""
+    """By default one per core; where one alone is asked for it is this process, for a debugger."""
     from joblib.externals import loky
 
     jobs = jobs or loky.cpu_count()
@@ -476,8 +467,7 @@ def on_processes(study: Study, tasks: Sequence[Row], stop: StudyStop, jobs: int 
 def on_cluster(
     study: Study, tasks: Sequence[Row], stop: StudyStop, client: Any, tell: Callable[[str], None]
 ) -> Lines:
-    """The same of a Dask cluster's workers.  No task waits at one: what is out is what is waited
-    for on Ctrl-C."""
+    """No task waits at a worker: what is out is what is waited for on Ctrl-C."""
 
     def room() -> int:
         # Without a limit a scheduler that goes away while it is asked is waited for for ever.
@@ -501,12 +491,10 @@ def _lines(
     study: Study, tasks: Sequence[Row], stop: StudyStop, submit: Callable[..., Future[Row]],
     room: Callable[[], int],
 ) -> Lines:  # fmt: skip
-    """The lines as they come, none twice; no task begins once `stop` is asked for.
-
-    Where a process dies joblib ends them all: what ran is repeated, one task after the other, so
-    that it is known whose process dies each time.  Dask gives the tasks of a dead worker to
-    another, and gives up a task that killed more than distributed.scheduler.allowed-failures.
-    """
+    """None twice; no task begins once `stop` is asked for.  Where a process dies joblib ends them
+    all: what ran is repeated, one task after the other, so that it is known whose process dies each
+    time.  Dask gives the tasks of a dead worker to another, and gives up a task that killed more
+    than distributed.scheduler.allowed-failures."""
     waiting, out, died = deque(tasks), dict[Future[Row], Row](), Counter[int]()
     while out or (waiting and not stop.asked):
         most = room() if waiting and not stop.asked else 0
@@ -534,12 +522,10 @@ def _lines(
 def _security(
     distributed: Any, address: str, unencrypted: bool = False, **files: Path | None
 ) -> Any:
-    """Dask's Security for a client of `address`: with the `files` tls_ca, tls_cert and tls_key
-    (PEM) or those of Dask's configuration.
-
-    Whoever stands between could run code of their own here and there: tasks and results are
-    pickles.  So another host is reached by TLS only, unless `unencrypted` allows it.
-    """
+    """For a client of `address`: with the `files` tls_ca, tls_cert and tls_key (PEM) or those of
+    Dask's configuration.  Whoever stands between could run code of their own here and there: tasks
+    and results are pickles.  So another host is reached by TLS only, unless `unencrypted` allows
+    it."""
     given = {name: path for name, path in files.items() if path is not None}
     for name, path in given.items():
         read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)

@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-# The lines of a CSV file: bounded, checked and counted.
-
 MAX_LINE = 64 * 1024
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
@@ -59,11 +57,8 @@ Row = tuple[int, list[str]]  # number of the line, its cells
 def csv_lines(
     source: str, handle: BinaryIO, what: str = "table", comments: bool = False
 ) -> tuple[tuple[str, ...], bool, Iterator[Row]]:
-    """The header of an open CSV file, whether decimal commas may be used, and its other lines, each
-    with as many cells as the header.
-
-    `comments`: lines that begin with # are passed over, and so are lines of empty cells.
-    """
+    """The header, whether decimal commas may be used, and the other lines, each with as many cells.
+    `comments`: lines that begin with # are passed over, and lines of empty cells."""
     remedy = "save the table as CSV in UTF-8"
     lines = (
         (number, decoded(source, line, remedy, "utf-8", line=number).rstrip("\r\n"))
@@ -81,7 +76,6 @@ def csv_lines(
 
 
 def _sound_lines(source: str, handle: BinaryIO, what: str) -> Iterator[tuple[int, bytes]]:
-    """The lines of a file that may be CSV in UTF-8, by number."""
     for number in count(1):
         line = handle.readline(MAX_LINE + 1)
         where = f"{source}, line {number}"
@@ -107,13 +101,11 @@ def _sound_lines(source: str, handle: BinaryIO, what: str) -> Iterator[tuple[int
 
 
 def _says_nothing(line: bytes) -> bool:
-    """Whether a line is a comment, or has empty cells alone."""
     bare = line.removeprefix(b"\xef\xbb\xbf").strip(b' \t\r\n,;"')
     return not bare or bare.startswith(b"#")
 
 
 def _split(source: str, number: int, line: str, delimiter: str) -> list[str]:
-    """The cells of a line.  Raises InputError where quotes do not close or are stray."""
     if '"' not in line:
         return line.split(delimiter)
     try:
@@ -128,7 +120,6 @@ def _split(source: str, number: int, line: str, delimiter: str) -> list[str]:
 def _rows(
     source: str, lines: Iterator[tuple[int, str]], header: tuple[str, ...], delimiter: str
 ) -> Iterator[Row]:
-    """The lines that are not blank, each with as many cells as the header."""
     blank, rows = " " if delimiter == "\t" else " \t", 0
     for number, line in lines:
         if not line.strip(blank):
@@ -150,12 +141,9 @@ def first_bad_cell(
     source: str, rows: Iterable[Row], columns: Mapping[int, str], comma_allowed: bool,
     blanks: Container[str] = (), marks: dict[str, str] | None = None, noun: str = "line",
 ) -> InputError | None:  # fmt: skip
-    """What is wrong with the first bad cell of `rows`, or None.
-
-    `columns`: field index → header of the number columns; `comma_allowed`: decimal commas may
-    be used, then everywhere in the file; `blanks`: headers of columns whose cells may be empty;
-    `marks`: where decimal points and commas were found in earlier rows.
-    """
+    """`columns`: field index → header of the number columns; `comma_allowed`: decimal commas may be
+    used, then everywhere in the file; `blanks`: headers of columns whose cells may be empty;
+    `marks`: where decimal points and commas were found in earlier rows."""
     marks = {} if marks is None else marks
     for number, cells in rows:
         for i, header in columns.items():
@@ -198,17 +186,11 @@ OTHER_UNITS = {unit for units in FACTORS.values() for unit in units if unit}
 OTHER_UNITS |= {"km", "nm", "inch", "urad", "grad", "turn", "mNm"}
 
 
-# What a table may hold
-
-
 @dataclass(frozen=True)
 class Family:
-    """Columns that belong together: all of them or none.
-
-    `units`: stem → the units it may be written in; stems with the same choice share one unit.
-    `is_label`: texts instead of numbers; `optional`: stems that may be absent, and whose cells may
-    be empty.
-    """
+    """Columns that belong together: all of them or none.  `units`: stem → the units it may be
+    written in; stems with the same choice share one unit.  `is_label`: texts instead of numbers;
+    `optional`: stems that may be absent, and whose cells may be empty."""
 
     name: str
     meaning: str
@@ -226,8 +208,6 @@ class Family:
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a file: its header, the stem of that, and its unit, "" where there is none."""
-
     header: str
     stem: str
     unit: str
@@ -260,11 +240,9 @@ def match_columns(
     explain: Callable[[str], str | None] = lambda text: None,
     called: Mapping[str, str] = CALLED, valid: str = "",
 ) -> Columns:  # fmt: skip
-    """Which column of a header is which of the `known` families.
-
-    `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one;
-    `called`: what its name may mean, as CALLED; `valid`: what to say where it is like none.
-    """
+    """Which column of a header is which of the `known` families.  `passed_over`: headers that mean
+    nothing here; `explain`: what to say of an unknown one; `called`: what its name may mean, as
+    CALLED; `valid`: what to say where it is like none."""
     for i, text in enumerate(header, start=1):
         told = "has no name in the header; name it or remove the separator too many"
         require(text, f"{source}: column {i} of {len(header)} {told}")
@@ -308,11 +286,8 @@ def check_columns(
     needed: Sequence[Sequence[str]] = (), needed_by: str = "",
     exclusive: Sequence[tuple[str, str]] = (),
 ) -> Columns:  # fmt: skip
-    """These columns, where they make a table: no family is there in part.
-
-    `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
-    needs"); `exclusive`: pairs of families that say the same.
-    """
+    """No family is there in part.  `needed`: of each entry one family must be there, because
+    `needed_by` (as in "a DH table needs"); `exclusive`: pairs of families that say the same."""
     for name, found in columns.items():
         family, unit, stems = known[name], found[0].unit, [c.stem for c in found]
         absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
@@ -373,9 +348,6 @@ def _unknown(
     )
 
 
-# What a table holds
-
-
 @dataclass(frozen=True)
 class Labels:
     """`codes` (n,) index into `names`, which stand in order of first appearance."""
@@ -395,10 +367,8 @@ class Labels:
 @dataclass(frozen=True)
 class RawTable:
     """n rows; `row` (n,) is the line (CSV) or row (Parquet) in the file, `noun` says which.
-
-    `numbers`: header → (n,) floats in the file's unit, finite, NaN for a cell that is empty where
-    it may be; `labels`: header → Labels.
-    """
+    `numbers`: header → (n,) floats in the file's unit, NaN for a cell that is empty where it may
+    be."""
 
     source: str
     noun: str
@@ -412,12 +382,11 @@ class RawTable:
         return f"{self.source}, {self.noun} {self.row[i]}, {columns}"
 
     def column(self, family: str, stem: str) -> Column | None:
-        """The column of a stem, None where the file has none."""
+        """None where the file has none."""
         found = self.columns.get(family, ())
         return next((column for column in found if column.stem == stem), None)
 
     def text(self, i: int, header: str) -> str:
-        """The text of row i in a column of labels, "" where the file has no such column."""
         labels = self.labels.get(header)
         return "" if labels is None else labels.names[labels.codes[i]]
 
@@ -433,7 +402,7 @@ class RawTable:
         return values
 
     def check(self, family: str, good: np.ndarray, rule: str) -> None:
-        """Raises InputError with `rule` for the first cell of a family (n, k) that is not good."""
+        """Raises InputError with `rule` for the first cell (n, k) that is not good."""
         if good.all():
             return
         i, k = (int(v) for v in np.argwhere(~good)[0])
@@ -443,21 +412,6 @@ class RawTable:
             f"drop the {self.noun}"
         )
 
-    def check_labels(self) -> None:
-        """Raises InputError for the first label that is empty or has control characters."""
-        for column in (c for own in self.columns.values() for c in own if c.is_label):
-            labels = self.labels[column.header]
-            for code, name in enumerate(labels.names):
-                if not is_label(name) and (name or not column.may_be_blank):
-                    i = int(np.argmax(labels.codes == code))
-                    what = f"{quoted(name)} has control characters" if name else "empty cell"
-                    raise InputError(
-                        f"{self.where(i, column.header)}: {what}; write a name or number"
-                    )
-
-
-# Sources
-
 
 PARQUET = (".parquet", ".pq")
 
@@ -466,12 +420,9 @@ def read_table(
     path: str | Path, choose: Choose, *, what: str = "measurement table", comments: bool = False,
     text: str | None = None, most: int = MOST_BYTES,
 ) -> RawTable:  # fmt: skip
-    """The columns of a CSV or Parquet (.parquet, .pq) file that `choose` picks from its header.
-
-    `what` names the kind of table in messages; `comments`: lines that begin with # are passed
-    over, and so are lines of empty cells.  With `text` the table is that CSV text, and `path` only
-    its name; a file has `most` bytes.  Raises InputError that names file, line, column and text.
-    """
+    """The columns of a CSV or Parquet file that `choose` picks from its header.  `what` names the
+    kind of table in messages; `comments` as of `csv_lines`.  With `text` the table is that CSV
+    text, and `path` only its name; a file has `most` bytes."""
     source = str(path)
     if text is None and Path(path).suffix.lower() in PARQUET:
         frame = _parquet(source, what)
@@ -482,7 +433,13 @@ def read_table(
         with open_input(path, what, most) if text is None else BytesIO(text.encode()) as handle:
             header, commas, rows = csv_lines(source, handle, what, comments)
             table = _read(source, "line", header, rows, choose, commas)
-    table.check_labels()
+    for column in (c for own in table.columns.values() for c in own if c.is_label):
+        labels = table.labels[column.header]
+        for code, name in enumerate(labels.names):
+            if not is_label(name) and (name or not column.may_be_blank):
+                where = table.where(int(np.argmax(labels.codes == code)), column.header)
+                what = f"{quoted(name)} has control characters" if name else "empty cell"
+                raise InputError(f"{where}: {what}; write a name or number")
     return table
 
 
@@ -490,7 +447,6 @@ def _read(
     source: str, noun: str, header: Sequence[str], rows: Iterator[Row],
     choose: Choose, commas: bool,
 ) -> RawTable:  # fmt: skip
-    """The columns that `choose` picks; `commas`: decimal commas may be used."""
     chosen = choose(header)
     every = [column for family in chosen.values() for column in family]
     pieces: dict[str, list[Array]] = {c.header: [] for c in every if not c.is_label}
@@ -554,14 +510,10 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
     return frame
 
 
-# Writing
-
-
 def write_csv(
     handle: TextIO, header: Iterable[str], rows: Iterable[Iterable[object]],
     comments: Iterable[str] = (),
 ) -> None:  # fmt: skip
-    """Write a table as CSV, each of `comments` on a line of its own above it, after #."""
     handle.writelines(f"# {printable(comment)}\n" for comment in comments)
     writer = csv.writer(handle, lineterminator="\n")
     writer.writerow(map(cell_text, header))

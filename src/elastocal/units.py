@@ -19,7 +19,6 @@ _TO_SI = {
     **dict.fromkeys(("", "si", "m", "rad", "N", "Nm", "s", "C", "kg"), (1.0, 1.0)),
 }  # fmt: skip
 
-# The types that every room passes on: arrays of numbers, and who is told of progress.
 Array = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -76,11 +75,9 @@ def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
 
 
 def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll).
-
-    Yaw is taken first and undone in the other two, so that all three are exact to rounding at
-    pitch = ±π/2 as well, where the textbook formula divides 0 by 0.
-    """
+    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll).  Yaw is taken first and undone
+    in the other two, so that all three are exact to rounding at pitch = ±π/2 as well, where the
+    textbook formula divides 0 by 0."""
     yaw = math.atan2(R[1, 0], R[0, 0])
     c, s = math.cos(yaw), math.sin(yaw)
     pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
@@ -89,10 +86,7 @@ def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
 
 
 def to_si(value: Value, unit: str) -> Value:
-    """A number or array in `unit` as SI (m, rad, rad/s, N, N m, s, 1); °C stays °C.
-
-    Raises KeyError for a unit not known here, which is a mistake of the program.
-    """
+    """m, rad, rad/s, N, N m, s, 1; °C stays °C."""
     factor, divisor = _TO_SI[unit]
     return value * factor / divisor
 
@@ -146,10 +140,8 @@ SHOWN = {
 
 
 def display(value: float, unit: str) -> tuple[float, str]:
-    """`value` in SI `unit` as people read it: 2.87e-7, "rad/(N*m)" → 0.287, "µrad/(N·m)".
-
-    A unit that is not listed keeps its value, written with proper symbols.
-    """
+    """As people read it: 2.87e-7, "rad/(N*m)" → 0.287, "µrad/(N·m)".  A unit that is not listed
+    keeps its value, written with proper symbols."""
     if unit in SHOWN:
         factor, text = SHOWN[unit]
         return value * factor, text

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 from elastocal.above import checked_arguments, later, shown, whole
-from elastocal.messages import InputError, option, options_given, quoted, require
+from elastocal.messages import InputError, option, quoted, require, saying
 
 if TYPE_CHECKING:
     from numpy.random import Generator
@@ -196,7 +196,7 @@ def design_request(
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
     named = tuple(name for name, given in asked.items() if given is not None)
-    with options_given(named):
+    with saying(given=named):
         cell = replace(cell, design=_design_of(cell, asked))
         cell.check()
     for number in curve:
@@ -699,9 +699,6 @@ def effects(cell: Any = None) -> DataFrame:
     return pd.DataFrame(effect_entries(_checked_cell(getattr(given, "cell", given), "cell")))
 
 
-# What the verbs take
-
-
 def _silent(message: str) -> None:
     """Who asks for no progress is told none."""
 
@@ -733,7 +730,6 @@ def _table(name: str, model: Model, given: Table) -> Measurements:
 
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:
-    """What a file and the option `physical` state together; None where neither was given."""
     from elastocal.identification.knowledge import Knowledge, read_knowledge
 
     if given is None:

@@ -52,17 +52,16 @@ from elastocal.messages import (
     explained,
     flag_of,
     json_text,
-    options_as_flags,
     require,
+    saying,
 )
 from elastocal.screen import (
-    close_streams,
     complain,
     interrupts,
-    prepare_streams,
     progress_line,
     safe_console,
     say,
+    spelling,
 )
 
 if TYPE_CHECKING:
@@ -108,11 +107,11 @@ class Told(TyperGroup):
         sys.exit(code or 0)
 
     def invoke(self, ctx: Any) -> Any:
-        """What the user can act on is turned into a message and an exit code, never a traceback;
-        nothing of it is left to typer, which takes an EOFError for an interrupt."""
+        """A message and an exit code, never a traceback; nothing of what the user can act on is
+        left to typer, which takes an EOFError for an interrupt."""
         before = len(interrupts)  # of an earlier command in this process
         try:
-            with options_as_flags(), warnings.catch_warnings():
+            with saying(flags=True), warnings.catch_warnings():
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
                 warnings.simplefilter("ignore", RuntimeWarning)
                 return super().invoke(ctx)
@@ -172,19 +171,17 @@ def run_app() -> None:
     gc.set_threshold(COLLECT_AFTER)
     # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
-    prepare_streams()
     try:
-        # The same name however it is called: completion scripts are made of it.
-        app(prog_name="elastocal")
+        with spelling():
+            # The same name however it is called: completion scripts are made of it.
+            app(prog_name="elastocal")
     finally:
-        close_streams()
         # Python ends by looking for garbage once more, which takes 0.17 s, as long as fitting a
         # small table does.
         gc.freeze()
 
 
 def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool = False) -> int:
-    """Say why a command that `read` these files ends; the exit code."""
     if isinstance(error, ElastocalError):
         complain(str(error))
         return error.exit_code
@@ -209,16 +206,11 @@ def _ended(error: BaseException, read: Sequence[object] = (), interrupted: bool 
     return code
 
 
-# The files that a command reads and writes: checked before the work, written after it.
-
-
 def repeated() -> str:
-    """The command line that repeats this run, as results name it."""
     return shlex.join(["elastocal", *sys.argv[1:]])
 
 
 def files_of(cell: Cell) -> list[Path]:
-    """Files that the cell names and its model or a plan depends on."""
     robot, targets = cell.robot, cell.design.test_path
     solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
     path = None if targets is None else targets.file
@@ -228,9 +220,6 @@ def files_of(cell: Cell) -> list[Path]:
     return [path for path in named if path is not None]
 
 
-# Commands from the signatures of the verbs: an option is declared once.
-
-# What the user asks of a verb: its keyword arguments.
 Asked: TypeAlias = dict[str, Any]
 # Metavar and meaning of an option that is another thing as a text than in Python.
 Texts: TypeAlias = Mapping[str, tuple[str, Callable[[Any], Any]]]
@@ -261,7 +250,6 @@ TAKEN: dict[str, Any] = {
 
 
 def whole_numbers(text: str, takes: str) -> list[int]:
-    """Numbers between commas, for an option that `takes` such."""
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
@@ -269,7 +257,6 @@ def whole_numbers(text: str, takes: str) -> list[int]:
 
 
 def named_numbers(stated: Iterable[str], takes: str) -> dict[str, float]:
-    """Texts NAME=NUMBER, for an option that `takes` such."""
     found = {}
     for text in stated:
         name, _, number = text.partition("=")
@@ -281,23 +268,21 @@ def named_numbers(stated: Iterable[str], takes: str) -> dict[str, float]:
 
 
 class Run:
-    """One run of a command: what it reads and writes, its progress and its answer."""
-
     def __init__(self, plugins: bool = False, json: bool = False, quiet: bool = False) -> None:
         self.plugins, self.json, self._quiet = plugins, json, quiet
         self.written: list[Path] = []
 
     def writes(self, *asked: tuple[Path | None, str]) -> None:
-        """The outputs asked for, each with the endings that it may have, between blanks; one that
-        cannot be written, or is named as something else, is refused before the work starts."""
+        """Each output asked for with the endings that it may have, between blanks; one that cannot
+        be written, or is named as something else, is refused before the work starts."""
         for path, endings in asked:
             if path is not None:
                 check_output(path, endings.split())
         self.written = [path for path, _ in asked if path is not None]
 
     def reads(self, *paths: Path | None, cell: Cell | None = None) -> list[Path]:
-        """The inputs that are given.  Refused is to write over one of them or a file that the
-        `cell` names, or two outputs into one."""
+        """Refused is to write over an input or a file that the `cell` names, or two outputs into
+        one."""
         given = [path for path in paths if path is not None]
         # Not Path.resolve, which raises RuntimeError where links go round in a circle.
         inputs = {*map(os.path.realpath, [*given, *(() if cell is None else files_of(cell))])}
@@ -319,7 +304,6 @@ class Run:
                     write(path)
 
     def progress(self) -> AbstractContextManager[Callable[[str], None]]:
-        """Tells on stderr what is done, where the user wants to know."""
         return progress_line(self._quiet)
 
     def answer(
@@ -380,7 +364,6 @@ def command(
 def _offered(
     verb: Callable[..., Any], names: Iterable[str], texts: Texts
 ) -> Iterator[tuple[str, inspect.Parameter]]:
-    """The options of a command for these arguments of a verb."""
     signature, told = inspect.signature(verb).parameters, _told(verb)
     for name in names:
         kinds, default = kinds_of(signature[name].annotation), signature[name].default
@@ -400,7 +383,6 @@ def _offered(
 
 
 def _own(each: inspect.Parameter, help: str, metavar: str | None) -> inspect.Parameter:
-    """An argument or option that a command has of itself, with its help."""
     kind, stated = each.annotation, getattr(each.annotation, "__metadata__", ())
     if stated:
         kind, option = get_args(each.annotation)[0], copy(stated[0])

@@ -126,8 +126,6 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     screen.print('In the cell: [model] effects = ["joint_offset", "backlash:joint2"].')
 
 
-# design: a plan of poses.
-
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 CURVE = "--curve takes numbers of poses, as in 10,15,20"
 
@@ -235,7 +233,6 @@ def _resumed(
     cell: Cell, options: DesignOptions, output: Path, files: list[Path], asked: Asked,
     progress: Progress,
 ) -> tuple[Plan, Checkpoint]:  # fmt: skip
-    """The plan, where an interrupted run of the same input left off, and what that left."""
     from elastocal.planning.design import design as run
     from elastocal.planning.search import Checkpoint, key_of
 
@@ -277,7 +274,6 @@ def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan)
 
 
 def _check_names(programs: list[Path], picture: Path | None) -> None:
-    """Refuse names that do not say which kind of file is wanted."""
     kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
     for path in programs:
         told = f"--program {path}: the suffix says the language, {kinds}"
@@ -286,8 +282,8 @@ def _check_names(programs: list[Path], picture: Path | None) -> None:
 
 
 def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[Path, str]:
-    """Robot programs of a plan by their paths; without one only whether they can be written for
-    this arm, which is told before the work and not after it."""
+    """Without a plan only whether they can be written for this arm, which is told before the work
+    and not after it."""
     from elastocal.model.chain import joint_limits
     from elastocal.model.manipulator import load_chain
     from elastocal.saving import LANGUAGES, check_six_axes, robot_program
@@ -302,9 +298,6 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
                     joint_limits(cell, chain), path.stem,
                 )  # fmt: skip
     return written
-
-
-# simulate: measurements of a plan that were never made.
 
 
 @command(
@@ -351,9 +344,6 @@ def simulate(
     run.answer(
         lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
     )
-
-
-# import: tracker exports and joint logs → the measurement table.
 
 
 @command(

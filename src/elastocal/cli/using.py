@@ -99,8 +99,6 @@ def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float
     return {name: um * 1e-6 for name, um in found.items()}
 
 
-# diagnose: why the real arm still differs from the model.
-
 MOST_POSES = 10
 
 
@@ -151,7 +149,6 @@ def diagnose(
 
 
 def _write_extended(path: Path, found: Diagnosis, data: Path, plugins: bool) -> Iterator[str]:
-    """Write the cell with the effects found, and say so and what to do with it."""
     from elastocal.model.manipulator import where_smooth_functions_end
     from elastocal.report.diagnosis_view import added_text
     from elastocal.saving import save_found_cell
@@ -170,7 +167,6 @@ def _write_extended(path: Path, found: Diagnosis, data: Path, plugins: bool) -> 
 
 
 def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> str:
-    """Write the extra poses, and say so; or why there are none to write."""
     from elastocal.saving import save_extra_poses
 
     extra = found.extra
@@ -182,9 +178,6 @@ def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> st
         return f"{path} not written: no pose separates the rivals"
     save_extra_poses(path, extra.plan, kinds)
     return f"wrote {path}: {extra.n_poses} poses, {len(extra.plan)} visits"
-
-
-# next: which poses to measure next, or that no more are needed.
 
 
 @command("next")
@@ -231,9 +224,6 @@ def next_command(
     show = partial(print_report, result=found)
     if run.answer(found.to_json, show, files=found.plan is not None) and found.plan is None:
         say(f"{output} not written")
-
-
-# compensate and export: what a result is for.
 
 
 GRID = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
@@ -316,7 +306,6 @@ def _check(
     targets: Path | None, target: str | None, output: Path | None, table: Path | None,
     of_a_table: tuple[str, str | None, str | None],
 ) -> None:  # fmt: skip
-    """Raises InputError for options that do not go together."""
     (_, box, rotation), given = of_a_table, (targets is not None) + (target is not None)
     need = "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE"
     require(given > 0 or table is not None, need)
@@ -326,9 +315,6 @@ def _check(
     need = "--grid, --box and --rotation belong to a correction table; give --table FILE"
     require(table is not None or of_a_table == ("5", None, None), need)
     require(rotation is None or box is not None, "--rotation belongs to --box")
-
-
-# export: the calibrated arm for other programs.
 
 
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
@@ -379,9 +365,6 @@ def export(
     )
 
 
-# compare: what has changed since the last calibration.
-
-
 @command(short_help="What has changed since the last calibration?")
 def compare(
     cell: Path, old: Path, new: Annotated[Path | None, typer.Argument()] = None,
@@ -428,7 +411,7 @@ def compare(
 
 
 def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
-    """Cell and both results where the cell does not come first, as it once did not."""
+    """Where the cell does not come first, as it once did not."""
     told = f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
     require(old.suffix.lower() != ".toml", told)
     known = old.parent / "cell.toml" if cell is None else cell
@@ -436,8 +419,6 @@ def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, 
     require(cell is not None or known.is_file(), f"{told} {old} {new}")
     return known, old, new
 
-
-# study: a scripted study, on the local cores or on a Dask cluster.
 
 EVERY = 10.0  # s between plain lines of progress
 
@@ -524,8 +505,7 @@ def _told(ending: Ending, results: Path) -> str:
 
 
 def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
-    """Tells how far a study is, of `total` tasks those that `ended`, failures among them: rate per
-    minute of this run, time left, failures; the first call begins."""
+    """Rate per minute of this run, time left, failures; the first call begins."""
     begun, before = time.monotonic(), -1
 
     def show(total: int, ended: int, failed: int) -> None:
@@ -540,9 +520,6 @@ def pace(tell: Callable[[str], None]) -> Callable[[int, int, int], None]:
         tell(text + (f", {failed} failed" if failed else ""))
 
     return show
-
-
-# demo: the example.
 
 
 @command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")

@@ -259,8 +259,7 @@ CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1,
 
 @dataclass(frozen=True)
 class _Writing:
-    """One arm in the formats there are, each read back by the library that users read it with
-    before it is kept."""
+    """One arm in the formats there are, read back by the library that users read it with."""
 
     calibrated: CalibratedArm
     wish: Wish
@@ -269,11 +268,9 @@ class _Writing:
     done: Exported
 
     def parameters(self) -> Exported:
-        """Everything to be written: estimates, the geometry they make, and that geometry's cost.
-
-        Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
-        rad (roll, pitch, yaw), offsets included, so that joint values stay commanded ones.
-        """
+        """Estimates, the geometry they make, and that geometry's cost.  Joint and flange placements
+        are those of the calibrated URDF: in the frame before, in m and rad (roll, pitch, yaw),
+        offsets included, so that joint values stay commanded ones."""
         pieces, model = self.pieces, self.calibrated.model
         chain, cell = pieces.calibrated_chain(), model.cell
         document = {
@@ -307,14 +304,11 @@ class _Writing:
         return self.done.written(text)
 
     def corrections(self) -> Exported:
-        """Every smooth function over its range, with the half width of its 95 % band.
-
-        A row says by how much (urad or um) the place has moved beyond its commanded or identified
-        position: of a joint its angle, of a link its end frame along and about its axes
-        (components 1 to 6), of the base along and about the data's axes, of a marker its position
-        in the flange frame.  `position_deg` or `time_s` is what it follows.  A line that begins
-        with # says where the numbers come from.
-        """
+        """Every smooth function over its range, with the half width of its 95 % band.  A row says
+        by how much (urad or um) the place has moved beyond its commanded or identified position: of
+        a joint its angle, of a link its end frame along and about its axes (components 1 to 6), of
+        the base along and about the data's axes, of a marker its position in the flange frame.
+        `position_deg` or `time_s` is what it follows."""
         arm, rows = self.calibrated, list[tuple[str, ...]]()
         names, place = arm.model.names, {n: k for k, n in enumerate(arm.determined)}
         quantile = float(t_quantile(LEVEL, np.array(np.inf)))
@@ -503,7 +497,7 @@ class _Writing:
 
 def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
     """Largest distance in m between flanges (n, 4, 4), of origin and points on the axes, so that
-    orientations count.  Raises ElastocalError where it is more than `largest`."""
+    orientations count."""
     apart = (found - expected)[:, :3] @ CORNERS
     return _accepted(float(np.linalg.norm(apart, axis=1).max()), largest)
 
@@ -518,7 +512,7 @@ def _accepted(distance: float, largest: float) -> float:
 
 
 def _compensator(part: Valued) -> dict[str, float] | None:
-    """Values of the gravity compensator by key with its 0-based joint, None where there is none."""
+    """By key, with its 0-based joint."""
     values = {name: v for name, v in part.values.items() if ".compensator_" in name}
     if not values:
         return None
@@ -669,11 +663,9 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
 
 
 def _decompose(chain: Chain, like: list[Array] | None = None) -> tuple[list[Array], Array]:
-    """Rows 0 … n of a chain and its flange in the last row's frame, near the rows `like`.
-
-    Of the last of these θ and d alone change, the rest is the flange's.  Its z is often in line
-    with the last axis, where a row of its own would turn any way.
-    """
+    """Rows 0 … n of a chain and its flange in the last row's frame, near the rows `like`.  Of the
+    last of these θ and d alone change, the rest is the flange's.  Its z is often in line with the
+    last axis, where a row of its own would turn any way."""
     turned = [  # rotations whose z column is the axis
         pose_at(np.zeros(3), np.column_stack([*transverse_axes(joint.axis), joint.axis]))
         for joint in chain.joints
@@ -699,7 +691,7 @@ def _decompose(chain: Chain, like: list[Array] | None = None) -> tuple[list[Arra
 
 
 def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Array] | None:
-    """What the user's own table says of links 0 … n; None where it is in another convention."""
+    """Of links 0 … n; None where the user's own table is in another convention."""
     if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in dh.UR_ENDINGS:
         return None
     table = dh.read_dh_table(robot.dh)

@@ -124,11 +124,9 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
 
 
 def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:
-    """One spring of positive stiffness per joint, and (effect, sentence) for what that changes.
-
-    A joint split into levels gets their mean; a negative compliance becomes rigid; deflections
-    are those at the deflected pose.  `only` makes the change of one of them alone.
-    """
+    """One spring of positive stiffness per joint, and (effect, sentence) for what that changes.  A
+    joint split into levels gets their mean; a negative compliance becomes rigid; deflections are
+    those at the deflected pose.  `only` makes the change of one of them alone."""
     cell, values = part.model.cell, dict(part.values)
     changed, spec = list[tuple[str, str]](), cell.model
     if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):
@@ -252,7 +250,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
 
 
 def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple[LinkMass, ...]:
-    """Nominal masses with what `link_mass_error` found missing: mass and first moment add up."""
+    """With what `link_mass_error` found missing: mass and first moment add up."""
     errors = [name for name in values if name.endswith(".mass_error")]
     if not link_gravity and not errors:
         return ()
@@ -283,9 +281,6 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
         return ()
     tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
     return tuple(tensors) if len(tensors) == chain.n_joints else ()
-
-
-# What an export costs: how far the file's arm is from the calibrated one, effect by effect.
 
 
 @dataclass(frozen=True)
@@ -546,8 +541,7 @@ def _commanded(table: Measurements, correction: JointCorrection) -> Measurements
 
 
 def _rms(kept: Kept, part: Valued, table: Measurements, commanded: Measurements) -> float:
-    """Distance in m, rms over markers and poses, of the markers of `part`, commanded to other
-    joints, from those of the arm."""
+    """Distance in m, rms over markers and poses, from those of the arm."""
     markers = (evaluate_pieces(arm, kept.conditions).points[1:] for arm in (kept.exported, part))
     expected = points_of(kept.full, table, next(markers))
     apart = np.linalg.norm(points_of(part, commanded, next(markers)) - expected, axis=2)
@@ -588,8 +582,8 @@ def _fitted(
 ) -> tuple[Valued, JointCorrection]:  # fmt: skip
     """`part` and its joint correction, fitted to where `kept.full` has points of its tool at the
     poses of a table: base and springs, with `geometry` that, with `tool` the markers, with
-    `correct` more than `start` of the correction.  The flange's origin counts as a marker where
-    the tool is not fitted."""
+    `correct` more than `start` of the correction.  The flange's origin counts as a marker where the
+    tool is not fitted."""
     pieces = evaluate_pieces(part, kept.conditions)
     places = {name: T[:3, 3] for name, T in pieces.markers.items()}
     free = part
@@ -645,7 +639,7 @@ def _fitted(
 
 def _basis(measured: Array) -> list[Curve]:
     """Curves of every joint against every joint's angle, linear between KNOTS places, and with the
-    side that it came from, each with the coefficient one: a joint correction is a sum of them."""
+    side that it came from, each with the coefficient one."""
     places = np.linspace(measured.min(axis=0), measured.max(axis=0), KNOTS)
     moving = np.flatnonzero(np.ptp(measured, axis=0) > MOVED)
     joints, ends = range(measured.shape[1]), np.array([-1.0, 1.0])

@@ -37,12 +37,11 @@ from elastocal.units import Array, pose_at, rpy_from_rotation
 
 
 def numbers(values: ArrayLike) -> str:
-    """Numbers separated by blanks, each with the digits that give the same double back."""
     return " ".join(repr(float(value)) for value in np.asarray(values, dtype=float))
 
 
 def placed_body(name: str | None, T: Array) -> dict[str, str]:
-    """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
+    """Attributes of a body or site at T (4, 4) in its parent's frame."""
     turned = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
     called = {} if name is None else {"name": name}
     return called | {"pos": numbers(T[:3, 3]), "quat": numbers(turned)}
@@ -74,11 +73,9 @@ MOUNT, TRACKER, LOAD_POINT = f"{PREFIX}flange_mount", f"{PREFIX}tracker", f"{PRE
 def calibrated_urdf(
     robot: Robot, pieces: ExportNumbers, tool: bool, base_frame: bool, note: str
 ) -> str:
-    """Text of the robot's URDF with the calibrated geometry; `note` becomes a comment in it.
-
-    Only origins that change are touched.  `tool` adds elastocal_marker_NAME and
-    elastocal_load_point as links on the flange, `base_frame` elastocal_tracker as the new root.
-    """
+    """Only origins that change are touched; `note` becomes a comment.  `tool` adds
+    elastocal_marker_NAME and elastocal_load_point as links on the flange, `base_frame`
+    elastocal_tracker as the new root."""
     assert robot.urdf is not None
     file = urdf_file(robot.urdf)
     tree, tags = tree_of(file), {tag.get("name").strip(): tag for tag in file.root.all("joint")}
@@ -132,7 +129,6 @@ def calibrated_urdf(
 
 
 def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
-    """Link name → placement (4, 4) in the flange frame of every marker and of the load point."""
     frames: dict[str, Array] = {}
     for marker, T in pieces.markers.items():
         name = f"{PREFIX}marker_{'_'.join(marker.split())}"
@@ -151,18 +147,14 @@ def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
     ]
 
 
-# A URDF for an arm that has none: a robot described by a DH table or a MuJoCo model.
-
 NEW_ENDS = NEW_BASE, NEW_FLANGE = "base_link", "flange"
 NO_LIMIT = 1e6  # m; a URDF's slide must have limits
 
 
 def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> str:
-    """URDF text of links base_link, link_1 … link_n, flange with the calibrated placements.
-
-    Joints bear the table's names and limits (continuous where one has none); masses that are known
-    stand with a zero inertia tensor.
-    """
+    """Links base_link, link_1 … link_n, flange with the calibrated placements.  Joints bear the
+    table's names and limits (continuous where one has none); masses that are known stand with a
+    zero inertia tensor."""
     # Masses of the robot's description where no weights act in the model.
     chain, masses = pieces.calibrated_chain(), pieces.masses or pieces.chain.masses
     lines = []
@@ -220,10 +212,8 @@ BESIDE = ("include", "model")
 
 
 def moved(path: Path, text: str, folder: Path) -> tuple[str, list[str]]:
-    """The `text` of a file that lies at `path`, to be written into `folder`, and what to know.
-
-    A file without names of others, or that stays where it was, is as before to the byte.
-    """
+    """The `text` of a file that lies at `path`, to be written into `folder`, and what to know.  A
+    file without names of others, or that stays where it was, is as before to the byte."""
     xml = XmlFile(path, text.encode("utf-8"), "a file")
     named = [tag for tag in xml.tags if any(_is_file(tag, key) for key in tag.stated)]
     if not named:
@@ -263,14 +253,9 @@ def _from(folder: Path, place: Path) -> str:
         return place.as_posix()
 
 
-# The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.
-
-
 def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Array) -> Array:
-    """T_base_flange (n, 4, 4) at q (n, joints) of a URDF in pinocchio; other joints are neutral.
-
-    Raises ValueError or RuntimeError where pinocchio refuses it.
-    """
+    """T_base_flange (n, 4, 4) at q (n, joints) in pinocchio, which raises ValueError or
+    RuntimeError where it refuses the file; other joints are neutral."""
     import pinocchio as pin
 
     model = pin.buildModelFromXML(text.encode("utf-8").decode("utf-8-sig"))
@@ -314,14 +299,11 @@ def calibrated_mjcf(
     pieces: ExportNumbers, note: str, inertias: Sequence[Array],
     compensator: dict[str, float] | None, base_frame: bool,
 ) -> str:  # fmt: skip
-    """MJCF text of the exported pieces.
-
-    Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
+    """Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
     actuators load_x, load_y, load_z (control: N at the load point, axes of the tracker).  Sites:
     flange, load_point, marker_NAME.  The world is the robot's base, or with `base_frame` the
     tracker's frame.  `inertias`: (3, 3) kg m² per link about its centre of mass in its joint's
-    axes; `compensator`: values of `gravity_compensator` by key, with `joint` its 0-based index.
-    """
+    axes; `compensator`: values of `gravity_compensator` by key, with `joint` its 0-based index."""
     chain = pieces.chain
     root = ET.Element("mujoco", model=chain.name)
     root.append(ET.Comment(f" {note.replace('--', '- -')} "))
@@ -412,7 +394,7 @@ def _passive(body: ET.Element, springs: dict[Spring, float], frame: Array = IDEN
 
 
 def spring_joint(prefix: str, spring: Spring, compliance: float, F: Array) -> dict[str, str]:
-    """Attributes of the passive joint of a spring whose frame is F (4, 4) in the moved body's."""
+    """The passive joint of a spring whose frame is F (4, 4) in the moved body's."""
     stiffness = 1.0 / compliance
     return {
         "name": prefix + spring.name, "type": MOTIONS[spring.kind],
@@ -444,7 +426,7 @@ def _motor(
 def _compensate(
     root: ET.Element, body: ET.Element, T: Array, axis: Array, values: dict[str, float]
 ) -> None:
-    """The compensator's spring, which hangs on the link before the joint: opposite (a_x, a_y)."""
+    """Its spring hangs on the link before the joint: opposite (a_x, a_y)."""
     x, y = transverse_axes(axis)
     point = -values["compensator_anchor_x"] * x - values["compensator_anchor_y"] * y
     place = T[:3, :3] @ point + T[:3, 3]
@@ -469,10 +451,8 @@ TOLERANCE, AT_REST = 1e-13, 1e-10  # rad or m: last step, and what may be left
 class MujocoRest:
     """A written arm in MuJoCo: a new file, whose joints its actuators drive, or the user's own as
     it is read back (`arm`), whose joints are held where they are commanded, its springs at rest.
-
     Of the user's own, joints beside the chain stay where they stand and only the springs move, so
-    what the file has besides to be seen or to move it plays no part.
-    """
+    what the file has besides to be seen or to move it plays no part."""
 
     def __init__(self, text: str, arm: MjcfArm | None = None) -> None:
         self._mujoco = mujoco = import_mujoco("the check")
@@ -498,11 +478,8 @@ class MujocoRest:
         self._commanded, self._at = model.jnt_qposadr[commanded], model.jnt_qposadr[yielding]
 
     def sites(self, q: Array, force: Array, names: Sequence[str]) -> Array:
-        """Positions (len(names), 3) in m in a new file's world, at rest: commanded to q (n,) under
-        `force` (3,) N.
-
-        Raises ElastocalError where no rest is found.
-        """
+        """Positions (len(names), 3) in m in a new file's world, commanded to q (n,) under `force`
+        (3,) N."""
         self._data.ctrl[self._drives] = q
         for axis, value in zip("xyz", force, strict=True):
             self._data.ctrl[self.model.actuator(f"load_{axis}").id] = value
@@ -510,8 +487,7 @@ class MujocoRest:
         return np.array([self._data.site(name).xpos.copy() for name in names])
 
     def points(self, q: Array, force: Array, pieces: ExportNumbers) -> Array:
-        """Positions (k, 3) of `pieces.points` in the world of the file, the same; `force` in the
-        tracker's axes."""
+        """`pieces.points` (k, 3) in the world of the file; `force` in the tracker's axes."""
         arm, data = self._arm, self._data
         if arm is None:
             return self.sites(q, force, ["flange", *(f"marker_{name}" for name in pieces.markers)])
@@ -578,12 +554,9 @@ class NotInPlace(ElastocalError):
 def corrected_mjcf(
     robot: Robot, pieces: ExportNumbers, frames: bool, note: str
 ) -> tuple[str, list[str]]:
-    """Text of the robot's MJCF with the calibrated arm, and what to know of it.
-
-    `frames`: sites elastocal_marker_NAME and elastocal_load_point on the flange.
-
-    Raises NotInPlace where the file cannot take a correction, with the reason.
-    """
+    """Text of the robot's MJCF with the calibrated arm, and what to know of it; NotInPlace where it
+    cannot take a correction.  `frames`: sites elastocal_marker_NAME and elastocal_load_point on the
+    flange."""
     assert robot.mjcf is not None
     text = _MjcfText(MjcfArm.read(robot.mjcf, robot.base, robot.flange), pieces)
     if pieces.springs_at(f"link{pieces.chain.n_joints}"):
@@ -632,7 +605,7 @@ class _MjcfText(XmlFile):
         return self.bodies[body].all("joint", "freejoint")
 
     def anywhere(self, name: str, above: str = "") -> list[Tag]:
-        """All tags of a name, those that stand directly in `above` where that is given."""
+        """Those that stand directly in `above` where that is given."""
         return [
             tag for tag in self.tags
             if tag.name == name and above in ("", tag.above.name if tag.above else "")
@@ -655,7 +628,7 @@ class _MjcfText(XmlFile):
         self.place(tag, transform(model.body_pos[body], model.body_quat[body]) @ error)
 
     def add_springs(self, i: int, j: int) -> int:
-        """Put the springs between link i and joint i before the joint; returns how many."""
+        """Between link i and joint i, before the joint; returns how many."""
         pieces, model = self.pieces, self.model
         proximal = pieces.springs_at(f"link{i}" if i else "base")
         springs = proximal | pieces.springs_at(f"joint{i + 1}")
@@ -690,8 +663,7 @@ class _MjcfText(XmlFile):
                 self.set(tag, {name: " ".join(values)})
 
     def let_act(self) -> list[str]:
-        """Let springs yield and weights act in the file, as they do in the model; what that
-        changes."""
+        """Springs yield and weights act in the file, as they do in the model; what that changes."""
         # Flags as versions of MuJoCo have them.
         names = ["passive", "spring", *(["gravity"] if self.pieces.masses else [])]
         flags, kinds = self.anywhere("flag", "option"), import_mujoco().mjtDisableBit

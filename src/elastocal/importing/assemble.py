@@ -46,16 +46,11 @@ from elastocal.units import Array, IntArray
 def with_joints(
     where: str, records: Records, joints: JointsTable, model_names: Sequence[str] = ()
 ) -> Records:
-    """The records with q1 … qn as the robot model counts them: order, sign, offset, coupling.
-
-        q_j = sign_j * c_{order(j)} + offset_j + Σ factor * q_i
-
-    with c the controller's values and the sum over the couplings of joint j; q_i there is the value
-    before any coupling, so the couplings do not depend on their order.
-
-    The order is that of [joints] order, else the joint names of the file (columns joint1 …) are
-    brought into the order of [joints] names, else of `model_names` where the file has them all.
-    """
+    """With q1 … qn as the robot model counts them: q_j = sign_j * c_{order(j)} + offset_j + Σ
+    factor * q_i, c the controller's values and the sum over the couplings of joint j; q_i there is
+    the value before any coupling, so the couplings do not depend on their order.  The order is that
+    of [joints] order, else the joint names of the file (columns joint1 …) are brought into the
+    order of [joints] names, else of `model_names` where the file has them all."""
     stems = joint_stems(records.numbers)
     if not stems:
         return records
@@ -177,13 +172,11 @@ CHUNK = 1024
 def dwells(
     time: Array, q: Array, still: Array, shortest: float
 ) -> tuple[IntArray, IntArray, Array]:
-    """The longest runs of rows in which no joint moves by more than `still`: the first and the
-    last row of each (k,), and where the arm stands then (k, n), the median.
-
-    `time` (m,) s, rising; `q` (m, n); `still` (n,): the largest max - min of each joint within a
-    dwell, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
-    the start of the log on, each as long as it can be; shorter ones count as motion.
-    """
+    """The longest runs of rows in which no joint moves by more than `still`: the first and the last
+    row of each (k,), and where the arm stands then (k, n), the median.  `time` (m,) s, rising; `q`
+    (m, n); `still` (n,): the largest max - min within a dwell, in the unit of q; `shortest` s
+    between its first and last row.  Runs are taken from the start of the log on, each as long as it
+    can be; shorter ones count as motion."""
     found: list[tuple[int, int]] = []
     start, m = 0, len(time)
     while start + 1 < m:
@@ -219,12 +212,9 @@ SHOWN = 8
 
 @dataclass(frozen=True)
 class Joined:
-    """`row` (points,) into the joint log, -1 without a partner; `q` (points, joints).
-
-    `pose` (points,) names the pose where the log does, None where it does not; `left_out` and
-    `unused` say which points and which poses found no partner; `remarks` and `warnings` are for
-    the preview.
-    """
+    """`row` (points,) into the joint log, -1 without a partner; `q` (points, joints); `pose`
+    (points,) names the pose where the log does.  `left_out` and `unused` say which points and which
+    poses found no partner; `remarks` and `warnings` are for the preview."""
 
     how: str
     row: IntArray
@@ -237,7 +227,6 @@ class Joined:
 
 
 def join(points: Records, log: Records, settings: JoinTable) -> Joined:
-    """By name where names agree, by time where both have one, else by order, unless stated."""
     named = points.texts.get("configuration")
     obvious = "time" if "time" in points.numbers and "time" in log.numbers else "order"
     how = settings.by or ("name" if named and _keys(named, _names_of(log)) else obvious)
@@ -263,10 +252,8 @@ MOST_POINTS_JOINED = 0.8  # a share from which an offset is worth telling
 
 
 def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str) -> str:
-    """The offset of the log's clock at which most points fall into standstills, as a hint.
-
-    "" where the join is not by clocks, few points would, or two offsets would do as well.
-    """
+    """The offset of the log's clock at which most points fall into standstills, as a hint; "" where
+    the join is not by clocks, few points would, or two offsets would do as well."""
     if how not in ("time", "standstill"):
         return ""
     at, order = points.clock(how), np.argsort(log.clock(how), kind="stable")
@@ -312,8 +299,7 @@ def _number(name: str) -> str:
 
 
 def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
-    """What two lists of names have in common: whole names, else the numbers at their ends where
-    these tell the names of each list apart; None where there is nothing."""
+    """Whole names, else the numbers at their ends where these tell the names of each list apart."""
     for key in (_key, _number):
         mine, other = {key(n) for n in ours}, {key(n) for n in theirs}
         apart = all(len({key(n) for n in names}) == len({_key(n) for n in names})
@@ -333,7 +319,7 @@ def _loads_apart(points: Records, log: Records) -> Iterator[tuple[str, IntArray,
 
 
 def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray:
-    """(chosen,) number of the visit: points measured without moving the arm in between."""
+    """(chosen,): points measured without moving the arm in between are of one visit."""
     n = len(chosen)
     if per_pose is not None:
         return np.arange(n) // per_pose
@@ -410,8 +396,8 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
 
 
 def _nearest(at: Array, first: Array, last: Array) -> tuple[IntArray, Array]:
-    """Number of the stop, from `first` to `last` (k,) s, one after the other, that is nearest to
-    each time `at` (n,), and the time to its nearer end, 0 within it."""
+    """Number of the stop, from `first` to `last` (k,) s, that is nearest to each time `at` (n,),
+    and the time to its nearer end, 0 within it."""
 
     def apart(stop: IntArray) -> Array:
         return np.maximum(np.maximum(first[stop] - at, at - last[stop]), 0.0)
@@ -475,12 +461,10 @@ Columns = dict[str, Sequence[str] | NDArray]
 def assemble(
     where: str, points: Records, mapping: MappingTable
 ) -> tuple[Columns, tuple[str, ...], list[str]]:
-    """A row for each point, in their order; the kind of each joint; sentences for the preview.
-
-    Configurations are those of the names, else of the joint log, else joint values that agree
-    within same_pose_deg.  Repeats are numbered in order where the file does not number them.  Times
-    are counted from the first reading.
-    """
+    """A row for each point; the kind of each joint; sentences for the preview.  Configurations are
+    those of the names, else of the joint log, else joint values that agree within same_pose_deg.
+    Repeats are numbered in order where the file does not number them.  Times are counted from the
+    first reading."""
     settings, n = mapping.join, len(points)
     numbers, units = dict(points.numbers), dict(points.units)
     stems = joint_stems(numbers)
@@ -572,8 +556,6 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
     return np.array([int(text) for text in stated], dtype=np.int64)
 
 
-# Whether an imported table can be right: its units, and whether the robot of a cell fits it.
-
 # Industrial arms measured by trackers: radians of a campaign span more than this, degrees too.
 SMALLEST_SPREAD_DEG = 7.0  # 2 pi: a column of radians read as degrees spans less
 LARGEST_TURN_DEG = 720.0
@@ -583,7 +565,7 @@ LARGEST_SIGMA_M = 5e-3
 
 
 def plausibility(columns: Columns, table: Measurements, observe: str | None) -> list[str]:
-    """Sentences about columns that are likely in another unit, and about pairs that are missing."""
+    """Of columns that are likely in another unit, and pairs that are missing."""
     turning = table.q[:, np.array([kind == "revolute" for kind in table.kinds])]
     turned = float(np.degrees(np.abs(turning).max(initial=0.0)))
     span = float(np.degrees(np.ptp(turning, axis=0).max(initial=0.0)))
@@ -631,11 +613,8 @@ def plausibility(columns: Columns, table: Measurements, observe: str | None) -> 
 
 @dataclass(frozen=True)
 class Imported:
-    """What was read and made of it.
-
-    `table` is the measurement table as `measurements.read_measurements` reads `text`;
-    `refused` says why the robot of the cell cannot have measured it, "" where it can.
-    """
+    """`table` is the measurement table as `text` reads; `refused` says why the robot of the cell
+    cannot have measured it."""
 
     understood: tuple[dict[str, Any], ...]
     columns: Columns
@@ -651,11 +630,8 @@ def import_files(
     files: Sequence[Path], mapping: tuple[str, MappingTable], cell: Cell | None = None,
     name: str = "data.csv",
 ) -> Imported:  # fmt: skip
-    """Read `files` as `mapping` says, join, convert, and validate the measurement table.
-
-    `cell`: the robot that the table must fit: number and kind of joints, markers, limits;
-    `name`: what messages call the table.  Nothing is written.
-    """
+    """Nothing is written.  `cell`: the robot that the table must fit: number and kind of joints,
+    markers, limits; `name`: what messages call the table."""
     where, table = mapping
     chain = None if cell is None else load_chain(cell)
     names = () if chain is None else tuple(joint.name for joint in chain.joints)
@@ -709,8 +685,8 @@ def import_files(
 def _by_role(
     where: str, files: Sequence[Path], table: MappingTable, names: tuple[str, ...]
 ) -> tuple[dict[str, list[Records]], list[dict[str, Any]], bool]:
-    """The records of each file among "points" or "joints", what is to be told of each file, and
-    whether any states angles in the place of positions; `names` of the cell's joints."""
+    """Of each file among "points" or "joints", what is to be told of each, and whether any states
+    angles in the place of positions."""
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood, spherical = [], False
     for path, source in _assigned(where, files, table.source or ()):
@@ -743,7 +719,7 @@ def _placed(points: Records) -> Iterator[None]:
 
 
 def _with_joint_values(points: Records, log: Records, joined: Joined) -> Records:
-    """The points that found joint values, with these and what else the log says there."""
+    """The points that found joint values, with what else the log says there."""
     rows = np.flatnonzero(joined.row >= 0)
     pose = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
     own, theirs, stems = points.take(rows), log.take(joined.row[rows]), joint_stems(log.numbers)
@@ -758,11 +734,8 @@ def _with_joint_values(points: Records, log: Records, joined: Joined) -> Records
 def _assigned(
     where: str, files: Sequence[Path], sources: Sequence[SourceTable]
 ) -> list[tuple[Path, SourceTable]]:
-    """Each file with the source that reads it.
-
-    A file goes to the first source whose `files` pattern fits its name; sources without a pattern
-    share the rest: one takes them all, several take one file each, in order.
-    """
+    """A file goes to the first source whose `files` pattern fits its name; sources without a
+    pattern share the rest: one takes them all, several take one file each, in order."""
     chosen: dict[int, SourceTable] = {}
     for i, path in enumerate(files):
         if path in files[:i]:

@@ -49,11 +49,9 @@ Line = tuple[int, list[str]]  # its number and cells
 
 
 def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str]:
-    """The lines of a text file of at most 300 MB without their ends, and its encoding.
-
-    `encoding` "auto": by the byte order mark, else UTF-8 where the bytes allow, else Windows-1252
-    (Latin-1 where that has no character).
-    """
+    """The lines of a text file without their ends, and its encoding.  `encoding` "auto": by the
+    byte order mark, else UTF-8 where the bytes allow, else Windows-1252 (Latin-1 where that has no
+    character)."""
     source = str(path)
     data = read_bytes(path, "export", MAX_BYTES)
     if not data.strip():
@@ -104,20 +102,13 @@ class Rows:
 def table_rows(
     source: str, lines: list[str], settings: TextSourceKeys, asked: Sequence[ColumnKey]
 ) -> Rows:
-    """The rows of a delimited table.
-
-    Where columns are asked for by name the header is the line that has them; else the table begins
-    at the first line with numbers where they are asked for, and the line before it is its header if
-    it has as many cells.  Lines above the table, repeated headers and lines that match `ignore` are
-    passed over and listed.
-    """
+    """Where columns are asked for by name the header is the line that has them; else the table
+    begins at the first line with numbers where they are asked for, and the line before it is its
+    header if it has as many cells.  Lines above the table, repeated headers and lines that match
+    `ignore` are passed over and listed."""
     guess = NumberCells("auto", settings.thousands, settings.missing, ())
     numbers = (c.at[0] for c in asked if c.required and c.quantities)
     places = [at for at in numbers if isinstance(at, int)]
-
-    def is_data(cells: Sequence[str]) -> bool:
-        return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
-
     named = any(isinstance(part, str) for c in asked if c.required for part in c.at)
     content, comments, ignored = _sorted_lines(source, lines, settings)
     tried = _by_numbers(content) if settings.delimiter == "auto" else [settings.delimiter]
@@ -133,7 +124,11 @@ def table_rows(
             break
     table = list(_split(source, delimiter, content))
     if not named:
-        first = next((k for k, row in enumerate(table[:SAMPLE]) if is_data(row[1])), None)
+        first = next(
+            (k for k, (_, cells) in enumerate(table[:SAMPLE])
+             if all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)),
+            None,
+        )  # fmt: skip
         if first is None:
             number, line = content[0]
             raise InputError(
@@ -175,7 +170,6 @@ Numbered = list[tuple[int, str]]  # lines with their numbers
 def _sorted_lines(
     source: str, lines: list[str], settings: TextSourceKeys
 ) -> tuple[Numbered, Numbered, Numbered]:
-    """Those of the table, those that are comments, and those that are to be ignored, with why."""
     marks = tuple(settings.comments)
     skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = Numbered(), Numbered(), Numbered()
@@ -211,8 +205,8 @@ def _cells(delimiter: str, line: str) -> list[str] | None:
 
 
 def _by_numbers(content: Numbered) -> list[str]:
-    """Delimiters by how many cells that are numbers they leave in a line of the median; commas may
-    be decimal marks."""
+    """By how many cells that are numbers they leave in a line of the median; commas may be decimal
+    marks."""
 
     def numbers(delimiter: str) -> int:
         lines = (_cells(delimiter, line) or [] for _, line in content[:SAMPLE])
@@ -238,13 +232,11 @@ _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
 
 def program_rows(source: str, lines: list[str], kind: str) -> Rows:
-    """The joint values in a robot program, KRL or RAPID, or in a log of its variables.
-
-    KRL: every aggregate of A1, A2 … (and E1 …); FRAME, POS and E6POS (X, Y, Z) are passed over.
-    RAPID: every jointtarget [[rax_1 … rax_6], [eax_a … eax_f]], an array's members named P{1},
-    P{2} …; robtargets hold no joint values and o_jointtarget is the position before a correction:
-    both are passed over.  What is passed over is named.
-    """
+    """The joint values in a robot program, KRL or RAPID, or in a log of its variables.  KRL: every
+    aggregate of A1, A2 … (and E1 …); FRAME, POS and E6POS (X, Y, Z) are passed over.  RAPID: every
+    jointtarget [[rax_1 … rax_6], [eax_a … eax_f]], an array's members named P{1}, P{2} …;
+    robtargets hold no joint values and o_jointtarget is the position before a correction: both are
+    passed over, and named."""
     axes, mark, read, what = {
         "krl": (KRL_AXES, ";", _krl, "no {A1 …, A2 …} with joint values"),
         "rapid": (RAPID_AXES, "!", _rapid, "no jointtarget [[…], […]]"),
@@ -316,8 +308,6 @@ def _rapid(whole: str) -> Found:
         start += len(statement) + 1
 
 
-# Rows of a file as the mapping reads them.
-
 FORCES = tuple(f"force_{axis}" for axis in "xyz")
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
@@ -326,14 +316,12 @@ UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are s
 
 @dataclass(frozen=True)
 class Records:
-    """n rows of exported files; `file` (n,) and `line` (n,) say where each stands.
-
-    `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` (name,
-    configuration, marker, repeat, load) → n texts; `load` of all rows, where one is stated.
-    `understood` says for people what was made of the file, by the keys of the command's JSON:
-    `unused` names of the file's other columns, `ignored` (line, reason) of everything passed over;
-    `doubts`: what to warn of.
-    """
+    """n rows of exported files; `file` (n,) and `line` (n,) say where each stands.  `numbers` stem
+    → (n,) in `units[stem]`, the units of the table to be written; `texts` (name, configuration,
+    marker, repeat, load) → n texts; `load` of all rows, where one is stated.  `understood` says for
+    people what was made of the file, by the keys of the command's JSON: `unused` names of the
+    file's other columns, `ignored` (line, reason) of everything passed over; `doubts`: what to warn
+    of."""
 
     file: list[str]
     line: IntArray
@@ -367,7 +355,7 @@ class Records:
         return [stem for stem in FORCES if stem in self.numbers]
 
     def shown(self, i: int) -> str:
-        """Row i for a list in a message: its name and line."""
+        """Row i for a list in a message."""
         name = self.names[i]
         return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
 
@@ -422,12 +410,8 @@ def joint_stems(numbers: Iterable[str]) -> list[str]:
 
 
 def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable) -> Records:
-    """The rows of `path` as `source` of the mapping `where` describes them, one for each marker
-    where a row has several.
-
-    A row with an empty cell where a number belongs is passed over and listed; of a marker without
-    a value that one alone.
-    """
+    """One for each marker where a row has several.  A row with an empty cell where a number belongs
+    is passed over and listed; of a marker without a value that one alone."""
     settings, name = source.text, str(path)
     asked = mapping_file.wanted(where, source.columns, source.optional)
     lines, encoding = read_lines(path, settings.encoding)
@@ -539,7 +523,6 @@ def _rows(
 
 
 def likely_presets(path: Path) -> list[str]:
-    """The presets that read most rows of a file; none where no preset reads it."""
     rows = dict[str, int]()
     for name in mapping_file.PRESETS:
         where, mapping = mapping_file.read_mapping(None, [name], "mm", "deg")
@@ -548,8 +531,6 @@ def likely_presets(path: Path) -> list[str]:
                 rows[name] = len(read_records(where, path, source, mapping.units))
     return [name for name, n in rows.items() if n == max(rows.values())]
 
-
-# What a row stands for: its position, its labels, its load.
 
 HEIGHT = ("zenith", "elevation")
 SPHERICAL = ("range", "azimuth", *HEIGHT)
@@ -618,11 +599,9 @@ NAMED = "write pattern in [source.names]"
 
 
 def with_labels(where: str, records: Records, names: NamesTable) -> Records:
-    """The records with the texts of GROUPS, from columns and, where a pattern is given, from names.
-
-    A group that a column gives too is taken from the column.  A name that no pattern matches is
-    an error, or with unmatched = "ignore" passed over and listed.
-    """
+    """With the texts of GROUPS, from columns and, where a pattern is given, from names, if no
+    column gives them.  A name that no pattern matches is an error, or with unmatched = "ignore"
+    passed over and listed."""
     if names.pattern is not None and "name" in records.texts:
         records = _with_names_read(where, records, names)
     labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
@@ -692,12 +671,9 @@ UNLOADED = ("none", "unloaded", "0")
 def forces_of(
     where: str, points: Records, loads: Mapping[str, Array | LoadStatesTable]
 ) -> Array | None:
-    """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
-
-    A mass m hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as
-    "2600 N" or "2.5 kg", unless [loads] has it.  The names none, unloaded and 0 mean no force
-    unless [loads] says otherwise.
-    """
+    """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.  A mass m
+    hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as "2600 N"
+    or "2.5 kg", unless [loads] has it."""
     named = points.texts.get("load")
     if named is None:
         if loads and not points.forces:
@@ -739,7 +715,6 @@ _NEWTONS = {"kg": STANDARD_GRAVITY, "kn": 1e3, "n": 1.0}
 
 
 def load_in(text: str) -> tuple[str, float] | None:
-    """The load that a text states, as it is written and in N; None where none is."""
     found = _SIZE.search(text)
     if found is None:
         return None
@@ -750,8 +725,8 @@ def load_in(text: str) -> tuple[str, float] | None:
 def with_loads_of_names(
     by_role: Mapping[str, list[Records]], loads: Mapping[str, Any]
 ) -> tuple[dict[str, list[Records]], list[str]]:
-    """The records with the loads that their files are named for, where nothing else states any, and
-    what to tell.  They hang straight down."""
+    """With the loads that their files are named for, hanging straight down, where nothing else
+    states any, and what to tell."""
     made, every = dict(by_role), [r for role in by_role.values() for r in role]
     if loads or any(r.load or "load" in r.texts or r.forces for r in every):
         return made, []

@@ -101,10 +101,8 @@ def init(
 def robot_of(
     path: Path, base: str | None, flange: str | None, convention: Convention, ur_model: str | None
 ) -> Robot:
-    """The robot that a file describes: URDF, MuJoCo model or DH table, by its ending.
-
-    Base and flange are those that are found where none are named, so that a cell states them.
-    """
+    """The robot of a file; base and flange are those that are found where none are named, so that a
+    cell states them."""
     kind = ENDINGS.get(path.suffix.lower())
     if path.suffix.lower() == ".xacro":
         raise InputError(xacro_left(path, f"the ending '{path.suffix}'"))
@@ -151,7 +149,6 @@ def first_cell(robot: Robot, folder: Path) -> str:
 
 
 def notes_of(robot: Robot, chain: Chain) -> list[str]:
-    """What to know of how the robot's file was read, in sentences."""
     found = list(chain.notes)
     if clash := clashing(chain):
         found.append(
@@ -175,8 +172,8 @@ FEW_KINDS = 3  # links of each mass, on average, from which on nobody has weighe
 
 
 def placeholder_masses(chain: Chain) -> str:
-    """What speaks against the masses of the robot's file: many links of one mass, or all together
-    far from what an arm of that length weighs; "" where nothing does."""
+    """Many links of one mass, or all together far from what an arm of that length weighs; "" where
+    nothing speaks against them."""
     masses = [f"{body.mass:.4g}" for body in chain.masses]
     if masses and len(set(masses)) * FEW_KINDS <= len(masses):
         mass, k = Counter(masses).most_common(1)[0]

@@ -160,8 +160,6 @@ class MappingTable(Table):
     join: JoinTable = key("a table", JoinTable())
 
 
-# Reads a mapping file and the presets: TOML → checked tables, the user's keys on top.
-
 # A key of [source.columns] with its unit cut off: what two keys for the same column share.
 _UNIT = re.compile(r"_[A-Za-z]+$")
 
@@ -176,11 +174,9 @@ def read_mapping(
     path: str | Path | None, presets: Sequence[str] = (), length_unit: str | None = None,
     angle_unit: str | None = None,
 ) -> tuple[str, MappingTable]:  # fmt: skip
-    """The mapping of a file, of presets (one source each), or of both; units given count instead of
-    its own.  Before it, where messages say that it was stated; sources have their presets in them.
-
-    A mapping file without [[source]] tables says how to join and convert what `presets` read.
-    """
+    """The mapping of a file, of presets (one source each), or of both, and where messages say that
+    it was stated; units given count instead of its own.  A mapping file without [[source]] tables
+    says how to join and convert what `presets` read."""
     given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
     checked(MappingTable, {"units": given}, f"{option('length_unit')}, {option('angle_unit')}")
     where = option("presets") if path is None else str(path)
@@ -226,15 +222,12 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
     return base | source | {part: base.get(part, {}) | source.get(part, {}) for part in tables}
 
 
-# Which column of an export fills which column of the measurement table, and in which unit.
-
 TEXTS = ("name", "configuration", "marker", "repeat", "load", "time_text", "joint#")
 AUTO = "auto"
 _NUMBERED = re.compile(r"^(q|torque_|approach_|joint)([1-9]\d?|#)(?=_|$)")
 
 
 def _of_any_joint(name: str) -> str:
-    """q# for q3, q#_deg for q3_deg."""
     return _NUMBERED.sub(r"\1#", name)
 
 
@@ -256,12 +249,10 @@ _QUANTITIES = _quantities()
 @dataclass(frozen=True)
 class ColumnKey:
     """A column to fill: `stem` ("x", "q3", "q#"), `unit` ("" where there is none, or "auto").
-
     `quantities` that its units are of, the usual first (joints are angles first), none of a text;
     `at`: where the mapping has it; `required`: it is of [source.columns], not [source.optional].
     Found in a file, it has its `index` among the cells of a row (several are joined, for texts),
-    the file's own name and its unit there.
-    """
+    the file's own name and its unit there."""
 
     key: str
     stem: str
@@ -274,7 +265,6 @@ class ColumnKey:
 
     @property
     def of_each_marker(self) -> bool:
-        """Whether one row has such a column for each marker."""
         return EACH in str(self.at[0])
 
     @property
@@ -317,7 +307,6 @@ EACH = "*"  # in a place of [source.columns]: the name of a marker
 def wanted(
     where: str, required: Mapping[str, Where], optional: Mapping[str, Where]
 ) -> tuple[ColumnKey, ...]:
-    """The keys of [source.columns] (required) and [source.optional], checked."""
     filled: dict[str, ColumnKey] = {}
     # q1 that is stated by itself counts before the q1 of q#, as of a preset.
     single = {column_key(where, name).stem for name in (*required, *optional) if "#" not in name}
@@ -359,7 +348,7 @@ def wanted(
 
 
 def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
-    """The required columns asked for by name that a line does not name, as the mapping has them."""
+    """The required columns asked for by name that a line does not have."""
     free = _unnamed(asked, cells)
     return [
         f"{target.key} = {quoted(part)}"
@@ -371,9 +360,7 @@ def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
 
 
 def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
-    """The markers that have a column each in one row, as the file calls them; none where the
-    mapping has no * in a place.
-    """
+    """As the file calls them; none where the mapping has no * in a place."""
     free = _unnamed(asked, header)
     found = {target: _marker_names(target, free) for target in asked if target.of_each_marker}
     names = list(dict.fromkeys(name for t, own in found.items() if t.required for name in own))
@@ -389,16 +376,15 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
 
 
 def _unnamed(asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
-    """The cells of a header without those that the mapping calls by their whole name, as force_z:
-    no marker is called force."""
+    """Without the cells that the mapping calls by their whole name, as force_z: no marker is called
+    force."""
     named = {_plain(name) for c in asked if not c.of_each_marker
              for part in c.at for name in str(part).split("|")}  # fmt: skip
     return [cell for cell in header if not named & {_plain(cell), _unitless(cell)}]
 
 
 def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
-    """What * stands for in the columns of a header; columns in a unit of something else are not
-    meant."""
+    """What * stands for in a header; columns in a unit of something else are not meant."""
     found = []
     for cell in header:
         unit = split_unit(cell)[1]
@@ -416,13 +402,10 @@ def resolve(
     source: str, asked: Sequence[ColumnKey], header: Sequence[str], width: int,
     units: UnitsTable, hint: str | None,
 ) -> tuple[ColumnKey, ...]:  # fmt: skip
-    """Where each column stands, and in which unit.
-
-    `header`: names of the columns, () without a header; `width`: cells of the first row;
-    `units`: for columns whose key ends in _auto where neither the header nor `hint`, the unit
-    that a comment of the file states, says one.  Times and temperatures that are optional have
-    the unit AUTO where nothing says it.
-    """
+    """Where each column stands, and in which unit.  `header`: names of the columns, () without a
+    header; `width`: cells of the first row; `units`: for columns whose key ends in _auto where
+    neither the header nor `hint`, the unit that a comment of the file states, says one.  Times and
+    temperatures that are optional have the unit AUTO where nothing says it."""
     columns: list[ColumnKey] = []
     for target in asked:
         if (found := _column(source, target, header, width)) is not None:
@@ -482,7 +465,7 @@ def _unitless(name: str) -> str:
 
 
 def _find(names: str, header: Sequence[str]) -> list[int]:
-    """Columns with the first of the names "A|B" that any has; by the whole header, else less its
+    """Columns with the first of the names "A|B" that any has, by the whole header, else less its
     unit."""
     for name in names.split("|"):
         sought = _plain(name)
@@ -494,8 +477,7 @@ def _find(names: str, header: Sequence[str]) -> list[int]:
 
 
 def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | None) -> ColumnKey:
-    """The column with its unit found out (AUTO where nothing says it), or compared with what the
-    file says."""
+    """AUTO where nothing says it."""
     if target.unit == "":
         return target
     stated = split_unit(target.header)[1]
@@ -514,14 +496,11 @@ def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | No
     return replace(target, unit=stated or fitting or general or AUTO)
 
 
-# How numbers, times and units are written.
-
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"
 
 
 def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:
-    """What the group `unit` of `pattern` finds in the first comment that it matches."""
     if pattern is None:
         return None
     expression = compiled(where, "unit_comment", pattern)
@@ -599,10 +578,8 @@ class NumberCells:
 def seconds_of(
     source: str, lines: Sequence[int], texts: Sequence[str], formats: Sequence[str]
 ) -> list[float]:
-    """Seconds since 1970 (UTC) of the times of a column; one without a zone is taken as UTC.
-
-    The first of `formats` (strptime, or ISO 8601) that reads the first text reads all.
-    """
+    """Seconds since 1970 (UTC); a time without a zone is taken as UTC.  The first of `formats`
+    (strptime, or ISO 8601) that reads the first text reads all."""
     chosen, found = [*formats, ISO], list[float]()
     for line, text in zip(lines, texts, strict=True):
         t = " ".join(text.split())

@@ -25,16 +25,14 @@ from elastocal.model.chain import Chain
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array, BoolArray, pose_at
 
-# What a solid is to geometry: its hull, its support function and its coal shape.
-
 MESH_BYTES = 100_000_000
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
 def hull(solid: Solid, boxed: bool = False) -> tuple[Array, float]:
-    """Points (k, 3) in the carrier's frame and a radius: the solid is their convex hull grown by
-    the radius; a cylinder lies inside, and a mesh that is `boxed`, so that k ≤ 8, in the box around
-    it along its own axes."""
+    """Points (k, 3) in the carrier's frame and a radius by which their convex hull is grown: the
+    solid, or what a cylinder, and a mesh that is `boxed` (k ≤ 8, along its own axes), lies
+    inside."""
     if solid.shape == "mesh":
         points, radius = mesh_hull(solid)[0], 0.0
         if boxed:
@@ -51,7 +49,7 @@ def hull(solid: Solid, boxed: bool = False) -> tuple[Array, float]:
 
 
 def support(solid: Solid, direction: Array) -> float:
-    """max d·x over the solid, for a unit direction d (3,) in the carrier's frame, in m; exact."""
+    """max d·x over the solid, for a unit direction d (3,) in the carrier's frame; exact."""
     points, radius = hull(solid)
     if solid.shape == "cylinder":
         along = float(solid.placement[:3, 2] @ direction)
@@ -60,7 +58,7 @@ def support(solid: Solid, direction: Array) -> float:
 
 
 def touches(solid: Solid, point: Array, within: float) -> bool:
-    """True where the solid is at most `within` m from a point (3,) in the carrier's frame."""
+    """At most `within` m from a point (3,) in the carrier's frame."""
     import coal
 
     there = coal.Transform3s(np.eye(3), np.array(point, dtype=float))
@@ -70,7 +68,7 @@ def touches(solid: Solid, point: Array, within: float) -> bool:
 
 
 def capsule_between(name: str, a: Array, b: Array, radius: float) -> Solid:
-    """The capsule with cap centres a and b (3,); a sphere where they coincide."""
+    """A sphere where the cap centres coincide."""
     length = float(np.linalg.norm(b - a))
     if length < 1e-9:
         return Solid(name, "sphere", np.array([radius]), pose_at((a + b) / 2))
@@ -88,10 +86,8 @@ def rotation_to(z: Array) -> Array:
 
 
 def coal_shape(solid: Solid) -> Any:
-    """The coal shape centred at the solid's placement; meshes are their convex hull.
-
-    The hull makes a mesh a solid body: a triangle surface would not see what lies inside it.
-    """
+    """Centred at the solid's placement; a mesh is its convex hull, a solid body: a triangle surface
+    would not see what lies inside it."""
     import coal
 
     if solid.shape != "mesh":
@@ -104,7 +100,7 @@ def coal_shape(solid: Solid) -> Any:
 
 
 def mesh_hull(solid: Solid) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices (k, 3) of the mesh's convex hull in the solid's own frame, and its triangles."""
+    """Vertices (k, 3) in the solid's own frame, and triangles."""
     if solid.mesh is None:
         raise InputError(f"body '{solid.name}' is a mesh, but no file is given for it")
     return _mesh_hull(solid.mesh, tuple(solid.size.tolist()), solid.name)
@@ -236,7 +232,6 @@ def data_base(cell: Cell) -> Array:
 
 
 def cell_bodies(cell: Cell, chain: Chain) -> tuple[Body, ...]:
-    """Every body of the cell: arm, carried bodies, hanging load and rope, obstacles."""
     workspace = cell.workspace
     bodies = (
         *_arm(cell, chain),
@@ -432,9 +427,6 @@ def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[s
     return length <= hull(a.solid)[1] + hull(b.solid)[1] + workspace.self_clearance
 
 
-# Where everything stands in a batch of poses, from the chain's one symbolic description.
-
-
 @dataclass(frozen=True)
 class Poses:
     """N poses: `q` (N, n), `force` (N, 3) N at the load point in the data's frame, and
@@ -462,8 +454,6 @@ class Poses:
 
 
 class Kinematics:
-    """Frames of the rigid nominal arm in whole batches."""
-
     def __init__(self, cell: Cell, chain: Chain) -> None:
         self.chain = chain
         self.T_data_base = data_base(cell)
@@ -502,7 +492,17 @@ class Collisions:
         import pinocchio as pin
 
         self._margins = np.array([pair.margin for pair in pairs])
-        model = arm_model(kinematics, free)
+        chain, model, parent = kinematics.chain, pin.Model(), 0
+        for i, joint in enumerate(chain.joints):
+            placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
+            moving = getattr(pin, f"JointModel{joint.kind.capitalize()}Unaligned")(
+                joint.axis.copy()
+            )
+            parent = model.addJoint(parent, moving, pin.SE3(np.array(placement)), f"joint{i + 1}")
+        load_point = (chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
+        model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(pose_at(load_point)), "hanging")
+        for i in range(free):
+            model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
         geometry = geometry_of(kinematics, [item for p in pairs for item in (p.body, p.other)])
         hangs = np.array([pair.hangs for pair in pairs], dtype=bool)
         self._pools = []
@@ -517,9 +517,7 @@ class Collisions:
         self, poses: Poses, extra: float | Array = 0.0, placed: Array | None = None
     ) -> BoolArray:
         """(N,): some pair is nearer than its margin plus `extra` m, for all pairs or for each.
-
-        `placed` (N, 7 free): position and quaternion (x, y, z, w) of every free body.
-        """
+        `placed` (N, 7 free): position and quaternion (x, y, z, w) of every free body."""
         import pinocchio as pin
 
         last = poses.frames[:, poses.q.shape[1] - 1, :3, :3]
@@ -536,21 +534,6 @@ class Collisions:
             rows = configuration[left].T
             found[left] = np.array(pin.computeCollisionsInParallel(1, pool, rows, True))
         return found
-
-
-def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
-    import pinocchio as pin
-
-    model, parent = pin.Model(), 0
-    for i, joint in enumerate(kinematics.chain.joints):
-        placement = kinematics.T_data_base @ joint.placement if i == 0 else joint.placement
-        moving = getattr(pin, f"JointModel{joint.kind.capitalize()}Unaligned")(joint.axis.copy())
-        parent = model.addJoint(parent, moving, pin.SE3(np.array(placement)), f"joint{i + 1}")
-    load_point = (kinematics.chain.flange_placement @ [*kinematics.load_point, 1.0])[:3]
-    model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(pose_at(load_point)), "hanging")
-    for i in range(free):
-        model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
-    return model
 
 
 def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> Any:
@@ -572,8 +555,6 @@ def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> An
         geometry.addGeometryObject(pin.GeometryObject(item.name, joint, placed, shape))
     return geometry
 
-
-# What the tracker sees: range, incidence on the reflector, free line of sight.
 
 # The beam ends this many of its radii before the marker: a reflector on a surface is then seen
 # at incidences up to acos(1/4) = 75° from the surface's normal.
@@ -652,9 +633,6 @@ def rope_angle(poses: Poses, axis: Array) -> Array:
     return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
 
 
-# How far a body can move during a part of a joint interpolation, at most.
-
-
 class MotionBound:
     """By how much the distance of a pair can change from an interval's middle to anywhere in it.
 
@@ -728,8 +706,6 @@ def _reach(bodies: Sequence[Body]) -> tuple[Array, Array]:
     return np.concatenate([own for _, own, _ in found]), np.concatenate(radii)
 
 
-# Are joint interpolations free of collision?  Certified, not sampled.
-
 # A move that keeps its margins by less than this, in m, may be refused.
 RESOLUTION = 2.5e-5
 LARGEST = 0.3  # m: longer displacements are cut before they are tested
@@ -779,7 +755,6 @@ class Paths:
         return free
 
     def _interval(self, poses: Poses, half: Array) -> tuple[BoolArray, BoolArray]:
-        """Intervals (K,) that are free for certain, and those that refuse their move."""
         change = self._bound(poses, half)
         moved = change.max(axis=1, initial=0.0)
         # One batch per octave: its intervals share the largest change of every pair.

@@ -51,10 +51,8 @@ def inverse(M: Array) -> Array:
 
 def power_mean(x: Array, q: float) -> Array:
     """(Σ_i x_i^q / n)^{1/q} (...,) of x ≥ 0 (..., n): the geometric mean for q = 0, max for inf.
-
     It lies between n^{−1/q} max x and max x, q ≥ 1.  Of degree 1, and for 1/x_i concave in M so is
-    its reciprocal (Hardy, Littlewood & Pólya 1934, ch. 2).
-    """
+    its reciprocal (Hardy, Littlewood & Pólya 1934, ch. 2)."""
     top = x.max(axis=-1)
     if q == np.inf:
         return np.asarray(top)
@@ -250,9 +248,6 @@ class Turned(ScenarioCriterion):
         return Turned(self.base.softened(q), self.T)
 
 
-# Variances of linear functions of the parameters.
-
-
 @dataclass(frozen=True)
 class TraceCriterion(ScenarioCriterion):
     """Φ = tr(F V Fᵀ), L-optimality: the summed variance of the linear functions F (q, p) of y.
@@ -301,9 +296,6 @@ class TraceCriterion(ScenarioCriterion):
         if type(self).value is not TraceCriterion.value:
             return Turned(self, T)
         return replace(self, F=triangular(self.F @ T))
-
-
-# Eigenvalues of the covariance of the parameters of interest.
 
 
 @dataclass(frozen=True)
@@ -388,9 +380,6 @@ class MeanCriterion(SpectralCriterion):
 
     def phi_curvature(self, lam: Array) -> Array:
         return self.factor * mean_curvature(lam, self.order)
-
-
-# The criteria there are: variances of linear functions of the parameters.
 
 
 @dataclass(frozen=True)
@@ -631,11 +620,7 @@ Registered = TypeVar("Registered", bound=type[ScenarioCriterion])
 
 
 def register(criterion: Registered) -> Registered:
-    """Add a criterion of one's own to `CRITERIA`; usable as a decorator of its class.
-
-    Raises InputError where it is no whole criterion, or its name is taken.  The same class defined
-    again, as in a notebook, replaces the former.
-    """
+    """The same class defined again, as in a notebook, replaces the former."""
     require(
         isinstance(criterion, type) and issubclass(criterion, ScenarioCriterion),
         f"register takes a class derived from ScenarioCriterion; found {quoted(criterion)}",

@@ -26,10 +26,10 @@ from elastocal.messages import (
     length,
     listed,
     option,
-    options_given,
     quoted,
     require,
     rounded,
+    saying,
     wish,
 )
 from elastocal.model.chain import (
@@ -103,8 +103,6 @@ from elastocal.planning.setup import (
 )
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# How a plan is searched for; what it is to be stands in the cell's [design].
-
 Effort = Literal["quick", "normal", "thorough", "batch"]
 
 
@@ -156,7 +154,7 @@ def design(
     on the cell, the options and the seed, not on `options.jobs`, and not on whether the work was
     interrupted and taken up again from `checkpoint`."""
     options, checkpoint = options or DesignOptions(), checkpoint or Checkpoint()
-    with options_given(options.asked):
+    with saying(given=options.asked):
         read = options.done.marker_names if options.done else ()
         if options.done is not None and lacks_noise(cell):
             progress("noise of the measurements done")
@@ -417,8 +415,8 @@ class _Design:
     def _fewest(
         self, setup: Setup, pool: FeasiblePool, sought: Callable[[IntArray, Checkpoint], Search]
     ) -> tuple[Search, tuple[PlanSize, ...]]:
-        """The plan of the fewest poses that meets the target, and the sizes that were tried: the
-        bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
+        """The fewest poses that meet the target, and the sizes that were tried: the bound tells
+        where to begin; as Φ goes about as 1/n, each plan tells what to try next."""
         wanted, figure = self.cell.design.target, setup.criterion.figure
         assert wanted is not None
         metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
@@ -511,8 +509,8 @@ class _Design:
         )  # fmt: skip
 
     def _names(self, pool: FeasiblePool, chosen: IntArray, own: int) -> tuple[str, ...]:
-        """Those that stay, behind the `own` ones of the pool, keep theirs, and the others are
-        numbered after all there have been."""
+        """Those that stay, behind the `own` ones of the pool, keep theirs; the others are numbered
+        after all there have been."""
         pins, q = self.options.pins, pool.q
         labels = self.options.done.configuration_labels if self.options.done else ()
         kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
@@ -550,9 +548,6 @@ def _check_criterion(model: Model) -> None:
     for name in names:
         told = f"{wish('combination', f'{where}: [design] combination')} names {quoted(name)}"
         check_known(name, model.names, f"{told}, which is no parameter of the model")
-
-
-# Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:

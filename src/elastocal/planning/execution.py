@@ -28,21 +28,17 @@ def at_stops(cell: Cell) -> Motion:
     return replace(motion, dwell=motion.dwell + motion.reading * readings)
 
 
-# What a steady drift of tracker or base does to what the readings are evaluated for.
-
 DRIFT = 50e-6  # m, from the first reading to the last: a tracker or a base over an hour
 HARMLESS = 0.1  # of what noise leaves: adds half a per cent to the error
 
 
 @dataclass(frozen=True)
 class Alias:
-    """How a shift of single readings comes back as an error of what the plan is for.
-
-    `share` (N, L, m, 3): the error (m,) that a shift (3,) m of the readings of pose i in load
-    state l leaves: R M⁻¹ B_iᵀ Σ_i⁻¹ D_il, D_il how readings enter the observations, |R x| the rms
-    error at the test poses in m where `at_test_poses`, else x in its own standard deviations, as
-    `noise` is.  `whitened` (N, L, r, 3): Σ_i^(-1/2) D_il; `blocks` (N, r, p) of the plan.
-    """
+    """How a shift of single readings comes back as an error of what the plan is for.  `share` (N,
+    L, m, 3): the error (m,) that a shift (3,) m of the readings of pose i in load state l leaves: R
+    M⁻¹ B_iᵀ Σ_i⁻¹ D_il, D_il how readings enter the observations, |R x| the rms error at the test
+    poses in m where `at_test_poses`, else x in its own standard deviations, as `noise` is.
+    `whitened` (N, L, r, 3): Σ_i^(-1/2) D_il; `blocks` (N, r, p) of the plan."""
 
     share: Array
     noise: float
@@ -80,11 +76,8 @@ class Alias:
 
     def information(self, M: Array, time: Array, noise: Unsteadiness) -> Array:
         """What is left of the information M (p, p) where all drifts as the cell's `noise` says,
-        poses being read at `time` (N, L) in s.
-
-        The drift's course is a sum of waves F u, u ~ N(0, I), that are estimated beside the
-        parameters: M − BᵀF (I + FᵀF)⁻¹ FᵀB.
-        """
+        poses being read at `time` (N, L) in s: the drift's course is a sum of waves F u, u ~ N(0,
+        I), estimated beside the parameters: M − BᵀF (I + FᵀF)⁻¹ FᵀB."""
         span = max(float(np.ptp(time)), 1e-9)
         waves = course_waves((time.ravel() - time.min()) / span, noise.lasting / span)
         F = np.einsum("nlrx,nlk->nrxk", self.whitened, waves.reshape(*time.shape, -1))
@@ -105,17 +98,11 @@ class Drifting:
     at_test_poses: bool
 
 
-# The load states in turn, within a number of changes of load.
-
-
 def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> list[int]:
-    """The `used` load states in the order in which they come, each entry one block of visits.
-
-    `loaded` (L,): which states have a load.  At most `changes` loads are hung, exchanged or taken
-    off, the arm beginning and ending without; None: as few as the states allow.  Without load the
-    arm is measured in every gap, first and last of all, so that neither the loads nor their absence
-    fall to one part of the time.
-    """
+    """The `used` load states in the order in which they come, each entry one block of visits.  At
+    most `changes` loads are hung, exchanged or taken off, the arm beginning and ending without;
+    None: as few as the states allow.  Without load the arm is measured in every gap, first and last
+    of all, so that neither the loads nor their absence fall to one part of the time."""
     free = [state for state in used if not loaded[state]]
     heavy = [state for state in used if loaded[state]]
     if not heavy:
@@ -268,7 +255,7 @@ class VisitTimes:
     def cleared(
         self, tour: list[int], seed: int, progress: Progress
     ) -> tuple[list[int], VisitTimes]:
-        """The order once its blocked moves are found and gone round."""
+        """Once its blocked moves are found and gone round."""
         clock, moves, rounds = self, self.moves, 0
         while moves.check(tour):
             progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
@@ -284,7 +271,7 @@ class VisitTimes:
         self, near: list[int], seed: int, progress: Progress,
         hot: Sequence[float], steps: int,
     ) -> tuple[list[int], VisitTimes]:  # fmt: skip
-        """The order of least price found from one that is `near` a good one."""
+        """From an order that is `near` a good one."""
         best, clock = self.cleared(near, seed, progress)
         for k, temperature in enumerate(hot, start=1):
             # Enough where a drift does no harm any more; without one the way alone counts.
@@ -371,10 +358,9 @@ def with_references(
     tour: list[int], moves: Moves, travel: Array, every: int, paired: bool
 ) -> list[tuple[int, int]]:
     """The tour's nodes, 0 behind each, with one pose of each load state visited again before the
-    first, after `every` visits, and at the end, under the load that hangs there, its number behind.
-    It is the one with the least way to the others, for all load states where one is visited in
-    all.  Where readings are `paired`, it is visited loaded no more often than without load.
-    """
+    first, after `every` visits, and at the end, under the load that hangs there, its number behind:
+    the one with the least way to the others, for all load states where one is visited in all.
+    Where readings are `paired`, it is visited loaded no more often than without load."""
     mean = travel[1:, 1:].mean(axis=0)
     states = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     common = set.intersection(*(set(moves.pose[moves.load == s].tolist()) for s in states))
@@ -402,14 +388,12 @@ def with_references(
 
 @dataclass(frozen=True)
 class Stop:
-    """One reading: pose `pose` at joints `q` (n,) in load state `load` (0-based both).
-
-    The arm moves straight through `via` (k, n), where nothing is measured, and then to `q`, in
-    `travel` s; the load is changed once `change_after` of these k + 1 moves are done.  `approach`
-    (n,): ±1, the direction of each joint's last motion, `side` 0 or 1 where the pose is approached
-    from both sides.  `again`: how often it has been visited for reference, this time included;
-    `part`: how often it was read before, with an equal part of the readings each time.
-    """
+    """One reading: pose `pose` at joints `q` (n,) in load state `load` (0-based both).  The arm
+    moves straight through `via` (k, n), where nothing is measured, and then to `q`, in `travel` s;
+    the load is changed once `change_after` of these k + 1 moves are done.  `approach` (n,): ±1, the
+    direction of each joint's last motion, `side` 0 or 1 where the pose is approached from both
+    sides.  `again`: how often it has been visited for reference, this time included; `part`: how
+    often it was read before, with an equal part of the readings each time."""
 
     pose: int
     load: int
@@ -507,7 +491,7 @@ def _time(moves: Moves, way: list[int]) -> float:
 
 
 def nearest_first(cost: Array) -> list[int]:
-    """From the beginning, node 0, always on to the nearest node not yet visited."""
+    """From node 0 always on to the nearest node not yet visited."""
     left, tour = cost.copy(), [0]
     for _ in range(len(cost) - 1):
         left[:, tour[-1]] = np.inf
@@ -521,21 +505,16 @@ def schedule(
     via: Array | None = None, alias: Alias | None = None, paired: bool = False, seed: int = 0,
     progress: Progress = lambda message: None,
 ) -> Execution:  # fmt: skip
-    """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
-
-    Every pose is visited under each of `loads` (L, 3) N (None: once, without load) in which it is
-    `read` (N, L) (None: in all), one load state after the other.  A move is straight in joint
-    space; where that is blocked, it goes through other poses, home, or points `via` (k, n).  With
-    `motion.both_directions` each pose is measured twice, inside `limits` (lower, upper).
-
-    Solve, check the moves of the solution, forbid the blocked ones, and again: at the end all
-    moves are checked, and the tour is one that the search holds best at costs that are
-    nowhere above the true ones.  The same seed gives the same order.
-
-    With an `alias` the order is one in which a drift does little to what the plan is for, as far as
-    `motion.extra_time` and `motion.load_changes` allow.  Raises Unreachable for a pose which no
-    free move reaches, with what is in the way if the `checker` can tell.
-    """
+    """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.  Every
+    pose is visited under each of `loads` (L, 3) N (None: once, without load) in which it is `read`
+    (N, L), one load state after the other.  A move is straight in joint space; where that is
+    blocked, it goes through other poses, home, or points `via` (k, n).  With
+    `motion.both_directions` each pose is measured twice, inside `limits` (lower, upper).  Solve,
+    check the moves of the solution, forbid the blocked ones, and again: at the end all moves are
+    checked, and the tour is one that the search holds best at costs that are nowhere above the true
+    ones.  With an `alias` the order is one in which a drift does little to what the plan is for, as
+    far as `motion.extra_time` and `motion.load_changes` allow.  A pose that no free move reaches is
+    Unreachable."""
     forces = np.zeros((1, 3)) if loads is None else loads
     moves = Moves.of(q, motion, checker, forces, limits, via, read)
     moves.check_reach()

@@ -39,8 +39,6 @@ from elastocal.planning.collision import (
 )
 from elastocal.units import Array, BoolArray, IntArray
 
-# What a rule of the cell is, and those that bound a quantity of the pose.
-
 SAME = 1e-9  # rounding of a joint value that was set to its limit
 SHOWN = 3  # causes that a remedy names
 ADVICE = {
@@ -58,7 +56,7 @@ ADVICE = {
 
 
 class Rule(ABC):
-    """One thing a pose must respect; its causes: a joint, a marker, a pair of bodies → (N,)."""
+    """Its causes: a joint, a marker, a pair of bodies → (N,)."""
 
     name: str
 
@@ -78,12 +76,9 @@ class Rule(ABC):
 
 @dataclass(frozen=True)
 class Bound(Rule):
-    """lower ≤ quantity ≤ upper: joint values, range, incidence, rope angle, torque.
-
-    `quantity` gives (N, m), `lower` and `upper` are (m,) or one for all, as `units`, which messages
-    show it in: "°" for quantities in rad.  `labels` (m) name the columns, `key` is what the user
-    calls the limit.
-    """
+    """lower ≤ quantity ≤ upper.  `quantity` gives (N, m), `lower` and `upper` are (m,) or one for
+    all, as `units`, which messages show it in: "°" for quantities in rad.  `labels` (m) name the
+    columns, `key` is what the user calls the limit."""
 
     name: str
     quantity: Callable[[Poses], Array]
@@ -132,8 +127,6 @@ class Struck(Rule):
         return {"a pose struck out": np.asarray(np.min(off, axis=0) < NEARBY)}
 
 
-# Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
-
 # A pose keeps every margin by this much more, so that a move that ends there can be certified.
 POSE_SLACK = 1e-4  # m
 
@@ -148,8 +141,6 @@ def hits_by_pair(
 
 
 class KeepApart(Rule):
-    """No pair of bodies nearer than its margin."""
-
     def __init__(self, name: str, kinematics: Kinematics, pairs: Sequence[Pair]) -> None:
         self.name, self._kinematics, self._pairs = name, kinematics, tuple(pairs)
         self._collisions = Collisions(kinematics, pairs)
@@ -172,8 +163,6 @@ class KeepApart(Rule):
 
 @dataclass(frozen=True)
 class LineOfSight(Rule):
-    """Every marker is seen from the tracker."""
-
     sight: Sight
     markers: Mapping[str, Array]
     name = "line_of_sight"
@@ -204,8 +193,7 @@ class EnoughMarkers(Rule):
     name = "markers_seen"
 
     def seen(self, poses: Poses) -> BoolArray:
-        """(N, markers): which are seen; nothing is looked for behind bodies where too few remain
-        without."""
+        """(N, markers); nothing is looked for behind bodies where too few remain without."""
         seen, names = np.ones((len(poses), len(self.markers)), dtype=bool), list(self.markers)
         for rule in self.bounds:
             for name, outside in rule.causes(poses).items():
@@ -351,8 +339,8 @@ MOST_TRIED = 300  # random poses in which a pair must once keep apart to be beli
 
 
 class Feasibility:
-    """The rules of a cell for the nominal, rigid arm, in the order of checking; `struck` (m, n):
-    poses near which none may be.  Pickles by what it is made of, so that processes can share it."""
+    """The rules of a cell for the nominal, rigid arm; `struck` (m, n): poses near which none may
+    be.  Pickles by what it is made of, so that processes can share it."""
 
     def __init__(self, cell: Cell, chain: Chain, struck: Array | None = None) -> None:
         self.cell, self.chain, self._struck = cell, chain, struck
@@ -368,8 +356,8 @@ class Feasibility:
         return Feasibility, (self.cell, self.chain, self._struck)
 
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
-        """Every rule on every pose q (N, n) under a force (3,) or (N, 3) N; not `every`: a pose
-        that broke a rule is not looked at again.  The load hangs wherever the force is not zero."""
+        """q (N, n) under a force (3,) or (N, 3) N, the load hanging wherever that is not zero; not
+        `every`: a pose that broke a rule is not looked at again."""
         poses = self.kinematics.poses(q, force)
         broken = np.zeros((len(poses), len(self.rules)), dtype=bool)
         left = np.arange(len(poses))
@@ -379,7 +367,6 @@ class Feasibility:
         return PoseFeasibility(tuple(r.name for r in self.rules), broken, poses.q, poses.force)
 
     def every(self, q: Array, forces: Array) -> PoseFeasibility:
-        """Every rule that each pose q (N, n) breaks under any of the `forces` (k, 3)."""
         ranked = forces[np.argsort(np.linalg.norm(forces, axis=1), kind="stable")]
         verdicts = [self.check(q, force) for force in ranked]
         return replace(verdicts[-1], broken=np.any([each.broken for each in verdicts], axis=0))
@@ -397,8 +384,8 @@ class Feasibility:
 
     @property
     def seen(self) -> Callable[[Array, Array], BoolArray] | None:
-        """Joints (N, n), force (3,) → (N, markers): which markers the tracker sees of poses that
-        are feasible; None where it sees all of them."""
+        """Joints (N, n), force (3,) → (N, markers) of poses that are feasible; None where the
+        tracker sees all of them."""
         rule = next((rule for rule in self.rules if isinstance(rule, EnoughMarkers)), None)
         return None if rule is None else lambda q, force: rule.seen(self.kinematics.poses(q, force))
 
@@ -445,8 +432,7 @@ class Feasibility:
         return np.array([self._known[move] for move in moves], dtype=bool)
 
     def blockers(self, q_from: Array, q_to: Array, loaded: bool) -> list[str]:
-        """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are
-        met."""
+        """The pairs of bodies that come too close on a way, as they are met."""
         step = np.linspace(0.0, 1.0, ON_THE_WAY)[:, None]
         poses = self.kinematics.poses(q_from + step * (q_to - q_from), DOWN * loaded)
         hits = hits_by_pair(self.kinematics, self.pairs, poses)
@@ -483,8 +469,7 @@ class Roadmap:
         self._ways: tuple[Array, NDArray[np.integer]] | None = None
 
     def check(self, moves: Iterable[tuple[int, int]]) -> bool:
-        """Are the straight moves between these pairs of points all free?  Each is checked once,
-        those not checked before together."""
+        """All free?  Each move is checked once, those not checked before together."""
         pairs = sorted({(min(move), max(move)) for move in moves})
         new = [pair for pair in pairs if not self.checked[pair]]
         if new:
@@ -501,7 +486,7 @@ class Roadmap:
         return np.where(np.isfinite(self.direct), self.direct, self._shortest()[0])
 
     def way(self, i: int, j: int) -> list[int]:
-        """Points passed on the fastest way from i to j, j included, i not; [] from i to itself."""
+        """Points passed on the fastest way from i to j, j included, i not."""
         if i == j:
             return []
         if np.isfinite(self.direct[i, j]):
@@ -530,11 +515,9 @@ class Roadmap:
         return self._ways
 
     def parts(self, needed: list[int]) -> list[list[int]]:
-        """`needed` points by what is connected through free moves, the largest part first.
-
-        Only as many moves are checked as it takes, first among `needed`, then through all points:
-        every part tries its shortest ways out, twice as many each time (Borůvka).
-        """
+        """`needed` points by what free moves connect, the largest part first.  Only as many moves
+        are checked as it takes, first among `needed`, then through all points: every part tries its
+        shortest ways out, twice as many each time (Borůvka)."""
         every = np.arange(len(self.points))
         for among, tries in ((np.array(needed), 1), (every, 1)):
             while len(set((label := self._joined())[needed])) > 1:
@@ -572,12 +555,10 @@ class Unreachable(InsufficientDataError):
 @dataclass(frozen=True)
 class Moves:
     """Home, poses, points of approach and via points in one list, `points` (m, n), with `times` (m,
-    m) between them, the roadmaps `maps` without and with load, and V visits among them.
-
-    Each visit is of `pose` (V,) in the load state `load` (V,), left from `leave` (V,), where the
-    pose is.  `sides` (V, 2) are the points from which it is approached, with `signs` (N, 2, n), and
-    which of them are `free` (V, 2); without approaches the pose itself.
-    """
+    m) between them, the roadmaps `maps` without and with load, and V visits among them: of `pose`
+    (V,) in the load state `load` (V,), left from `leave` (V,), where the pose is.  `sides` (V, 2)
+    are the points from which it is approached, with `signs` (N, 2, n), and which of them are `free`
+    (V, 2); without approaches the pose itself."""
 
     points: Array
     times: Array
@@ -683,8 +664,8 @@ class Moves:
         return found
 
     def way(self, u: int, v: int) -> tuple[Roadmap, list[int]]:
-        """The roadmap and the points from node u to the entry of node v, both included, as far as
-        beginning and end are anywhere; the ends alone where no way is known."""
+        """From node u to the entry of node v, both included, as far as beginning and end are
+        anywhere; the ends alone where no way is known."""
         roadmap = self.maps[int(self.carries(u) >= 0 and self.carries(v) >= 0)]
         goal = self.home if v == 0 else int(self.entry[v - 1])
         start = self.home if u == 0 else int(self.leave[u - 1])
@@ -770,9 +751,9 @@ class Moves:
 
 
 def approach_signs(chain: Chain, q: Array, lower: Array, upper: Array, by: float) -> IntArray:
-    """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first
-    upwards (+1), then down (−1), so that backlash and hysteresis show; both times from the same
-    side where the other is beyond the limits [lower, upper] (n,)."""
+    """Directions (N, 2, n) of the last motion of each joint, from q − sign · `by`: first upwards
+    (+1), then down (−1), so that backlash and hysteresis show; both from the same side where the
+    other is beyond the limits."""
     below, above = q - by >= lower, q + by <= upper
     if not (below | above).all():
         i, j = (int(v) for v in np.argwhere(~(below | above))[0])

@@ -48,8 +48,6 @@ from elastocal.model.observations import SIZE, Observations, available_noise, ob
 from elastocal.simulation import marker_sigmas, simulate
 from elastocal.units import Array, BoolArray, IntArray
 
-# What a pose will be read as: its table rows, load states, and the covariance of its readings.
-
 Sight = Callable[[Array, Array], BoolArray]  # joints (N, n), force (3,) → (N, markers): seen?
 NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
@@ -80,10 +78,7 @@ def _no_noise(cell: Cell) -> str:
 
 
 def reading_covariance(model: Model, observed: Observations) -> Array:
-    """Covariance (n_rows, size, size) by which a single reading of each table row counts.
-
-    Raises InputError where neither tracker nor markers state a noise.
-    """
+    """(n_rows, size, size), by which a single reading of each table row counts."""
     cell = model.cell
     kind = available_noise(observed.table, cell.tracker)
     if observed.kind == "distance":
@@ -105,14 +100,11 @@ def reading_noise(
     model: Model, observed: Observations, x: Array, readings: Array | float = 1.0, visits: int = 1
 ) -> sparse.csr_array:
     """Covariance (rows, rows) of the observations, means of so many `readings` (n,) of each table
-    row, and of so many `visits`.
-
-    Σ = (T Σ_rows Tᵀ / readings + τ² per visit and direction + J diag(s²) Jᵀ) / visits + s_c² per
-    configuration: deflections share their unloaded reading; what the arm does not repeat, τ of
-    `[design] repeatability_um` and s of the joints of `[noise]`, is common to the markers of a
-    visit, and what a configuration is off by as a whole to all of its visits.  J is that of the
-    arm x (parameters,).
-    """
+    row, and of so many `visits`: Σ = (T Σ_rows Tᵀ / readings + τ² per visit and direction + J
+    diag(s²) Jᵀ) / visits + s_c² per configuration.  Deflections share their unloaded reading; what
+    the arm does not repeat, τ of `[design] repeatability_um` and s of the joints of `[noise]`, is
+    common to the markers of a visit, and what a configuration is off by as a whole to all of its
+    visits.  J is that of the arm x (parameters,)."""
     cell, table = model.cell, observed.table
     single = reading_covariance(model, observed) / np.asarray(readings).reshape(-1, 1, 1)
     T = sparse.kron(observed.combine, sparse.eye_array(observed.size), format="csr")
@@ -132,19 +124,15 @@ def reading_noise(
     return sparse.csr_array(covariance)
 
 
-# From the symbolic model to information: whitened B of any pose.
-
 CHUNK_NUMBERS = 4_000_000  # numbers of a chunk's regressor held at once
 
 
 @dataclass(frozen=True)
 class PoseInformation:
-    """B of poses, whitened by their noise and scaled by the sizes of the parameters.
-
-    `x` (parameters,): values at which the arm is linearised; `columns` (p,) the parameters to be
+    """B of poses, whitened by their noise and scaled by the sizes of the parameters.  `x`
+    (parameters,): values at which the arm is linearised; `columns` (p,) the parameters to be
     estimated, `sizes` (p,) what one unit of a scaled parameter is.  `sight`: which markers are
-    seen, None for all of them; a reading that is not made counts as one that shows nothing.
-    """
+    seen, None for all of them; a reading that is not made counts as one that shows nothing."""
 
     model: Model
     x: Array
@@ -167,11 +155,8 @@ class PoseInformation:
 
     def blocks(self, q: Array, readings: IntArray | None = None) -> Array:
         """Whitened, scaled B (N, r, p) of poses q (N, n), with `readings` (N, L) in each load state
-        or, None, `[design] repeats` in all.
-
-        r counts the components of all markers and load states of a pose; W_i B_i with
-        W_iᵀ W_i = Σ_i⁻¹ gives a pose's information B_iᵀ Σ_i⁻¹ B_i.
-        """
+        or, None, `[design] repeats` in all.  r counts the components of all markers and load states
+        of a pose; W_i B_i with W_iᵀ W_i = Σ_i⁻¹ gives a pose's information B_iᵀ Σ_i⁻¹ B_i."""
         per_pose = len(self.model.cell.tool.markers) * len(self.forces)
         size = max(CHUNK_NUMBERS // (per_pose * 6 * max(len(self.columns), 20)), 1)
         found = []
@@ -184,7 +169,7 @@ class PoseInformation:
         return np.concatenate(found)
 
     def rows(self, q: Array) -> Measurements:
-        """Table rows, not measured yet, of poses q (N, n) in each load state, of each marker."""
+        """Not measured yet: poses q (N, n) in each load state, of each marker."""
         names, n = tuple(self.model.cell.tool.markers), len(self.forces)
         pose = np.repeat(np.arange(len(q)), n * len(names))
         table = Measurements.of_poses(
@@ -234,8 +219,6 @@ class PoseInformation:
             covariance = covariance * (read[:, :, None] & read[:, None]) + never
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
-
-# What a plan can make certain: the parameters that some feasible pose shows, and their scale.
 
 SURE = 1e3  # standard deviations that a typical deviation counts for where a prior is stated
 # Share of a test point's motion that may lie outside what the poses show: rounding, not physics.
@@ -330,7 +313,6 @@ class Estimable:
         return np.asarray((a * self.sizes)[self.columns])
 
     def why(self, index: int) -> str:
-        """Why parameter `index` is not among the kept ones, and what would help."""
         name, r, model = self.model.names[index], self.structure, self.model
         if index in r.kept:
             return (
@@ -376,7 +358,7 @@ class Estimable:
         return tuple(int(self.structure.dropped[d]) for d in order if off[d] > least)
 
     def remaining_bias(self, A: Array, weight: Array) -> float:
-        """Rms in m of what typical deviations of held parameters move the test points by, A (T, r,
+        """Rms in m by which typical deviations of held parameters move the test points, A (T, r,
         parameters) with `weight` (T,)."""
         off = self._unexplained(A, self.reduction)
         return float(np.sqrt(weight @ (off**2).sum(axis=(1, 2))))
@@ -425,12 +407,10 @@ def estimable(
 
 
 def evenly(group: IntArray, each: int) -> IntArray:
-    """Indices of about `each` of the members of every group, evenly spread."""
+    """Indices of about `each` of the members of every group."""
     members = [np.flatnonzero(group == g) for g in np.unique(group)]
     return np.sort(np.concatenate([own[:: -(-len(own) // each)] for own in members]))
 
-
-# Measurements already done: what they tell, so that a plan adds what they lack.
 
 IDENTIFIED = "the arm as identified from the measurements done"
 COMPUTED = 1e-9  # m: readings that scatter by less were not read
@@ -438,10 +418,8 @@ LEAST = 1e-3  # share of its size as stated by which a function that was left ou
 
 
 def lacks_noise(cell: Cell) -> bool:
-    """Whether the noise of a reading is to be taken from the measurements done, as none is stated.
-
-    Raises InputError where these do not show it: deflections share readings, poses have two units.
-    """
+    """None is stated, and it is taken from the measurements done.  InputError where these do not
+    show it: deflections share readings, poses have two units."""
     if cell.model.observe == "distance":
         return cell.tracker.distance_sigma is None
     lacks = cell.tracker.noise is None and not cell.design.marker_sigma
@@ -494,7 +472,7 @@ def whitened(model: Model, table: Measurements, x: Array) -> tuple[Array, Array]
 
 
 def next_number(labels: Iterable[str]) -> int:
-    """The number after those of the configurations that there are, so that what is measured next
-    can join them: 9 after "8", "8-" and "warm-up"; 1 where there is no number."""
+    """What is measured next can join what is there: 9 after "8", "8-" and "warm-up"; 1 where there
+    is no number."""
     numbers = [int(m[0]) for m in (re.match(r"[0-9]+", label) for label in labels) if m]
     return max(numbers, default=0) + 1

@@ -29,8 +29,6 @@ from elastocal.planning.information import Estimable
 from elastocal.tables import csv_text
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
-# What a plan promises, and why each pose is in it.
-
 TOLD = 3  # parameters named per pose
 COMBINED = 0.01  # share of a typical deviation that counts as being part of a combination
 ALONE, ROUNDING = 1e-9, 1e-6  # share of a direction that no other pose shows; of a variance

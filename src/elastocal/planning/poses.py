@@ -57,8 +57,6 @@ from elastocal.planning.plan import CandidateCounts
 from elastocal.tables import NO_UNIT, Columns, Family, read_table
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
-
 
 @dataclass(frozen=True)
 class JointSpace:
@@ -117,8 +115,6 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     return JointSpace(lower, upper, joint_index(name), levels)
 
 
-# Candidate poses: scrambled Sobol points within the limits that the cell allows.
-
 CHUNK = 2048  # a power of two, so that every chunk is balanced over the joint space
 GIVE_UP = 32 * CHUNK  # tries after which a group without any feasible pose counts as empty
 PER_TASK = 4  # chunks that a process checks at a time
@@ -147,12 +143,10 @@ def draw(
     rules: Feasibility, forces: Array, n: int, seed: int, jobs: int = 1,
     progress: Progress = lambda message: None,
 ) -> Candidates:  # fmt: skip
-    """About `n` candidates feasible under all `forces` (L, 3) N, equally many per level.
-
-    Owen-scrambled Sobol points (Owen 1998; scipy.stats.qmc) over the joint ranges, one sequence
-    per level, filtered chunk by chunk until there are enough, or TRIES per candidate wanted.  The
-    result depends on `seed` only, not on `jobs`, the number of processes (−1: all cores).
-    """
+    """About `n` candidates feasible under all `forces` (L, 3) N, equally many per level:
+    Owen-scrambled Sobol points (Owen 1998; scipy.stats.qmc) over the joint ranges, one sequence per
+    level, filtered chunk by chunk until there are enough, or TRIES per candidate wanted.  The
+    result depends on `seed` only, not on `jobs`, the number of processes (−1: all cores)."""
     cell, chain = rules.cell, rules.chain
     space = joint_space(cell, chain)
     groups = space.n_groups
@@ -220,15 +214,13 @@ def brought(
 
 
 def sobol(dimension: int, seed: int | np.random.Generator) -> Any:
-    """A scrambled Sobol sequence of points of the unit cube; a number is another seed to it than a
-    generator made of that."""
+    """A number is another seed to the scrambled sequence than a generator made of that."""
     from scipy.stats import qmc  # slow to import, and identify needs this module
 
     return qmc.Sobol(dimension, seed=seed)
 
 
 def points(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
-    """Chunks (CHUNK, n) of an endless sequence of poses of a group."""
     free, rng = len(space.lower) - (space.held is not None), np.random.default_rng(stream)
     drawn = sobol(free, rng)
     while True:
@@ -255,16 +247,12 @@ def _checked(
             yield from pool([delayed(_check)(rules, forces, group, q) for q in wave])
 
 
-# How many poses a plan has at each level.
-
 DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
 
 
 def shares_of(cell: Cell, n_poses: int | None = None, asked: str = "") -> IntArray:
     """Poses (L,) per level of [design.levels], (1,) without, `n_poses` in all, as the option
-    `asked` says, or as the cell says; what does not divide evenly goes to the first levels.
-
-    Raises InputError where these are fewer than the levels."""
+    `asked` says, or as the cell says; what does not divide evenly goes to the first levels."""
     spec, where = cell.design, f"{cell.source}: [design]"
     levels = sum(map(len, spec.levels.values())) or 1
     if spec.per_level and n_poses is None:
@@ -286,9 +274,8 @@ def shares_of(cell: Cell, n_poses: int | None = None, asked: str = "") -> IntArr
 
 
 def check_available(cell: Cell, available: IntArray, shares: IntArray, refused: str) -> None:
-    """Raise where a level has fewer candidates, `available` (L,), than poses: InputError where too
-    few were asked for, InsufficientDataError where too few are feasible, or brought and not
-    `refused`."""
+    """InputError where fewer were asked for than a level has poses, `shares` (L,);
+    InsufficientDataError where too few are feasible, or brought and not `refused`."""
     short = np.flatnonzero(available < shares)
     if not len(short):
         return
@@ -376,7 +363,6 @@ def read_pins(
 
 
 def poses_of(model: Model, path: Path) -> Measurements:
-    """The poses of a table, whichever markers its rows are of."""
     return read_measurements(path, joint_kinds=model.chain.kinds, observe="plan")
 
 
@@ -389,10 +375,8 @@ def plan_and_names(text: str | Path) -> tuple[Path, tuple[str, ...]]:
 
 
 def _poses(table: Measurements) -> dict[str, int]:
-    """Pose → its first row, in the order of the table.
-
-    "7+" and "7-", the sides from which pose 7 is approached, are one; reference visits, "7r1",
-    are none of the plan's own."""
+    """Pose → its first row.  "7+" and "7-", the sides from which pose 7 is approached, are one;
+    reference visits, "7r1", are none of the plan's own."""
     labels = table.configuration_labels
     found: dict[str, int] = {}
     for row, configuration in enumerate(table.configuration):
@@ -404,8 +388,6 @@ def _poses(table: Measurements) -> dict[str, int]:
             found.setdefault(name, row)
     return found
 
-
-# A table of test poses: a machining path in joints, or in positions of the tool's point.
 
 TAKEN = ("q", "position", "rotation", "quaternion", "force")
 WEIGHT = Family("weight", "weights", {"weight": NO_UNIT})
@@ -439,8 +421,6 @@ def _columns(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> 
     return columns
 
 
-# The test poses: where position must be right, under which load, at which point of the tool.
-
 # Where the user states none: fewer, and the plan serves just these, and harms what is between them.
 DEFAULT_COUNT = 100
 ELSEWHERE = 200  # postures that stand for all of the joint ranges
@@ -469,10 +449,10 @@ class TargetPoses(NewPoses):
 def test_poses(
     cell: Cell, chain: Chain, feasibility: Feasibility | None = None, seed: int = 0
 ) -> TargetPoses:
-    """The test poses of the cell: [[design.test_pose]], [design.test_path] and [design.test_box]
-    together, or 100 poses drawn over the joint limits.  A pose without a force of its own is taken
-    under each of the design's loads that is not zero, which share its weight.  Places are reached
-    by the posture nearest to home, or the middle of the joint ranges, that the rules allow."""
+    """[[design.test_pose]], [design.test_path] and [design.test_box] together, or 100 poses drawn
+    over the joint limits.  A pose without a force of its own is taken under each of the design's
+    loads that is not zero, which share its weight.  Places are reached by the posture nearest to
+    home, or the middle of the joint ranges, that the rules allow."""
     spec, of = cell.design, _Sources(cell, chain, feasibility, seed)
     groups = []
     for k, pose in enumerate(spec.test_poses):
@@ -514,7 +494,7 @@ class _Sources:
 
     @property
     def loads(self) -> Array:
-        """The forces (L, 3) N of the design's loads that are not zero, or none but zero."""
+        """(L, 3) N: of the design's loads those that are not zero, or zero alone."""
         loads = self.cell.design.loads
         loaded = np.zeros((0, 3)) if loads is None else loads[(loads != 0).any(axis=1)]
         return loaded if len(loaded) else np.zeros((1, 3))
@@ -531,8 +511,8 @@ class _Sources:
         self, q: Array, source: str, spec: Spec = None, force: Array | None = None,
         weight: Array | None = None,
     ) -> TargetPoses:  # fmt: skip
-        """Poses q (n, joints) of one source with their own `force` (n, 3), else that of the `spec`,
-        else under each of the loads, which share the `weight` (n,)."""
+        """With their own `force` (n, 3), else that of the `spec`, else under each of the loads,
+        which share the `weight` (n,)."""
         if force is None and spec is not None and spec.force is not None:
             force = np.broadcast_to(spec.force, (len(q), 3))
         each = len(self.loads) if force is None else 1
@@ -547,8 +527,8 @@ class _Sources:
         )
 
     def path(self, spec: TargetPath) -> TargetPoses:
-        """The poses of a table: q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw …
-        where the rotation is prescribed; force_x_N … and weight may be added."""
+        """q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is
+        prescribed; force_x_N … and weight may be added."""
         file = str(spec.file)
         raw = read_table(spec.file, lambda header: _columns(file, header, self.chain.kinds))
         columns, n, weight = raw.columns, len(raw.row), raw.si(WEIGHT.name)
@@ -676,9 +656,6 @@ class _Sources:
         return np.asarray(drawn[:count])
 
 
-# Where position must be right: A_t, how the parameters move the tool at the test poses.
-
-
 def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool = False) -> Array:
     """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
 
@@ -730,12 +707,8 @@ def fitted_markers(model: Model) -> bool:
 
 def _carrying(cell: Cell, point: Array) -> Array:
     """J (T, M, 3, 3): δp_t = Σ_m J_tm δ_m of points p (T, 3) on the body that M markers are fixed
-    to, whose motion is the least-squares one of theirs: with r from the markers' mean c,
-
-        δp = mean δ + ω × (p − c),   (Σ |r|² 1 − r rᵀ) ω = Σ r_m × δ_m
-
-    Raises InsufficientDataError where the markers do not hold a body: fewer than three, or in line.
-    """
+    to, whose motion is the least-squares one of theirs, with r from the markers' mean c: δp = mean
+    δ + ω × (p − c),  (Σ |r|² 1 − r rᵀ) ω = Σ r_m × δ_m."""
     places = np.array(list(cell.tool.markers.values()))
     r = places - places.mean(axis=0)
     inertia = (r**2).sum() * np.eye(3) - r.T @ r
@@ -765,9 +738,9 @@ def _with_points(model: Model, points: Array) -> Model:
 def known_rows(
     at_work: Model, targets: TargetPoses, x: Array, found: Estimable
 ) -> tuple[Array, tuple[str, ...]]:
-    """The rows of `prediction_rows` of the arm `at_work`, and what to say of them: where the
-    markers' places are fitted and the readings cannot tell where the flange is, points that are
-    stated are taken to be fixed to the markers."""
+    """`prediction_rows` of the arm `at_work`, and what to say of them: where the markers' places
+    are fitted and the readings cannot tell where the flange is, points that are stated are taken to
+    be fixed to the markers."""
     cell, chain = at_work.cell, at_work.chain
     for joint, levels in cell.model.compliance_levels.items():
         j = joint_index(joint)

@@ -52,8 +52,8 @@ class DesignProblem:
 
     @cached_property
     def packed(self) -> Array:
-        """B_iᵀB_i as its upper triangle, √2 off the diagonal (N, p(p+1)/2), so that ⟨G, B_iᵀB_i⟩
-        is a product of rows."""
+        """B_iᵀB_i as its upper triangle, √2 off the diagonal (N, p(p+1)/2), so that ⟨G, B_iᵀB_i⟩ is
+        a product of rows."""
         rows, columns, factor = triangle(len(self.prior))
         found = np.empty((len(self.blocks), len(rows)))
         for k in range(0, len(found), BATCH):
@@ -194,8 +194,6 @@ def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> fl
     return tangent.bound(problem.prior, float(sum(best)))
 
 
-# Column generation.
-
 GAP = 1e-4  # 1 − bound/Φ at which the relaxation ends
 EVEN = 0.05  # part of even weights in those that show where the support lies
 PER_PARAMETER = 4  # candidates of the first support per parameter, shared among the groups
@@ -221,11 +219,10 @@ class Relaxed:
 
 
 def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) -> Relaxed:
-    """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l].
-
-    The problem should be a `balanced` one of a certifiable criterion.  `start` (N,) ≥ 0: weights
-    near the optimum, as those of a smaller pool.  Where rounding forbids the `gap` that is asked
-    for, the bound holds all the same."""
+    """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l], of a `balanced`
+    problem of a certifiable criterion.  `start` (N,) ≥ 0: weights near the optimum, as those of a
+    smaller pool.  Where rounding forbids the `gap` that is asked for, the bound holds all the
+    same."""
     size = np.bincount(problem.group, minlength=len(problem.shares))
     full = (size == problem.shares)[problem.group]
     if full.any():
@@ -401,12 +398,10 @@ STREAM = 10_000  # of the seed's children, beyond those that draw candidates
 def exchange(
     problem: DesignProblem, plan: IntArray, looks: int | None = None
 ) -> tuple[IntArray, float]:
-    """Until no candidate betters the plan (n,) in the place of any of its poses.
-
-    1/Φ is concave: with pose i in an open place 1/Φ ≤ (1 + d_i/Φ₋)/Φ₋, Φ₋ and d those without it:
-    candidates are evaluated in the order of d until the best found exceeds all that are left.
-    Of a criterion without a bound all are; with `looks`, no more than so many.
-    """
+    """Until no candidate betters the plan (n,) in the place of any of its poses.  1/Φ is concave:
+    with pose i in an open place 1/Φ ≤ (1 + d_i/Φ₋)/Φ₋, Φ₋ and d those without it: candidates are
+    evaluated in the order of d until the best found exceeds all that are left.  Of a criterion
+    without a bound all are; with `looks`, no more than so many."""
     plan, criterion = plan.copy(), problem.criterion
     value, d = problem.worth(inverse(problem.information(plan)))
     places = list(np.argsort(d[plan], kind="stable"))
@@ -460,9 +455,6 @@ def exact_plan(
     problem: DesignProblem, relaxed: Relaxed, *, starts: int = 2, seed: int = 0,
     warm: IntArray | None = None,
 ) -> tuple[IntArray, float]:  # fmt: skip
-    """The plan (n,) of least Φ found from `starts` starts, and Φ: `warm`, a plan that may have
-    other shares, or the rounded relaxation, and roundings drawn at random.  Each is improved by
-    exchange with the most promising candidates, the best at last with all."""
     rng, weights = np.random.default_rng(seed), relaxed.weights
     begins = [problem.rounded(weights) if warm is None else problem.fitted(warm)]
     begins += [problem.rounded(weights, rng) for _ in range(starts - 1)]
@@ -482,8 +474,6 @@ def sized_plans(
     problem_of: Callable[[int], DesignProblem], numbers: Iterable[int], seed: int,
     progress: Progress,
 ) -> dict[int, tuple[float, float]]:  # fmt: skip
-    """Φ of the best plan found by number of poses, and the bound on all such, NaN without one; each
-    begun from the next smaller one, so that Φ does not rise where no group's share falls with n."""
     found: dict[int, tuple[float, float]] = {}
     chosen, weights = None, None
     for n in sorted(numbers):

@@ -37,14 +37,12 @@ from elastocal.planning.relaxation import DesignProblem, exact_plan, exchange, p
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# What the stages of a design have finished.
-
 State = Mapping[str, Any]  # arrays and numbers, which become arrays
 KEY = "elastocal"  # the array that says of which design a file is
 
 
 def key_of(files: Iterable[Path], **options: object) -> str:
-    """A hash of everything a design depends on: input files, options, the version."""
+    """Of everything that a design depends on: input files, options, the version."""
     digest = hashlib.sha256(__version__.encode())
     for path in files:
         with open_input(path, "input file") as handle:
@@ -133,8 +131,6 @@ Goal = Callable[[Array], tuple[float, Array]]
 
 @dataclass
 class Searches:
-    """What searches off the pool need to know of the cell."""
-
     setup: Setup
     space: JointSpace
     checker: Feasibility
@@ -144,7 +140,6 @@ class Searches:
         return self.checker.under(q, self.setup.information.forces).ok
 
     def rows(self, q: Array, level: int) -> tuple[ca.Function, ca.Function]:
-        """B (q, x) and its adjoint (q, x, W) of poses at a level, as q (n,) is."""
         if level not in self._rows:
             info = self.setup.information
             arm, template = info.model.symbolic, info.rows(q[None])
@@ -177,11 +172,9 @@ class Searches:
 
 
 class JointSearch:
-    """min f(B(q_1) … B(q_k)) inside bounds, over all poses of a `lot` at once.
-
-    B is that of the parameters z, y = T z, whitened by the noise of the lot; what is not read of a
-    pose has next to no weight by that.
-    """
+    """min f(B(q_1) … B(q_k)) inside bounds, over all poses of a `lot` at once.  B is that of the
+    parameters z, y = T z, whitened by the noise of the lot; what is not read of a pose has next to
+    no weight by that."""
 
     def __init__(self, searches: Searches, T: Array, lot: FeasiblePool) -> None:
         self.info, self.T, self.maps = searches.setup.information, T, []
@@ -294,12 +287,10 @@ def estimate(
     pool: FeasiblePool, seed: int = 0, progress: Progress = lambda message: None,
 ) -> dict[str, Any]:  # fmt: skip
     """The largest d on the continuum per group, for the tangent (Φ, G) of the optimum of the `pool`
-    with its `problem`; every maximum is evaluated exactly and passed by the cell's rules.
-
-    `bound` on Φ from it: an estimate, as a larger d may have been missed.  `q`, `group` and
-    `readings` of feasible poses whose d exceeds all of the pool's, by `searched` new points and
-    `ascents` local searches.
-    """
+    with its `problem`; every maximum is evaluated exactly and passed by the cell's rules.  `bound`
+    on Φ from it: an estimate, as a larger d may have been missed.  `q`, `group` and `readings` of
+    feasible poses whose d exceeds all of the pool's, by `searched` new points and `ascents` local
+    searches."""
 
     def price(lot: FeasiblePool) -> Array:
         B = lot.blocks @ T
@@ -357,8 +348,6 @@ def distinct(q: Array, count: int) -> IntArray:
             chosen.append(i)
     return np.array(chosen, dtype=np.int64)
 
-
-# What a plan is sought by.
 
 POOL = 2000  # candidates where nobody asks for a number
 CLOSE, FINE = 1e-3, 1e-4  # gap of the relaxations that lead to the next one, and of the last
@@ -428,8 +417,8 @@ class Search:
         return pool, chosen[np.argsort(pool.group[chosen], kind="stable")]
 
     def exchange(self, chosen: IntArray) -> None:
-        """Another plan (k,): the bounds hold, as a plan's own poses, where they are new, are those
-        that the continuum's is about."""
+        """The bounds hold for another plan (k,), as a plan's own poses, where they are new, are
+        those that the continuum's is about."""
         self.chosen, self.value = chosen, self.value_of(chosen)
         self.certificate = self.certificate.of(self.value)
 
@@ -462,8 +451,8 @@ class Search:
         return self
 
     def _started(self) -> tuple[IntArray, list[float]]:
-        """The best of plans begun from exchange, from roundings and random plans in turn, each
-        polished, and where these ended."""
+        """From exchange, from roundings and random plans in turn, each polished; and where these
+        ended."""
         problem, relaxed, effort, seed = self.problem, self.relaxed, self.effort, self.seed
         rng, least, ends = np.random.default_rng(seed), np.inf, list[float]()
         best = begun = self.checkpoint.finished(
@@ -504,7 +493,6 @@ class Search:
         self.relaxed = prospects(self.problem, gap, start)
 
     def _widened(self, k: int) -> State:
-        """What the relaxed optimum lacks of the continuum, whose poses join the pool."""
         asked = self.problem, self.relaxed.tangent, self.searches, self.T, self.pool, self.seed + k
         found = self.checkpoint.finished(f"continuum{k}", lambda: estimate(*asked, self.progress))
         self._join(found["q"], found["group"], found["readings"])
@@ -655,8 +643,6 @@ class _Ordering:
         return points[parts[0] if motion.home is None else next(p for p in parts if 0 in p)]
 
     def _reached(self, q: Array) -> BoolArray:
-        """(N,): a free move joins the posture q (N, n) to one of the TRIED next to it of the
-        hub."""
         next_to = np.argsort(np.abs(q[:, None] - self.hub).max(axis=2), axis=1)
         alone = np.arange(len(q))
         for k in range(min(TRIED, len(self.hub))):

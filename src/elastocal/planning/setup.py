@@ -164,13 +164,11 @@ def set_up(
     region: TargetPoses | None = None, sight: Sight | None = None, work: Model | None = None,
     hold: bool = False,
 ) -> Setup:  # fmt: skip
-    """The parameters that the candidates q (N, n) show, and the criterion on them.
-
-    `region`: poses all over the joint ranges, which count for the criterion with the share
-    `[design] elsewhere`.  `work`: the model at the test poses, where its tool is another one.
-    `hold`: parameters by which no plan can predict the test poses are held, not refused; so they
-    are of distances, which never show where the arm stands as a whole.
-    """
+    """The parameters that the candidates q (N, n) show, and the criterion on them.  `region`: poses
+    all over the joint ranges, which count with the share `[design] elsewhere`.  `work`: the model
+    at the test poses, where its tool is another one.  `hold`: parameters by which no plan can
+    predict the test poses are held, not refused; so they are of distances, which never show where
+    the arm stands as a whole."""
     spec, hold = model.cell.design, hold or model.observe == "distance"
     x = model.nominal if known.done is None else known.done.x
     free, every = fixed_and_free(model, known.fixed), np.arange(len(model.parameters))
@@ -254,8 +252,8 @@ ENOUGH = 4000  # candidates
 def share_within(
     setup: Setup, pool: FeasiblePool, shares: IntArray, cap: float, progress: Progress
 ) -> float:
-    """The largest share s of the postures elsewhere for which the relaxed optimum is at most
-    `cap` worse at the test poses (rms) than it could be; 0 where there are none."""
+    """The largest share s of the postures elsewhere for which the relaxed optimum is at most `cap`
+    worse at the test poses (rms) than it could be."""
     if setup.elsewhere_rows is None or not cap:
         return 0.0
     progress(f"weight of the joint ranges, at most {100 * cap:g} % worse at the test poses")
@@ -545,10 +543,8 @@ class Choice:
 def _mobile(
     boxes: Boxes, cell: Cell, information: PoseInformation
 ) -> Callable[[Array], PoseInformation]:
-    """Information as at `cell`, of the same readings, with everything at other places (k, 3).
-
-    One model serves them all: places on the tool are its parameters.
-    """
+    """Information as at `cell`, of the same readings, with everything at other places (k, 3). One
+    model serves them all: places on the tool are its parameters."""
     base, on_tool = boxes.places(cell), [n != TRACKER for n in boxes.names]
     motions: list[tuple[Entry, str]] = [
         (LoadPointMotion(), LoadPointMotion.at)
@@ -597,8 +593,8 @@ def within(choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes:
 
 
 class _Fit(NamedTuple):
-    """A plan that fits a time: how many parameters it determines, its Φ, what it is, the cell that
-    asks for its stops, and in which states (K, L) candidates are read."""
+    """How many parameters a plan determines, its Φ, what it is, the cell that asks for its stops,
+    and in which states (K, L) candidates are read."""
 
     kept: int
     value: float
@@ -633,8 +629,8 @@ def _fitting(
     choice: Choice, cell: Cell, minutes: float, drawn: Candidates, repeats: int,
     read: BoolArray | None,
 ) -> list[_Fit]:  # fmt: skip
-    """A plan of as many poses as fit, candidates being `read` in load states that were chosen
-    before; empty or an error where there is none."""
+    """As many poses as fit, candidates being `read` in load states that were chosen before; empty
+    or an error where there is none."""
     # What poses read twice would take, more poses may have.
     motion = replace(cell.design.motion, extra_time=cell.design.motion.longer)
     spec = replace(cell.design, per_level=(), repeats=repeats, minutes=None, motion=motion)
@@ -694,7 +690,7 @@ SOME = 1000  # poses that the choice is made on
 
 
 def single_ways(information: PoseInformation) -> IntArray:
-    """The ways (K, L) to read a pose in one load state: of deflections in one and unloaded."""
+    """Ways (K, L) to read a pose in one load state: of deflections in one and unloaded."""
     ways = information.everything * np.eye(len(information.forces), dtype=np.int64)
     if information.model.cell.model.observe == "deflection":
         ways[1:, 0] = ways[0, 0]

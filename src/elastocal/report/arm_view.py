@@ -48,10 +48,8 @@ STOUT, SLIM = 0.038, 0.014
 @dataclass(frozen=True)
 class Shell:
     """A convex body as triangles: `points` (k, 3) m in its carrier's frame, `faces` (f, 3).
-
-    `carrier`: 0 the base frame, i the frame of joint i after its motion; of what stands in the
-    cell 0 is the data's frame.
-    """
+    `carrier`: 0 the base frame, i the frame of joint i after its motion; of what stands in the cell
+    0 is the data's frame."""
 
     points: Array
     faces: IntArray
@@ -101,10 +99,8 @@ def _shells(solids: Sequence[tuple[Solid, int]]) -> tuple[Shell, ...]:
 
 
 def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
-    """Points (k, 3) in m in the carrier's frame and triangles (f, 3), turned outwards.
-
-    Round shapes become inscribed polyhedra.  Raises InputError for a mesh that cannot be read.
-    """
+    """Points (k, 3) in m in the carrier's frame and triangles (f, 3), turned outwards; round shapes
+    become inscribed polyhedra."""
     centres, radius = hull(solid)
     if not radius:
         return outward(centres)
@@ -174,7 +170,7 @@ class Space:
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
 
     def _box(self) -> Array:
-        """Corners (2, 3) of the box around everything that is drawn, with room for arrows."""
+        """Corners (2, 3) around everything that is drawn, with room for arrows."""
         every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
         every = np.vstack([every, *self.bodies])
         low, high = every.min(axis=0), every.max(axis=0)
@@ -229,9 +225,8 @@ class Space:
 
 
 def in_script(content: object) -> str:
-    """JSON in which nothing can end the element that holds it, whatever names hold."""
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-    for character in "<>&":
+    for character in "<>&":  # so that nothing can end the element that holds it
         text = text.replace(character, f"\\u{ord(character):04x}")
     return text
 
@@ -239,11 +234,9 @@ def in_script(content: object) -> str:
 def frames_at(
     cell: Cell, chain: Chain, q: Array, flange: Array | None = None
 ) -> tuple[Array, Array]:
-    """Frames (N, n + 1, 4, 4) of base and joints, and flanges (N, 4, 4), at joints q (N, n).
-
-    The nominal chain, moved as a whole to end at `flange` (N, 4, 4) where that is known: on a
-    page, the millimetres between the two cannot be seen.
-    """
+    """Frames (N, n + 1, 4, 4) of base and joints, and flanges (N, 4, 4), at joints q (N, n): of the
+    nominal chain, moved as a whole to end at `flange` (N, 4, 4) where that is known; on a page, the
+    millimetres between the two cannot be seen."""
     kinematics = Kinematics(cell, chain)
     poses = kinematics.poses(q, np.zeros(3))
     base = np.broadcast_to(kinematics.T_data_base, (len(q), 1, 4, 4))
@@ -340,8 +333,6 @@ def plan_arm(plan: Plan) -> say.Figure:
     return posed("poses", "The arm in the poses of the plan", caption, space)
 
 
-# The still picture
-
 MOST_NUMBERED = 80  # beyond that numbers hide each other
 LONGEST_NAME = 24
 SIGNS = ("o", "s", "^", "D", "v", "P")  # of groups, which differ in more than colour
@@ -372,10 +363,7 @@ def posed(name: str, title: str, caption: str, space: Space) -> say.Figure:
 
 
 def write_plan_picture(path: str | Path, plan: Plan) -> None:
-    """Draw the poses of a plan; PNG or SVG by suffix, and the same plan gives the same file.
-
-    Raises InputError for another suffix and an unwritable place.
-    """
+    """PNG or SVG by suffix; the same plan gives the same file."""
     suffix = Path(path).suffix.lower()
     require(suffix in (".png", ".svg"), f"{path}: a picture of poses is written as .png or .svg")
     figure: Any = figure_of(plan_arm(plan))

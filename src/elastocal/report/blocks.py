@@ -73,11 +73,9 @@ WARNING = "Warning"
 
 @dataclass(frozen=True)
 class ShownTable:
-    """A table of texts.  `words` are the columns that hold words; the others hold numbers.
-
-    `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}, for
-    a page.  `narrow` is the same with less, for a terminal that is too narrow.
-    """
+    """`words` are the columns that hold words; the others hold numbers.  `groups` names the rows
+    that follow, by the index of the first: {0: "base frame", 6: …}, for a page.  `narrow` is the
+    same with less, for a terminal that is too narrow."""
 
     heads: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
@@ -94,17 +92,15 @@ class ShownTable:
         return replace(self, heads=heads, rows=rows, words=words, narrow=None)
 
     def when_narrow(self, *columns: int) -> ShownTable:
-        """The table that loses some columns where there is no room for them."""
+        """Some columns are lost where there is no room for them."""
         return replace(self, narrow=self.without(*columns))
 
 
 @dataclass(frozen=True)
 class Figure:
-    """What `draw` puts on matplotlib's figure, `height` inches high.
-
-    `name` is what `plot` calls it, `title` says what it shows to those who cannot see it.  With a
-    `space` (arm_view.Space) it is the arm, which a page lets be turned.
-    """
+    """What `draw` puts on matplotlib's figure, `height` inches high.  `name` is what `plot` calls
+    it, `title` says what it shows to those who cannot see it.  With a `space` (arm_view.Space) it
+    is the arm, which a page lets be turned."""
 
     name: str
     title: str
@@ -117,9 +113,7 @@ class Figure:
 @dataclass(frozen=True)
 class Fold:
     """What stands behind a summary, or without one open on pages; made only when it is shown.
-
-    `printed`: by a terminal too, with details.  `figures` are the names of those it may have.
-    """
+    `printed`: by a terminal too, with details.  `figures` are the names of those it may have."""
 
     summary: str
     blocks: Callable[[], Iterable[Block]]
@@ -140,17 +134,12 @@ def unfolded(blocks: Iterable[Block], which: Callable[[Fold], bool]) -> Iterator
             yield from unfolded(block.blocks(), which)
 
 
-# Numbers
-
 MOST_DECIMALS = 9
 
 
 def with_uncertainty(value: float, half: float) -> tuple[str, str]:
-    """Value and ± half width with the digits the half width allows: "0.287", "0.003".
-
-    The half width gets two digits where it begins with 1 or 2, else one; hundreds and more
-    are rounded off as well.
-    """
+    """ "0.287", "0.003": the half width gets two digits where it begins with 1 or 2, else one;
+    hundreds and more are rounded off as well."""
     if not (math.isfinite(value) and math.isfinite(half)) or half <= 0:
         return plain(value), plain(half)
     exponent = math.floor(math.log10(half))
@@ -169,11 +158,9 @@ def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
 
 
 def with_ends(value: float, low: float, high: float) -> tuple[str, str, float]:
-    """Value, interval and the half width whose digits both have: "0.000", "[0.000, 0.013]", 0.015.
-
-    The interval's shorter side gets two digits, unless that is empty, without an end, or below a
-    tenth of the longer; the half width is 0 where both ends are open.
-    """
+    """Value, interval, as "0.000", "[0.000, 0.013]", and the half width whose digits both have. The
+    interval's shorter side gets two digits, unless that is empty, without an end, or below a tenth
+    of the longer; the half width is 0 where both ends are open."""
     sides, half = [side for side in (value - low, high - value) if 0 < side < math.inf], 0.0
     if sides:
         half = 1.5 * 10.0 ** math.floor(math.log10(max(min(sides), max(sides) / 10)))
@@ -233,8 +220,7 @@ MOST_FAULTY = 100  # rows of the table of outliers
 
 
 def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> list[Block]:
-    """Readings beyond the noise: each with its line and names, its error in m, and that over the
-    noise."""
+    """Each with its line and names, its error in m, and that over the noise."""
     rows = [
         (str(o.line), printable(o.configuration), printable(o.marker), length(error),
          significant(ratio))
@@ -291,8 +277,6 @@ def resource(name: str) -> str:
     return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
 
 
-# Effects in words
-
 # Places that are the only one their effects have: "base drift", not "base drift at base".
 SINGLE = ("base", "wrist", "load", "tracker", "arm")
 STAGES = {
@@ -307,12 +291,10 @@ LONG_TIME = 120.0  # s, from which on times are told in minutes
 
 
 def plain_name(name: str) -> str:
-    """ "gear_eccentricity" → "gear eccentricity"."""
     return printable(name).replace("_", " ")
 
 
 def place(where: str) -> str:
-    """ "joint2" → "joint 2", "marker:M_1" → "marker M_1", "all" → "all links"."""
     if where.startswith("marker:"):
         return f"marker {printable(where.removeprefix('marker:'))}"
     if where == "all":
@@ -321,7 +303,6 @@ def place(where: str) -> str:
 
 
 def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
-    """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
     return effect_at_places(e.effect, [e.where])
 
 
@@ -331,7 +312,6 @@ STEPS = {"unknown": "what has no name", "rest": "the smaller causes"}
 
 
 def places(where: Iterable[str], runs: bool = False) -> str:
-    """ "joints 1, 2 and 5", "link 3 and base"; with `runs` "joints 1 to 4 and 6"."""
     numbers: dict[str, list[int]] = {}
     told, others = [], []
     for one in where:
@@ -353,7 +333,6 @@ def places(where: Iterable[str], runs: bool = False) -> str:
 
 
 def effect_at_places(effect: str, where: Sequence[str]) -> str:
-    """ "gear errors at joints 1, 2 and 5", "thermal expansion of links 2 and 3"."""
     name = STEPS.get(effect, plain_name(effect))
     if effect not in STEPS and len(where) == 1 and where[0] in SINGLE:
         return name
@@ -377,7 +356,6 @@ def name_of(text: str) -> str:
 
 
 def driver_name(driver: str) -> str:
-    """ "joint2 angle" → "joint 2 angle"."""
     return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
 
 
@@ -395,7 +373,6 @@ def percent(fraction: float) -> str:
 
 
 def reduction(f: FoundEffect) -> str:
-    """ "75 % (63 to 84 %)"."""
     low, high = f.gap_reduction_ci95
     if not (math.isfinite(low) and math.isfinite(high)):
         return percent(f.gap_reduction)
@@ -432,7 +409,6 @@ MOST_ORDERS = 6
 
 
 def _orders(settings: Mapping[str, float]) -> list[str]:
-    """ "orders 1.000 ± 0.002, 18.52 ± 0.03 and 4 more", with 95 % half widths."""
     told = []
     orders = [key for key in settings if (line := LINE.fullmatch(key)) and not line[1]]
     for key in orders[:MOST_ORDERS]:

@@ -155,9 +155,6 @@ def noise_floor_lines(
         yield f"{say.counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
 
 
-# The verdict, and what beside it
-
-
 NONE_NAMED = (
     "No effect is named: something may be missing, but nothing both stands out from the noise and "
     "lowers the error at poses left out of the fit"
@@ -307,7 +304,6 @@ def sensitivity(d: Diagnosis) -> list[str]:
 
 
 def diagnosis_steps(d: Diagnosis) -> list[str]:
-    """What to do now: the remedies of the findings, what extra poses promise, what to record."""
     steps = [f.remedy for f in d.findings if f.remedy]
     if (extra := d.extra) is not None:
         rivals, n = say.together([say.name_of(name) for name in extra.rivals], "or"), extra.n_poses
@@ -329,8 +325,8 @@ def diagnosis_steps(d: Diagnosis) -> list[str]:
 
 
 def alike(d: Diagnosis) -> list[str]:
-    """Sets of effects that these data cannot tell apart; beside many causes, the one that was
-    taken with its probability."""
+    """Sets of effects that these data cannot tell apart; beside many causes, the one that was taken
+    with its probability."""
     taken = {(f.effect, f.where): f.probability for f in d.effects} if d.groups else {}
 
     def told(e: EffectAt) -> str:
@@ -338,9 +334,6 @@ def alike(d: Diagnosis) -> list[str]:
         return say.effect_at(e) + ("" if p is None else f" (probability {say.probability(p)})")
 
     return [say.together([told(e) for e in rivals]) for rivals in d.indistinguishable]
-
-
-# Tables
 
 
 def _budget(d: Diagnosis) -> say.Budget:
@@ -414,7 +407,6 @@ def pair_table(d: Diagnosis) -> say.ShownTable:
 
 
 def untested_table(d: Diagnosis) -> say.ShownTable:
-    """Effects that could not be tested, those with the same reason and remedy in one row."""
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
         effects = groups.setdefault((printable(u.reason), printable(u.advice)), {})
@@ -429,8 +421,7 @@ def untested_table(d: Diagnosis) -> say.ShownTable:
 
 
 def location_table(d: Diagnosis) -> say.ShownTable:
-    """The stages of the chain from commanded joints to tracker with the evidence for each, and the
-    likeliest places."""
+    """The stages of the chain from commanded joints to tracker, and the likeliest places."""
     location = d.location
     if location is None:
         return say.ShownTable((), [])
@@ -448,9 +439,6 @@ def location_table(d: Diagnosis) -> say.ShownTable:
     return say.ShownTable(("where", "probability"), rows, groups=groups)
 
 
-# Many causes at once: findings, and their places below them.
-
-
 def _error_of(c: ComponentShare) -> str:
     return FAMILIES.get(c.family, say.plain_name(c.family))
 
@@ -464,7 +452,6 @@ def _unnamed(d: Diagnosis) -> list[tuple[str, ComponentShare]]:
 
 
 def share_text(fraction: float, fine: bool | None = None) -> str:
-    """ "55 %", "1.6 %", "< 0.1 %"."""
     if not math.isfinite(fraction):
         return "–"
     fine = abs(fraction) < FINE if fine is None else fine
@@ -508,7 +495,6 @@ def cause_table(d: Diagnosis) -> say.ShownTable:
 
 
 def place_table(d: Diagnosis) -> say.ShownTable:
-    """What acts at each place, below the finding that it belongs to."""
     named = [c for c in d.components if c.named]
     found = [
         (say.effect_at_places(g.name, g.places),
@@ -545,9 +531,6 @@ def curve_span(curve: Curve) -> str:
         return say.length(moved)
     shown, unit = say.display(moved, curve.y_unit)
     return f"{say.significant(shown)} {unit}"
-
-
-# Corrections that have no name.
 
 
 def _corrections(d: Diagnosis) -> Iterator[say.Block]:

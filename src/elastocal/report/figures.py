@@ -85,7 +85,6 @@ WIDTH = 5.6  # inches
 
 
 def style() -> AbstractContextManager[None]:
-    """Defaults of matplotlib with this package's colours, whatever the user has configured."""
     import matplotlib.style
     from cycler import cycler
 
@@ -217,8 +216,6 @@ def waterfall(name: str, steps: say.Steps, floor: say.Floor, of: str) -> say.Fig
     return rows_of_dots(name, title, steps, "held-out rms error", caption, floor)
 
 
-# Panels of points, lines and bands
-
 Panel: TypeAlias = Callable[["Axes"], object]  # draws into its axes
 
 
@@ -226,7 +223,7 @@ def panelled(
     name: str, title: str, panels: Sequence[Panel], caption: str, height: float,
     across: int = 1, columns: int = 2, **share: Any,
 ) -> say.Figure:  # fmt: skip
-    """Panels in a grid `across` wide, under one legend of `columns`."""
+    """In a grid `across` wide, under one legend of `columns`."""
 
     def draw(figure: Drawing) -> None:
         rows = max(-(-len(panels) // across), 1)
@@ -244,7 +241,7 @@ def panelled(
 
 
 def level(axes: Axes, height: float) -> None:
-    """Axes that reach as far above zero, which has a line, as below it."""
+    """As far above zero, which has a line, as below it."""
     axes.axhline(0, color=FAINT, linewidth=0.8)
     axes.set_ylim(-height, height)
 
@@ -265,10 +262,8 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = 
 
 
 def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Array]:
-    """Mean x, mean y and twice its standard error in bins of equally many x.
-
-    Where x takes few different values, each is a bin.
-    """
+    """Mean x, mean y and twice its standard error in bins of equally many x; where x takes few
+    different values, each is a bin."""
     order = np.argsort(x, kind="stable")
     steps = np.flatnonzero(np.diff(x[order]) > 1e-9 * (np.abs(x).max(initial=0.0) + 1e-300)) + 1
     if len(steps) >= 1.5 * bins:
@@ -293,8 +288,6 @@ def reach(values: Array) -> float:
 def _in_unit(kind: str, q: Array) -> tuple[Array, str]:
     return (np.degrees(q), "°") if kind == "revolute" else (q * 1e3, "mm")
 
-
-# Of a diagnosis and a plan
 
 LONGEST_ENTRY = 24  # what moves, written along the height of a small panel
 # Unit of a curve's axis → (factor, unit shown).
@@ -339,12 +332,9 @@ MOST_SHAPES, NO_COLUMNS = 6, np.zeros((0, 0))
 
 
 def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
-    """Every named effect at a joint whose offset the model has, reading by reading.
-
-    With b = ∂p/∂q_j of a reading, bᵀr/bᵀb is the joint's motion that explains most of r: of the
+    """With b = ∂p/∂q_j of a reading, bᵀr/bᵀb is the joint's motion that explains most of r: of the
     effect, and of the effect with the residual that is left where it and all other parameters are
-    fitted (a component-plus-residual plot; to first order).
-    """
+    fitted (a component-plus-residual plot; to first order)."""
     base, panels = d.calibrated, list[Panel]()
     if base is None or base.planned:
         return
@@ -421,8 +411,6 @@ def plan_curve(plan: Plan) -> say.Figure:
 def _ticks(axes: Axes, places: Sequence[float], names: Sequence[str]) -> None:
     axes.set_xticks(places, names, rotation=90 if max(map(len, names)) > 2 else 0)
 
-
-# Of residuals
 
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
 MOST_LABELS = 20
@@ -550,10 +538,7 @@ class Residuals:
         )  # fmt: skip
 
     def table(self) -> say.ShownTable:
-        """Mean, rms and largest residual of every direction, marker, load state and configuration.
-
-        Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
-        """
+        """Of a direction signed; else lengths of the 3-D residual, and of its mean vector."""
         # Names with values (n,) that have a sign, or with vectors (n, components), in their unit.
         found: list[tuple[str, Array, str]] = [
             *zip(self.components, self.value.T, self.units, strict=True)
@@ -581,17 +566,14 @@ class Residuals:
         return say.ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 
-# Over the work space
-
 CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told
 FEWEST_ON_MAP = 30  # poses
 
 
 def uncertainty_map(result: Calibration) -> say.Figure | None:
-    """How sure the tool's place is over reach and height, under the loads measured: rms in µm of
-    each part of the workspace; None where no error is expected, or where the model asks for more
-    than joints and load."""
+    """Expected error over reach and height, under the loads measured; None where none is expected,
+    or where the model asks for more than joints and load."""
     if result.predicted is None:  # as where only distances were read; nor has the verdict one
         return None
     model, point = result.model, None

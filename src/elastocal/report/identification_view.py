@@ -41,7 +41,6 @@ READINGS = {
 def calibration_blocks(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
 ) -> Iterator[say.Block]:
-    """An identification; `truth` and `published` (SI) stand beside the estimates."""
     budget = cache(lambda: gap_budget(result))
     yield say.Fold("", lambda: [_key(result, budget())])
     yield words.judgement(result)
@@ -293,8 +292,7 @@ def budget_steps(result: Calibration, budget: ErrorBudget) -> say.Budget:
 
 
 def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[str, Array]:
-    """Length (n,) in m of the errors by name: of the nominal arm and of the calibrated one in poses
-    that were not fitted, and on test data."""
+    """Length (n,) in m of the errors, in poses that were not fitted and on test data."""
     found = {}
     if budget is not None and len(budget.steps) > 1:
         ends = {nominal_held_out(result): budget.steps[0], "calibrated": budget.steps[-1]}
@@ -315,8 +313,7 @@ def spread_table(
 
 
 def _influence_table(result: Calibration) -> say.ShownTable:
-    """The configurations that decide most, by Cook's distance; those without others to judge them
-    first."""
+    """By Cook's distance; configurations without others to judge them first."""
     found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
     rows = [
         (
@@ -336,9 +333,6 @@ def _influence_table(result: Calibration) -> say.ShownTable:
         "on one, measure more like it."
     )
     return say.ShownTable(heads, rows, (0, 4), note=note)
-
-
-# The parameters as tables, and why some have no value of their own.
 
 
 def names_of(result: Calibration, standing: str) -> list[str]:
@@ -376,7 +370,7 @@ WITHOUT = {
 
 
 def limits(result: Calibration, e: Estimate) -> str:
-    """What the readings say of a parameter that has no value for it, and what the model uses."""
+    """What the readings say of a parameter without a value, and what the model uses."""
     assert e.limits is not None
     p = result.model.parameters[result.model.names.index(e.name)]
     if p.beyond(e.limits):
@@ -403,7 +397,6 @@ def combination_truth(result: Calibration, combination: Combination, truth: Trut
 
 
 def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
-    """Whether a true value lies in the 95 % interval; empty where either is unknown."""
     if value is None or ci95 is None:
         return ""
     return "inside" if ci95[0] <= value <= ci95[1] else "outside"
@@ -425,7 +418,7 @@ def nominal_text(e: Estimate, parameter: Parameter) -> str:
 
 
 def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
-    """Which parameters have no number of their own, and why, one line per reason; `most` names."""
+    """Which parameters have no number of their own, and why; `most` names a line."""
     standing, known = findings.standings(result), {p.name: p for p in result.model.parameters}
     redundant = result.left.redundant if result.left else ()
     groups: dict[str, list[Estimate]] = {}
@@ -493,7 +486,7 @@ ROUNDING = 1e-9  # sides of an interval this short beside the value are alike
 
 
 def is_lopsided(value: float, ci95: tuple[float, float]) -> bool:
-    """Whether the interval needs both ends to be told: not symmetric, or without an end."""
+    """Not symmetric, or without an end: both ends are to be told."""
     below, above = value - ci95[0], ci95[1] - value
     if not (math.isfinite(below) and math.isfinite(above)):
         return True
@@ -530,7 +523,7 @@ def _numbers(
     title: str, names: list[str], found: Sequence[Estimate | Combination],
     truth: list[float | None] | None, after: dict[str, list[str]],
 ) -> say.ShownTable:  # fmt: skip
-    """Names, values, intervals and units, with true values where known, and columns `after`."""
+    """With true values where known, and columns `after`."""
     lopsided = any(
         e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
     )

@@ -20,7 +20,6 @@ from elastocal.report import blocks as say
 
 
 def judgement(result: Calibration) -> say.ShownVerdict:
-    """How good the calibration is, as the result's findings say."""
     trust = result.finding("trust")
     assert trust is not None, "every identification is judged"
     if trust.severity == "poor":
@@ -36,8 +35,8 @@ def judgement(result: Calibration) -> say.ShownVerdict:
 
 
 def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
-    """The warnings that say more than the verdict, what to do next and the line on noise, each
-    with its label: what is only a note does not call for attention."""
+    """Those that say more than the verdict, what to do next and the line on noise: what is only a
+    note does not call for attention."""
     told = {"residual_above_stated_noise", "scatter_not_counted", "impossible_values"}
     said = {f.kind for f in result.verdict.missing} & told
     notes = {f.kind for f in result.findings if f.severity == "note"}
@@ -51,8 +50,7 @@ def _length(f: Finding, name: str) -> str:
 
 
 def _doubt(f: Finding) -> str:
-    """What speaks against a calibration: the words of its kind with its numbers, lengths in the
-    units people think in, others to three digits."""
+    """Lengths in the units people think in, others to three digits."""
     words = DOUBTS[f.kind]
     if not isinstance(words, str):
         return words(f)
@@ -286,7 +284,6 @@ def constraints_line(result: Calibration) -> str | None:
 
 
 def prior_line(result: Calibration) -> str | None:
-    """Parameters that owe more than half of their information to the prior."""
     shares, found = result.prior_share, result.finding("mostly_prior")
     if not shares:
         return None
@@ -380,8 +377,6 @@ def noise_model_line(result: Calibration) -> str | None:
 
 
 def _sizes(noise: Noise) -> list[str]:
-    """Name and standard deviation of every noise component; of many, the two extremes."""
-
     def number(s: NoiseSize) -> float:
         return (s.factor or 0.0) if s.sigma is None else s.sigma
 
@@ -416,7 +411,6 @@ def candidate_table(noise: Noise) -> say.ShownTable:
 
 
 def repeats_line(result: Calibration) -> str | None:
-    """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
     f = result.finding("lack_of_fit", "repeats_agree")
     if f is None:
         return None
@@ -480,7 +474,6 @@ def deviating_table(summary: ResidualSummary) -> say.ShownTable:
 
 
 def in_time_line(result: Calibration) -> str | None:
-    """How alike the residuals of visits are that follow each other; None for few visits."""
     found = result.autocorrelation
     if found is None:
         return None
@@ -529,9 +522,6 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     moves = "in the fit they move" if bends else "fitted along they would move"
     count = say.significant(finding.influence, 2)
     return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
-
-
-# The smooth functions that were fitted.
 
 
 def smooth_table(result: Calibration) -> say.ShownTable:

@@ -115,8 +115,6 @@ def pose_table(plan: Plan, decimals: int = 2) -> say.ShownTable:
 
 
 def served(reason: Reason) -> str:
-    """The parameters that a pose serves most: "joint3.compliance +38 %"."""
-
     def grown(factor: float) -> str:
         if math.isinf(factor):
             return "undetermined"

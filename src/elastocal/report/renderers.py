@@ -85,8 +85,7 @@ LONGEST_WHOLE = 28  # letters; a longer name breaks where its column ends
 
 
 def print_report(console: Console, result: object, details: bool = True, **told: Any) -> None:
-    """Show a result: what stands open in its report, and unless `details` are left out what is
-    folded and `printed`."""
+    """Without `details` only what stands open, not what is folded and `printed`."""
     print_blocks(console, blocks_of(result, **told), details)
     if not details:
         more = f"{option('details', True)} tells of method, noise, residuals, intervals"
@@ -101,7 +100,6 @@ def printed_text(result: object) -> str:
 
 
 def print_blocks(console: Console, blocks: Iterable[say.Block], details: bool = False) -> None:
-    """Print blocks; a blank line separates tables from sentences."""
     heading, before = "", None
     for block in say.unfolded(blocks, lambda fold: details and fold.printed):
         if isinstance(block, say.Heading):
@@ -172,8 +170,6 @@ def table_of(shown: say.ShownTable, tight: bool = False) -> Table:
     return table
 
 
-# Pages
-
 LIBRARIES = ("numpy", "scipy", "casadi")  # that the numbers depend on
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
 
@@ -182,12 +178,8 @@ def write_page(
     result: Any, path: str | Path, inputs: Any = None, command: str | None = None,
     seed: int | None = None, **told: Any,
 ) -> None:  # fmt: skip
-    """Write the result's page, whole or not at all; arguments as for `page_of`.  A certificate
-    whose name ends in .xml is a digital one (DCC).
-
-    Where no `inputs` are named, they are the files that the result came from.  Raises InputError
-    where an input cannot be read or `path` cannot be written, or names no page.
-    """
+    """Arguments as for `page_of`; where no `inputs` are named, they are the files that the result
+    came from.  A certificate whose name ends in .xml is a digital one (DCC)."""
     found = type(path).__name__
     require(isinstance(path, str | Path), f"{option('path')} takes a path; found {found}")
     path = Path(path)
@@ -204,13 +196,9 @@ def page_of(
     result: Any, inputs: Inputs = None, command: str | None = None, seed: int | None = None,
     certificate: bool = False, **told: Any,
 ) -> str:  # fmt: skip
-    """The page of a result as text.
-
-    `inputs` are the files read, or a map from their names to their SHA-256; `command` and `seed`
+    """`inputs` are the files read, or a map from their names to their SHA-256; `command` and `seed`
     tell how to repeat the run.  To a calibration `truth` (SI) adds true values, and `published`
-    values (SI) and half widths that others found; `certificate` makes a certificate of it.  Raises
-    InputError where an input cannot be read.
-    """
+    values (SI) and half widths that others found; `certificate` makes a certificate of it."""
     named = digests(inputs)
     body = html_of(blocks_of(result, certificate, **told))
     kind = VIEWS["certificate" if certificate else type(result).__name__][2]
@@ -275,8 +263,6 @@ style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
 """
 
 
-# Blocks as HTML
-
 OPTION = re.compile(r"(?<!\S)\(?--[a-z][a-z-]+[.,:;)]*")
 VIEW = '<script type="application/json" class="view-data">'
 
@@ -291,11 +277,9 @@ def text_of(text: str, minus: bool = True) -> str:
 def html_of(
     blocks: Iterable[say.Block], deep: int = 2, pictures: bool = True, summary: str = ""
 ) -> str:
-    """Blocks as HTML under heads of level `deep`; figures that follow each other stand in a row.
-
-    Without `pictures` figures are left out, and of folds what is not `printed`.  A table does not
-    repeat the `summary` that they stand behind.
-    """
+    """Under heads of level `deep`; figures that follow each other stand in a row.  Without
+    `pictures` figures are left out, and of folds what is not `printed`.  A table does not repeat
+    the `summary` that they stand behind."""
     parts = []
     for flat, several in groupby(blocks, lambda b: isinstance(b, say.Figure) and b.space is None):
         found = [_html(block, deep, pictures, summary) for block in several]
@@ -389,9 +373,6 @@ def _picture(block: say.Figure) -> str:
     )
 
 
-# What goes with a page
-
-
 @cache
 def plotly() -> tuple[str, str]:
     """plotly.js, and the same packed (gzip, base64) to a third of that."""
@@ -435,11 +416,8 @@ def html(result: object) -> str:
 
 
 def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) -> Any:
-    """The figure `kind` of a result: matplotlib's, in the place of `ax` where that is given, or of
-    the arm plotly's where `interactive`.
-
-    Raises InputError for a kind that the result does not have, and one that cannot be turned.
-    """
+    """matplotlib's, in the place of `ax` where that is given, or of the arm plotly's where
+    `interactive`."""
     folds = [block for block in blocks_of(result) if isinstance(block, say.Fold)]
     every = [name for fold in folds for name in fold.figures]
     arms = [name for name in every if name in ("space", "poses")]
@@ -515,10 +493,8 @@ def _plan_frame(plan: Plan | None) -> dict[str, Any]:
 
 
 def _candidates(d: Diagnosis) -> list[dict[str, Any]]:
-    """One row per hypothesis, best first; whether it is held to be real; `score` in nats.
-
-    What was found only where all causes are judged together comes first, without a score.
-    """
+    """Best first; whether it is held to be real; `score` in nats.  What was found only where all
+    causes are judged together comes first, without a score."""
     found = {(f.effect, f.where): f for f in d.effects}
     tried = {(c.effect, c.where): c for c in d.candidates}
     rows = []

@@ -139,9 +139,6 @@ def _moves(c: Comparison) -> say.Figure:
     return rows_of_dots("moved", title, rows, "tool moved, rms", caption, noise)
 
 
-# Commands
-
-
 def commands_blocks(c: Compensation) -> Iterator[say.Block]:
     from elastocal.compensation import summary
 
@@ -168,10 +165,7 @@ def commands_blocks(c: Compensation) -> Iterator[say.Block]:
 
 
 def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
-    """Errors before and after, uncertainty and warnings.
-
-    `content`: the summary of the `commands`, that of the correction `table`, or both.
-    """
+    """Of the summary of the `commands`, that of the correction `table`, or both."""
     commands, table = content.get("commands"), content.get("table")
     if commands is not None:
         rows = {
@@ -220,9 +214,6 @@ def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> say.ShownTable:
     return say.ShownTable(("", "rms", "95 %", "max"), cells, title=title)
 
 
-# Readings
-
-
 def readings_blocks(table: Measurements) -> Iterator[say.Block]:
     rows = [
         (printable(name), str(len(np.unique(values.astype(str)))), "", "")
@@ -243,8 +234,6 @@ def readings_blocks(table: Measurements) -> Iterator[say.Block]:
         "", lambda: [rows_of_dots("joints", title, dots, axis, lengths=False)], figures=("joints",)
     )
 
-
-# The calibrated arm in a file
 
 WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 # At the start of a sentence and in a title.
@@ -315,8 +304,6 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         )
 
 
-# What an import understood
-
 FIRST_ROWS = 5
 MOST_COLUMNS = 14  # of the first rows, on a wide terminal
 ROLES = {"points": "points", "joints": "joint values", "both": "points and joint values"}
@@ -336,10 +323,6 @@ def left_out(found: Imported) -> list[str]:
 
 
 def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
-    """Files and their columns, the first rows, ranges, counts, what was left out, warnings.
-
-    `width`: columns of letters that there is room for.
-    """
     for seen in found.understood:
         preset = f"preset {seen['preset']}, " if seen["preset"] else ""
         decimals = ", decimal commas" if seen["decimal"] == "," else ""
@@ -419,7 +402,6 @@ FEWEST = 3  # readings of one place from which on a repeatability is told
 
 
 def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
-    """A page to print and file: entries, verdict, conformity, uncertainty, pose accuracy."""
     entries, budget = result.model.cell.certificate, gap_budget(result)
     certified = certified_values(result, budget)
     yield judgement(result)
@@ -469,14 +451,12 @@ def certificate_blocks(result: Calibration) -> Iterator[say.Block]:
 
 @dataclass(frozen=True)
 class Certified:
-    """What the certificate and its XML state, lengths in m.
-
-    `sources`: standard uncertainty of a coordinate by source (name, GUM's type, u), of the distance
-    where distances were read; their root sum of squares is that of what the calibrated model
-    predicts against one reading.  `coordinates`: how many a reading has, 3 or 1.
-    `error`: the largest distance between places meant and read, of `places` that were not fitted.
-    `repeatability`: RP of the places read often enough.
-    """
+    """What the certificate and its XML state, lengths in m.  `sources`: standard uncertainty of a
+    coordinate by source (name, GUM's type, u), of the distance where distances were read; their
+    root sum of squares is that of what the calibrated model predicts against one reading.
+    `coordinates`: how many a reading has, 3 or 1.  `error`: the largest distance between places
+    meant and read, of `places` that were not fitted.  `repeatability`: RP of the places read often
+    enough."""
 
     sources: tuple[tuple[str, str, float], ...]
     error: float | None
@@ -551,10 +531,8 @@ def certified_values(result: Calibration, budget: ErrorBudget | None) -> Certifi
 
 
 def pose_repeatability(result: Calibration) -> Array:
-    """RP (places,) in m as ISO 9283 has it, of places with enough readings.
-
-    RP = l̄ + 3 S_l of the distances l of the readings from their mean.
-    """
+    """RP = l̄ + 3 S_l (places,) in m of the distances l of the readings of a place from their mean
+    (ISO 9283), where there are enough."""
     observed = result.observations
     if observed.kind not in ("position", "pose"):
         return np.zeros(0)
@@ -618,8 +596,6 @@ def _poses(
         )
 
 
-# The certificate as XML
-
 UNITS = {
     "m": "\\metre",
     "rad": "\\radian",
@@ -645,11 +621,6 @@ COVERED = (
 
 
 def dcc_text(result: Calibration) -> str:
-    """The XML document.
-
-    Raises InputError where [certificate] of the cell lacks entries: there is no DCC without them.
-    """
-
     c, name = result.model.cell.certificate, result.model.chain.name
     if c.missing:
         raise InputError(
