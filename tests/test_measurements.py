@@ -29,7 +29,7 @@ def read(tmp_path):
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    monkeypatch.setattr(tables, "ROWS_AT_ONCE", 1)
+    monkeypatch.setattr(tables, "PIECE", 20)
 
 
 @pytest.fixture
