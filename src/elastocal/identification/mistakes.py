@@ -498,8 +498,8 @@ SHOWN = 6  # runs of lines, and configurations, that are named
 def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, ...], str] | None:
     """Rows (k,) with the name of another marker, the markers mixed up, and what to do."""
     names, n = table.marker_names, len(table)
-    poses = len(np.unique(table.q, axis=0))
-    if table.position is None or len(names) < 2 or not FEWEST_POSES <= poses <= n <= MOST_READINGS:
+    few = n > MOST_READINGS or len(np.unique(table.q, axis=0)) < FEWEST_POSES
+    if table.position is None or len(names) < 2 or few:
         return None
     flange, row = model.rigid.flange_poses(table), np.arange(n)
     marker, far = table.marker, np.sqrt(special.chdtri(3, FALSE_ALARM / n))
@@ -716,12 +716,14 @@ def scale_of(result: Calibration) -> float | None:
     """
     table = result.observations.table
     own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
-    if table.position is None or own or len(np.unique(table.q, axis=0)) < FEWEST_POSES:
+    if table.position is None or own:
         return None
     extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
     if not SCALED * extent / 10 < result.nominal_rms < math.inf:
         return None
     table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
+    if len(np.unique(table.q, axis=0)) < FEWEST_POSES:
+        return None
     flange = result.model.rigid.flange_poses(table)
     found = LinearFits(flange[None], np.asarray(table.position), table.marker)
     if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:

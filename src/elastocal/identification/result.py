@@ -728,7 +728,7 @@ class Calibration(scrutiny.FoundFit, Result):
             "verdict": self.verdict.to_json() | {"sentence": said},
             "predicted_new_poses_um": self.predicted,
             "load_point_um": microns(self.load_point_error),
-            "measured_visits": measured_visits(observed),
+            "measured_visits": self.arm.visits,
             "measured_poses": self.shown,
             "open": self.left,
             "tails": None,

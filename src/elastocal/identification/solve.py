@@ -338,13 +338,14 @@ def solve(
     few = _sampled(problem)
     found = _tied_from(few, problem.x0, CHOOSING)
     progress("choosing the parameters that the data determine")
-    more = np.sqrt(len(problem.observations.value) / len(few.observations.value))
-    sigma, kept = residual_sigma(found, 0), None
-    r_factor = found.r_factor.scaled(np.full(len(problem.free), more))
-    for _ in range(5):
+    sigma, kept, r_factor = residual_sigma(found, 0), None, _as_of(found, problem)
+    whole = few is problem
+    for turn in range(5 if whole else 10):
         reduction = choose(problem, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
-            break
+            if whole:
+                break
+            whole = True  # what a sample has settled, all readings begin with
         held = reduction.dropped[is_placed(problem.model)[reduction.dropped]]
         if problem.model.observe == "distance":
             # What no reading tells stays at its guess: a fit of the nominal arm takes it anywhere.
@@ -352,9 +353,9 @@ def solve(
         elif not exact and len(held):
             problem, exact = with_placed(started, PLACING)[0], True
         # The threshold is in units of the noise, and the noise is known only after the fit.
-        kept = reduction.kept
-        found = fit_kept(problem, found.x, reduction)
-        sigma, r_factor = residual_sigma(found, len(kept)), found.of_free
+        kept, whole = reduction.kept, whole or turn == 5
+        found = fit_kept(problem if whole else _sampled(problem), found.x, reduction)
+        sigma, r_factor = residual_sigma(found, len(kept)), _as_of(found, problem)
     if (left := reduction.seen(problem.free, r_factor.R, problem.sizes)) is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)
     if try_wider:
@@ -525,6 +526,12 @@ def _sampled(problem: Problem) -> Problem:
         return problem
     part = problem.sample(min(SAMPLE, n // 4))
     return replace(problem, observations=part.observations, weights=part.weights)
+
+
+def _as_of(found: Fit, problem: Problem) -> RFactor:
+    """The R factor of the free columns for all readings, of which `found` may have a part."""
+    more = len(problem.observations.value) / len(found.problem.observations.value)
+    return found.of_free.scaled(np.full(len(problem.free), np.sqrt(more)))
 
 
 def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None = None) -> Fit:

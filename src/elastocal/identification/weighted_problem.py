@@ -339,8 +339,11 @@ class Problem:
         rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
         if len(index) == len(observed.lead):
             return Part(index, rows, observed, weights)
-        own = subset(observed, np.isin(np.arange(len(observed.lead)), index))
-        inside = None if weights.whiten is None else weights.whiten[rows][:, rows]
+        own = subset(observed, index)
+        # A block of rows by its ends: picking columns one by one takes as long as the table is.
+        block = len(rows) == rows[-1] + 1 - rows[0]
+        own_rows = slice(rows[0], rows[-1] + 1) if block else rows
+        inside = None if weights.whiten is None else weights.whiten[own_rows][:, own_rows]
         mine = replace(weights, whiten=inside)
         if weights.common is not None and weights.together is not None:
             mine = replace(mine, common=weights.common[rows], together=weights.together[index])

@@ -12,7 +12,7 @@ from scipy import sparse
 from elastocal.cell_tables import CartesianNoise, PolarNoise, Tracker
 from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.messages import InputError, require
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}
 XYZ = ("x", "y", "z")
@@ -98,16 +98,21 @@ def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     return float((left**2).sum()), int((count - 1).sum()) * values.shape[1]
 
 
-def rows_needed(observed: Observations, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+def rows_needed(observed: Observations, chosen: BoolArray | IntArray) -> IntArray:
+    if observed.kind != "deflection":  # each is of its own row, whatever else is in the table
+        return observed.lead[chosen]
     return np.unique(observed.combine[chosen].indices).astype(np.int64)
 
 
-def subset(observed: Observations, chosen: NDArray[np.bool_]) -> Observations:
-    combine = observed.combine[chosen]
+def subset(observed: Observations, chosen: BoolArray | IntArray) -> Observations:
+    """Of those that hold (N,), or of these numbers (n,), which ascend."""
     rows = rows_needed(observed, chosen)
     value = observed.value.reshape(-1, observed.size)[chosen].ravel()
-    lead = np.searchsorted(rows, observed.lead[chosen])
-    return Observations(observed.kind, value, combine[:, rows], lead, observed.table.take(rows))
+    lead, combine = np.arange(len(rows)), sparse.eye_array(len(rows), format="csr")
+    if observed.kind == "deflection":
+        lead = np.searchsorted(rows, observed.lead[chosen])
+        combine = observed.combine[chosen][:, rows]
+    return Observations(observed.kind, value, combine, lead, observed.table.take(rows))
 
 
 def _needed(column: Array | None, table: Measurements, names: str, kind: str) -> Array:
