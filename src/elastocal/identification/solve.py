@@ -473,7 +473,8 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     dropped, with −mixing · δ of those kept, leave them where they are in the first order, and so do
     the errors of those kept, of this `covariance` (kept, kept); what estimates do in the second is
     found from the mean of the readings at both and at their opposites.  Where a length is hardly
-    told, a direction that is not told at all moves the markers by the product of the two.
+    told, a direction that is not told at all moves the markers by the product of the two.  What the
+    fit knows besides the readings holds estimates against it, equalities for exact.
     """
     problem, found, chosen = solution.problem, solution.fit, solution.reduction
     kept, dropped = chosen.kept, chosen.dropped
@@ -609,7 +610,8 @@ class SmoothPart:
                 x = places[even]
                 of_the_arm = (np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],)
                 Q, _ = np.linalg.qr(np.column_stack([np.ones(len(x)), *of_the_arm]))
-                waves = basis(x) - Q @ (Q.T @ basis(x))
+                waves = basis(x)
+                waves = waves - Q @ (Q.T @ waves)
             mean = self.value[own] @ waves.T
             rng = np.random.default_rng(0)
             k = waves.shape[1]
