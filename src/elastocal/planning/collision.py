@@ -628,7 +628,7 @@ class Sight:
 
 
 def rope_angle(poses: Poses, axis: Array) -> Array:
-    """Angle (N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves."""
+    """(N,) between the vertical and `axis` (3,) of the flange, in which the rope leaves."""
     turned = poses.flange[:, :3, :3] @ (np.asarray(axis) / np.linalg.norm(axis))
     return np.asarray(np.arctan2(np.hypot(turned[:, 0], turned[:, 1]), -turned[:, 2]))
 

@@ -255,9 +255,8 @@ class VisitTimes:
     def cleared(
         self, tour: list[int], seed: int, progress: Progress
     ) -> tuple[list[int], VisitTimes]:
-        """Once its blocked moves are found and gone round."""
         clock, moves, rounds = self, self.moves, 0
-        while moves.check(tour):
+        while moves.check(tour):  # blocked moves are gone round
             progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
             rounds += 1
             if rounds == PATIENT:
@@ -271,7 +270,6 @@ class VisitTimes:
         self, near: list[int], seed: int, progress: Progress,
         hot: Sequence[float], steps: int,
     ) -> tuple[list[int], VisitTimes]:  # fmt: skip
-        """From an order that is `near` a good one."""
         best, clock = self.cleared(near, seed, progress)
         for k, temperature in enumerate(hot, start=1):
             # Enough where a drift does no harm any more; without one the way alone counts.

@@ -607,7 +607,6 @@ class Moves:
 
     @cached_property
     def entry(self) -> IntArray:
-        """(V,): the point by which a visit is entered."""
         return np.asarray(self.sides[np.arange(len(self.pose)), self.side])
 
     @cached_property

@@ -146,7 +146,6 @@ class PoseInformation:
 
     @property
     def everything(self) -> IntArray:
-        """Readings (1, L) of a pose that is read in all load states."""
         return np.full((1, len(self.forces)), self.model.cell.design.repeats)
 
     @property
@@ -238,8 +237,6 @@ class Done:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known before a plan: held parameters, a stated prior, measurements done."""
-
     fixed: tuple[str, ...] = ()
     prior: GaussianPrior | None = None
     done: Done | None = None
@@ -262,8 +259,8 @@ class Estimable:
 
     @property
     def interest(self) -> IntArray:
-        """Indices into the kept parameters that D, A, E and the indices O count: those of `[design]
-        interest`, by default all but base and markers."""
+        """Indices into the kept parameters that D, A, E and the indices O count, by default all but
+        base and markers."""
         model, wanted = self.model, self.model.cell.design.interest
         kept = [model.parameters[c] for c in self.columns]
         where = wish("interest", f"{model.cell.source}: [design] interest")

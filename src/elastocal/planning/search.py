@@ -100,7 +100,6 @@ class Checkpoint:
         return made
 
     def clear(self) -> None:
-        """The design has ended: there is nothing to resume."""
         if self.path is not None and self.begun:
             self.path.unlink(missing_ok=True)
 

@@ -154,7 +154,7 @@ class Setup:
         return DesignProblem(pool.blocks, prior, pool.group, shares, self.criterion, source)
 
     def gathered(self, blocks: Array) -> Array:
-        """M (p, p) of a plan's blocks (N, r, p) and what was known before."""
+        """M (p, p), with what was known before."""
         B = blocks.reshape(-1, blocks.shape[-1])
         return np.asarray(self.prior + B.T @ B)
 

@@ -252,7 +252,7 @@ def stroke(axes: Axes, x: Array, y: Array, how: str, colour: str, **more: Any) -
 
 
 def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = "") -> None:
-    """Scatter as one line of round caps: a third of the bytes of a marker per point."""
+    """One line of round caps: a third of the bytes of a marker per point."""
     if label:
         axes.plot([], [], "o", color=colour, markersize=size + 1, label=label)
     at = np.stack([x, y])[:, np.isfinite(x) & np.isfinite(y), None]

@@ -475,8 +475,7 @@ class Certified:
 
     @property
     def of_deviations(self) -> float:
-        """Expanded uncertainty of a measured distance: of reading and instrument alone, since the
-        arm's own errors are what is measured."""
+        """Of reading and instrument alone, since the arm's own errors are what is measured."""
         own = [u for name, _, u in self.sources if name in (READING, INSTRUMENT)]
         return K * math.sqrt(self.coordinates * sum(u**2 for u in own))
 
