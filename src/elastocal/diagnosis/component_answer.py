@@ -64,12 +64,10 @@ def pays(without: Array, now: Array) -> bool:
 
 @dataclass(frozen=True)
 class SumAnswer:
-    """The pieces of a diagnosis that a sum of components fills.
-
-    `before` has the columns of the cell's own parameters, `dataset` those beside the weights of
-    links where the sum has them.  `hidden` may be there as well: shares and intervals, not names,
-    count with them.  `instead` is what the sum would be if some kinds of it did not exist.
-    """
+    """The pieces of a diagnosis that a sum of components fills.  `before` has the columns of the
+    cell's own parameters, `dataset` those beside the weights of links where the sum has them.
+    `hidden` may be there as well: shares and intervals, not names, count with them.  `instead` is
+    what the sum would be if some kinds of it did not exist."""
 
     before: DiagnosisData
     dataset: DiagnosisData
@@ -130,11 +128,9 @@ class SumAnswer:
     @cached_property
     def moved(self) -> Array:
         """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
-        parameters have followed them, at equal weights.
-
-        They follow in the directions that the readings determine, not in what rounding leaves of
-        parallel axes; what is only uncertain of the load's point is no fitted parameter.
-        """
+        parameters have followed them, at equal weights.  They follow in the directions that the
+        readings determine, not in what rounding leaves of parallel axes; what is only uncertain of
+        the load's point is no fitted parameter."""
         before = self.before
         B = before.data.X[self._rows][:, np.isin(before.fitted, before.base.model.names)]
         B = B / np.maximum(np.linalg.norm(B, axis=0), 1e-300)
@@ -217,7 +213,6 @@ class SumAnswer:
 
     @cached_property
     def total(self) -> Array:
-        """Mean squares (draws,) in m² of the whole."""
         return self.squares(range(len(self._spans)))
 
     @property
@@ -245,11 +240,9 @@ class SumAnswer:
     @cached_property
     def _not_paying(self) -> dict[tuple[str, str], float]:
         """Named effects at their places without which configurations that are left out of the fit
-        are predicted better, or worse by less than PAYS: by how many standard errors worse.
-
-        The one that matters least is judged first, and stays out then: of two that say the same,
-        one remains.
-        """
+        are predicted better, or worse by less than PAYS: by how many standard errors worse.  The
+        one that matters least is judged first, and stays out then: of two that say the same, one
+        remains."""
         gone: list[int] = []
         out: dict[tuple[str, str], float] = {}
         free = {k for k, c in enumerate(self.found.components) if c.named and not c.given}
@@ -272,11 +265,9 @@ class SumAnswer:
         return squared_lengths(self.found.data, each_left_out(*self._fitted_without(gone)))
 
     def _fitted_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
-        """P (C, m, m) of each configuration and u = P r (C, m) without these components.
-
-        With S the posterior covariance of their coefficients, β̂ the mean, and Y = HL⁻¹ there, P
-        grows by Y S⁻¹Yᵀ and u by Y S⁻¹β̂.
-        """
+        """P (C, m, m) of each configuration and u = P r (C, m) without these components.  With S
+        the posterior covariance of their coefficients, β̂ the mean, and Y = HL⁻¹ there, P grows by
+        Y S⁻¹Yᵀ and u by Y S⁻¹β̂."""
         at, index = self._fitted, self._index(gone) + self._own
         D = at.beta_deviation[:, index]
         Y, W = at.H @ D, np.linalg.inv(D.T @ D)
@@ -321,7 +312,7 @@ class SumAnswer:
         return [k for k, c in enumerate(self._every) if _kind(c) == name]
 
     def _by(self, key: Callable[[Component], Any]) -> dict[Any, list[int]]:
-        """The components' numbers by what `key` says of each; without those that it denies."""
+        """The components' numbers by what `key` says of each, without those that it denies."""
         groups: dict[Any, list[int]] = {}
         for k, c in enumerate(self.found.components):
             if own := key(c):
@@ -333,10 +324,8 @@ class SumAnswer:
     @cached_property
     def _true(self) -> Array:
         """Readings without noise (rows, draws) of the configurations that are kept, each left out.
-
         θ* is drawn about the fit to the others, as uncertain as that is: what is read there then
-        has the covariance P_cc⁻¹.
-        """
+        has the covariance P_cc⁻¹."""
         kept, _ = self._poses
         at, configuration = self.at, np.nonzero(self._rows)[0][kept]
         moved = self._wide.X[self._rows][kept] @ (self._drawn - at.beta[:, None])
@@ -353,7 +342,7 @@ class SumAnswer:
         return (self.found.data.r - each_left_out(P, u))[self._rows][self._poses[0]]
 
     def _error_without(self, gone: Sequence[int]) -> Array:
-        """Mean square (draws,) in m² by which new poses err if these are in no model."""
+        """Mean square (draws,) in m² by which new poses err with these in no model."""
         predicted = self._predicted(*self._fitted_without(gone))
         return self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
 
@@ -363,13 +352,10 @@ class SumAnswer:
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls when these components are added
-        last.
-
-        A configuration c that is left out of a fit is a new pose for it.  Before, the error there
-        is X_c β̂₋c − W_c θ*, after it W_c (θ̂₋c − θ*), with the columns W of all that is held to be
-        true.  What is unexplained is no noise, and stays; so does a change for new readings
-        that fall between its moment and the one that was found.
-        """
+        last.  A configuration c that is left out of a fit is a new pose for it.  Before, the error
+        there is X_c β̂₋c − W_c θ*, after it W_c (θ̂₋c − θ*), with the columns W of all that is held
+        to be true.  What is unexplained is no noise, and stays; so does a change for new readings
+        that fall between its moment and the one that was found."""
         before = self._error_without([*members, *self._not_written])
         after = self._error + sum(self._mistimed(k) for k in members)
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
@@ -480,17 +466,15 @@ class SumAnswer:
 
     @cached_property
     def effects(self) -> tuple[FoundEffect, ...]:
-        """What has a name, each effect at a place once, the largest first."""
+        """Each effect at a place once, the largest first."""
         return tuple(self._found_effects(named=True))
 
     @cached_property
     def slight(self) -> tuple[FoundEffect, ...]:
-        """What has a name and moves the markers by next to nothing, or perhaps not at all."""
         return tuple(self._found_effects(named=True, slight=True))
 
     @cached_property
     def fields(self) -> tuple[FoundEffect, ...]:
-        """What has none, and corrects the arm all the same."""
         return tuple(self._found_effects(named=False))
 
     @property
@@ -499,11 +483,9 @@ class SumAnswer:
 
     @cached_property
     def _slight(self) -> set[int]:
-        """Named components, by effect and place, that probably do not matter, or do not pay.
-
-        Where a kind does, and at which of its places these data do not tell, one of them stands for
-        all: the most probable.
-        """
+        """Named components, by effect and place, that probably do not matter, or do not pay.  Where
+        a kind does, and at which of its places these data do not tell, one of them stands for all:
+        the most probable."""
         chance = {own[0]: self._matters(own) for own in self._at_place.values()}
         slight = set()
         for name, members in self._by(_kind).items():
@@ -607,7 +589,6 @@ class SumAnswer:
     # The budget, and shapes.
 
     def budget(self, first: Sequence[BudgetStep]) -> tuple[BudgetStep, ...]:
-        """The steps so far, one for each named step, and one with what has no name."""
         steps: list[BudgetStep] = list(first)
         members: list[int] = []
         for name, own in self._named_steps():
@@ -622,7 +603,6 @@ class SumAnswer:
         return tuple(steps)
 
     def _named_steps(self) -> Iterator[tuple[str, list[int]]]:
-        """Each group of components, the largest first."""
         for group in self.groups[:MOST_STEPS]:
             yield f"{group.name}:{'+'.join(group.places)}", [
                 k for k, c in enumerate(self.found.components)

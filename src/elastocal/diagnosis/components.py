@@ -69,8 +69,7 @@ class Component:
     motion.  `settings` are constants of the effect by key, `search` what finding them cost in nats;
     `follows` is what a field depends on; `fellows` at how many places there may be one of its kind.
     One that is `given` stays in the sum: the columns of others are about it, or it has been
-    compared with its absence already.
-    """
+    compared with its absence already."""
 
     family: Family
     effect: Effect
@@ -149,13 +148,11 @@ class Sizes:
 
 
 class Pool:
-    """The prior of which components are there, and of the logarithms of their sizes.
-
-    A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  It is there
-    with probability PRESENT, then at any number of them with equal probability, and at any k of
-    them (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n
-    over k) nats.  The logarithms of a kind's sizes spread by SPREAD in all, ALONE of it their own.
-    """
+    """The prior of which components are there, and of the logarithms of their sizes.  A kind has n
+    places, the k-th family of lines of a joint as one of the k-th ones.  It is there with
+    probability PRESENT, then at any number of them with equal probability, and at any k of them
+    (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n over k)
+    nats.  The logarithms of a kind's sizes spread by SPREAD in all, ALONE of it their own."""
 
     def __init__(self, components: Sequence[Component]) -> None:
         ranks: Counter[tuple[str, str, str]] = Counter()
@@ -235,11 +232,8 @@ SETTLED, ROUGHLY, STEPS = 2e-3, 0.1, 30
 @dataclass(frozen=True)
 class SumOfComponents:
     """Components beside the data's own columns, under a noise whose factor is free: −2ℓ and its
-    slope.
-
-    Of the data under that `noise` V: `inverse` V⁻¹ (C, m, m), zero where rows do not count;
-    `products` with the components last; and what of −2ℓ no coefficient changes.
-    """
+    slope.  Of the data under that `noise` V: `inverse` V⁻¹ (C, m, m), zero where rows do not count;
+    `products` with the components last; and what of −2ℓ no coefficient changes."""
 
     data: NoisyData
     components: tuple[Component, ...]
@@ -281,21 +275,18 @@ class SumOfComponents:
         return Pool(self.components)
 
     def _beside(self, columns: Array) -> Across:
-        """Of columns beside the data's own and the components'."""
         white = _rows(self.inverse @ columns)
         others = (self.data.X, *(c.columns for c in self.components))
         across = np.concatenate([_rows(C).T @ white for C in others])
         return across, _rows(columns).T @ white, white.T @ self.data.r.ravel()
 
     def across(self, columns: Sequence[Array]) -> Iterator[Across]:
-        """Of each of these columns."""
         for some in bundles(columns):
             cross, own, z = self._beside(side_by_side(self.data, some))
             for at in spans_of([c.shape[2] for c in some], len(z)):
                 yield cross[:, at], own[at, at], z[at]
 
     def joined(self, more: Sequence[Component]) -> SumOfComponents:
-        """The sum with these as well."""
         out = self
         for columns in bundles([c.columns for c in more]):
             some, more = more[: len(columns)], more[len(columns) :]
@@ -317,13 +308,11 @@ class SumOfComponents:
         return found, self.constant + self.products.value(found)
 
     def objective(self, theta: Array) -> tuple[float, Array, Array]:
-        """−2 log posterior of the logarithms, its slope and its average information (1 + 2 K,
-        1 + 2 K): the mean of observed and expected curvature (Gilmour, Thompson and Cullis 1995,
-        Biometrics 51, 1440).
-
-        With A the coefficients' precision in units of their prior deviations and b their mean, two
-        parameters that change the logarithms of prior variances by s and t share sᵀb(1 − A⁻¹)bt.
-        """
+        """−2 log posterior of the logarithms, its slope and its average information
+        (1 + 2 K, 1 + 2 K): the mean of observed and expected curvature (Gilmour, Thompson and
+        Cullis 1995, Biometrics 51, 1440).  With A the coefficients' precision in units of their
+        prior deviations and b their mean, two parameters that change the logarithms of prior
+        variances by s and t share sᵀb(1 − A⁻¹)bt."""
         K, at = len(self.components), Sizes.of(theta)
         by_length = np.zeros_like(self.by_size)
         for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
@@ -389,10 +378,8 @@ def posed(
     data: NoisyData, components: Sequence[Component], noise: NoiseValues,
     known: SumOfComponents | None = None,
 ) -> SumOfComponents:  # fmt: skip
-    """The sum of these components beside the data's own columns, under one noise.
-
-    What a sum that is `known` of the same data has summed up under this noise is not summed anew.
-    """
+    """The sum of these components beside the data's own columns, under one noise.  What a sum that
+    is `known` of the same data has summed up under this noise is not summed anew."""
     if known is None or known.noise is not noise:
         own = Weighted.of(data, noise)
         inverse = own.root.transpose(0, 2, 1) @ own.root
@@ -408,12 +395,10 @@ def _rows(columns: Array) -> Array:
 @dataclass(frozen=True)
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
-
     `earned` (K,) nats of each, `spread` (K, K) the covariance of the logarithms of their sizes;
     `sums` are those over the rows of the data, which are without their columns, `variances` (Σ k,)
     their coefficients' prior.  `complete` are the components whose kinds have been tried at all
-    their places beside it.
-    """
+    their places beside it."""
 
     sizes: Sizes
     noise: NoiseValues
@@ -445,11 +430,9 @@ class FittedSum:
 
     @property
     def spans(self) -> tuple[slice, ...]:
-        """Where each component's coefficients stand among those of the data, last of all."""
         return self.sums.spans
 
     def away(self, components: Sequence[Component]) -> list[Component]:
-        """Those of these components that are not in it."""
         return [c for c in components if c not in self.components]
 
     def without_these(self, some: Sequence[Component] = ()) -> NoisyData:
@@ -471,7 +454,6 @@ def fit_sum(
     start: Sizes | None = None, refit_noise: bool = True, known: SumOfComponents | None = None,
 ) -> FittedSum:  # fmt: skip
     """Maximise over all sizes; leave out, one after the other, what does not earn its cost.
-
     `known` are the sums of a fit to the same data, which are not summed anew."""
     at, rounds = start or Sizes.start(components), 2 if refit_noise and start is None else 1
     problem = posed(data, components, noise, known)
@@ -630,11 +612,9 @@ def drawn(
 
 @dataclass(frozen=True)
 class _Kind:
-    """What has sizes that are alike: a kind's components, or an effect's parameters.
-
-    Its members' `spans` of the columns and `logs` (k,) of their sizes, −∞ of none; what finding
-    them `sought` (k,); at how many `places` there may be one, None where it is there in any case.
-    """
+    """What has sizes that are alike: a kind's components, or an effect's parameters.  Its members'
+    `spans` of the columns and `logs` (k,) of their sizes, −∞ of none; what finding them `sought`
+    (k,); at how many `places` there may be one, None where it is there in any case."""
 
     spans: Sequence[slice]
     logs: Array

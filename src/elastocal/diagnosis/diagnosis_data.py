@@ -51,8 +51,7 @@ class DiagnosisData:
     these columns, of the load point's the effect, of a stated drift's that of the base.
     `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a load.
     `other_backlash` is the probability that play follows the backlash model that the base's model
-    does not have.
-    """
+    does not have."""
 
     base: Baseline
     columns: Columns
@@ -222,12 +221,10 @@ def diagnosis_data_of(
     x: Array | None = None,
     apart: bool = False,
 ) -> DiagnosisData:
-    """Compute all columns at the baseline's fit and gather them by configuration.
-
-    `around` is the base's model with some of the hypotheses in it, at its values x: columns are
-    those there, and the residual is the baseline's.  `apart`: those of the base's own parameters
-    are without the hypotheses.
-    """
+    """Compute all columns at the baseline's fit and gather them by configuration.  `around` is the
+    base's model with some of the hypotheses in it, at its values x: columns are those there, and
+    the residual is the baseline's.  `apart`: those of the base's own parameters are without the
+    hypotheses."""
     model, observed, blocks = base.model, base.observed, base.blocks
     # The load's own error, whose load point has a tolerance in any case.
     acting = model.cell.model.torque != "measured"
@@ -282,10 +279,8 @@ def diagnosis_data_of(
 def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     """What the cell's [noise] states that readings share: columns (N, size, k) of the drift,
     coefficients of variance one, and the covariance (C, m, m) of what changes faster than its waves
-    and of what is common to a configuration.
-
-    It is noise: left out, it passes for an effect that goes with time or with the joints' angles.
-    """
+    and of what is common to a configuration.  It is noise: left out, it passes for an effect that
+    goes with time or with the joints' angles."""
     observed, member, n = base.observed, base.blocks.member, len(base.observed.lead)
     some = subset(observed, np.arange(n) < base.n_measured)
     waves = np.zeros((n, observed.size, 0))
@@ -386,12 +381,10 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
 
 def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, tuple[EntryKey, Array]]]:
     """Places that the load bends, the base and each link's end, with the entry that moves them and
-    the load's force and moment (n_rows, 6) there along the entry's axes, of a visit's first row.
-
-    A frame moved by e moves every marker by R e, so the columns of its frame are R; and turned
-    about e they move a marker by R e × lever, whose product with the force is the moment about e,
-    the load taken at the marker.
-    """
+    the load's force and moment (n_rows, 6) there along the entry's axes, of a visit's first row.  A
+    frame moved by e moves every marker by R e, so the columns of its frame are R; and turned about
+    e they move a marker by R e × lever, whose product with the force is the moment about e, the
+    load taken at the marker."""
     if not recorded(dataset.table, "load"):
         return
     n, begun = dataset.table.q.shape[1], first_of_visit(dataset.table)
@@ -405,10 +398,8 @@ def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, tuple[EntryKey, Arra
 
 
 def waves(x: Array, present: BoolArray, count: int) -> Array:
-    """cos(kπu)/k, k = 1 … count, of x (C, v) scaled to u in [0, 1]: (C, v, count).
-
-    The fall with k makes a Gaussian prior over their weights one over continuous functions.
-    """
+    """cos(kπu)/k, k = 1 … count, of x (C, v) scaled to u in [0, 1]: (C, v, count).  The fall with k
+    makes a Gaussian prior over their weights one over continuous functions."""
     known = x[present]
     span = max(float(np.ptp(known)), 1e-12)
     u = (x - known.min()) / span
@@ -437,11 +428,9 @@ LOAD_POINT_MOTION = 1e-2
 
 @dataclass(frozen=True)
 class Generic:
-    """A block: `entry` moved by smooth functions of `covariate`, or ready columns.
-
-    `direction` (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k)
-    are packed columns of blocks that vary within a visit.
-    """
+    """A block: `entry` moved by smooth functions of `covariate`, or ready columns.  `direction`
+    (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k) are packed
+    columns of blocks that vary within a visit."""
 
     kind: str
     covariate: str

@@ -42,12 +42,10 @@ REFINED_ROUNDS = 3  # of settings that depend on each other
 
 class ModelSet:
     """Additions `items` to the fitted model, noise fitted beside them, and the log posterior.
-
-    `score` = log evidence at the fitted noise, sizes mixed, + log prior of noise and items.
-    `data` holds the items' columns at the best of their scales, `scales` (items,).  The noise is
-    fitted from `start`, twice where the best scale is not the typical one; the items' columns, of
-    typical size, stand last in `joined`.
-    """
+    `score` = log evidence at the fitted noise, sizes mixed, + log prior of noise and items.  `data`
+    holds the items' columns at the best of their scales, `scales` (items,).  The noise is fitted
+    from `start`, twice where the best scale is not the typical one; the items' columns, of typical
+    size, stand last in `joined`."""
 
     def __init__(
         self, dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None,
@@ -115,18 +113,14 @@ def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
 
 
 def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ...]) -> Array:
-    """Of the coefficients of the data's columns and of the items'."""
     own = [np.full(item.what.width, 1 / s**2) for item, s in zip(items, scales, strict=True)]
     return np.concatenate([data.precision, *own])
 
 
 def within_bounds(z: Array) -> float:
     """Σ log 2Φ(z) over parameters that cannot be below their nominal value, z = mean/deviation of
-    each above it.
-
-    A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
-    posterior's share of that half, each parameter taken by itself.
-    """
+    each above it.  A compliance's size prior is one half of the Gaussian; the evidence gains or
+    loses by the posterior's share of that half, each parameter taken by itself."""
     return float((np.log(2) + log_ndtr(z)).sum())
 
 
@@ -134,11 +128,9 @@ def _mixed_scales(
     data: NoisyData, weighted: Weighted, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> tuple[tuple[float, ...], float]:
     """The best scale of each item, the others' at theirs, and the evidence with scales mixed.
-
     Scales of different items hardly depend on each other: the log of each one's mean over its
     scales, less its best, adds up.  Only the prior differs from scale to scale: `weighted`, the
-    data with the items' columns, stays.
-    """
+    data with the items' columns, stays."""
     if not items:
         return scales, weighted.factored(data.precision)[1]
     spent = 0.0
@@ -164,10 +156,8 @@ def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
 def _refined(
     dataset: DiagnosisData, chosen: ModelSet, k: int, noise: NoiseValues
 ) -> ModelSet | None:
-    """The same at one noise; None where nothing was searched.
-
-    One setting after the other; where there are several, they go round REFINED_ROUNDS times.
-    """
+    """The same at one noise; None where nothing was searched.  One setting after the other; where
+    there are several, they go round REFINED_ROUNDS times."""
     item = chosen.items[k]
     what = item.what
     if not what.settings:
@@ -200,7 +190,6 @@ def _refined(
 def with_items(
     dataset: DiagnosisData, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> NoisyData:
-    """The data with the items' columns at the given scales."""
     data = dataset.data
     X = np.concatenate([data.X, *(dataset.packed(i.what, i.settings) for i in items)], axis=2)
     return replace(data, X=X, precision=_precision(data, items, scales))
@@ -212,12 +201,10 @@ PLAUSIBLE = 5.0
 
 
 def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[str, str], float]:
-    """d of item k from each other hypothesis that the data could mean instead.
-
-    d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's
-    columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
-    standard deviations.  A rival larger than usual is less probable, but it is no less alike.
-    """
+    """d of item k from each other hypothesis that the data could mean instead.  d² = min over β, γ
+    of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's columns C at its best
+    settings and s = PLAUSIBLE times the widest of the size prior: in standard deviations.  A rival
+    larger than usual is less probable, but it is no less alike."""
     v, data = chosen.signal(k), chosen.beside(k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
@@ -233,7 +220,7 @@ def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[st
 
 def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array:
     """Settings (G, …) at which a rival may imitate an item: those of the search and, where both
-    have the same kind of constant, the item's own, which was refined between them."""
+    have the same kinds of constants, the item's own, which were refined between them."""
     values = dataset.grids.get(rival.key, NO_SETTINGS).values
     kinds, own = ([s.kind for s in what.settings] for what in (rival, item.what))
     within = (
@@ -263,8 +250,8 @@ def settings_of(item: Item) -> dict[str, float]:
 
 def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
     """The nonlinear fit of the model with `items` of the set in it, from the posterior means of
-    its known items' parameters; where one was looked for from many starts, from its columns' own
-    point: its geometry is far from linear."""
+    their parameters; where one was looked for from many starts, from its columns' own point: its
+    geometry is far from linear."""
     model, columns = dataset.base.model, dataset.columns
     about = dict(zip(columns.full.names, columns.x, strict=True))
     start = dict(zip(model.names, dataset.base.x, strict=True))
@@ -292,11 +279,8 @@ ALIKE = 1e-3  # nats: the rounding of two fits must not choose between models th
 
 
 def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
-    """The data under the backlash model that its readings make likelier.
-
-    Where no side of approach is recorded, the cell has play already, or no reading tells the two
-    apart, it stays as it is.
-    """
+    """The data under the backlash model that its readings make likelier.  Where no side of approach
+    is recorded, the cell has play already, or no reading tells the two apart, it stays as it is."""
     model, noise = dataset.base.model, dataset.data.noise
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     if model.cell.model.play_side != BY_BOTH or not play:
@@ -326,12 +310,10 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
 
 def doubt(odds: float, d: Array) -> float:
     """Probability of the less likely of two models: the larger of 1/(1 + exp L) and Φ(−L / √Σ d²).
-
     L are the log odds, d (configurations,) what each adds to the log likelihood ratio.  Both models
     idealise, so that a few configurations may speak loudly for the wrong one; by the test of Vuong
     (1989, Econometrica 57) for models of which none is quite true, their ratio counts against its
-    own scatter.
-    """
+    own scatter."""
     odds, scatter = max(odds, 0.0), max(float(np.linalg.norm(d)), 1e-300)
     return float(max(expit(-odds), ndtr(-odds / scatter)))
 
@@ -351,18 +333,15 @@ def gains(better: NoisyData, other: NoisyData, noise: NoiseValues) -> Array:
 
 @dataclass(frozen=True)
 class Slot:
-    """What could stand in one place of the set, the other items given.
-
-    `options` are candidates with log posterior scores relative to nothing in that place; they
-    hold every hypothesis and block.
-    """
+    """What could stand in one place of the set, the other items given: `items`, every hypothesis
+    and block, with log posterior `scores` relative to nothing there."""
 
     items: tuple[Item, ...]
     scores: Array
 
     def best_of(self, other: Slot) -> Slot:
-        """The same options, each with the higher score: both are bounds from below on what it
-        would be under the noise that suits it best."""
+        """The higher score of each: both bound from below what it would be under the noise that
+        suits it best."""
         higher = other.scores > self.scores
         items = tuple(
             b if up else a for a, b, up in zip(self.items, other.items, higher, strict=True)
@@ -388,12 +367,9 @@ class Slot:
 @dataclass(frozen=True)
 class SelectedEffects:
     """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
-    p-value of the first of them, or else of the likeliest addition, against all that could have
-    been found by chance.
-
-    `dataset` is the one that the set was fitted on: columns about a fit with its large effects.
-    `first` is the scan beside nothing under its own noise, `alone` under the final noise.
-    """
+    p-value of the first of them, or else of the likeliest addition, against all that chance could
+    have found.  The set was fitted on `dataset`: columns about a fit with its large effects.
+    `first` is the scan beside nothing under its own noise, `alone` under the final noise."""
 
     dataset: DiagnosisData
     chosen: ModelSet
@@ -413,11 +389,8 @@ FAR = 2e-4
 
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     """The data about the nonlinear fit with the set's known effects in the model, where one of them
-    is large; else as they are.
-
-    The residual is that of the fitted parameters alone: what the effects explain is put back, so
-    that sets with and without them are judged on the same footing.
-    """
+    is large; else as they are.  What the effects explain is put back into the residual, so that
+    sets with and without them are judged on the same footing."""
     used, whats = ~dataset.data.left_out, [item.what for item in chosen.items]
     direct = {k: h for k, h in enumerate(whats) if isinstance(h, Hypothesis) and not h.driven}
     signals = (chosen.signal(k)[used] for k in direct)
@@ -492,8 +465,6 @@ def left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | No
 
 @dataclass
 class ForwardSelection:
-    """The search's means: data, blocks, flips of signs, and the level of a claim."""
-
     dataset: DiagnosisData
     generic: list[Generic]
     level: float
@@ -558,11 +529,9 @@ class ForwardSelection:
         self._fitted.clear()
 
     def _paying(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
-        """The set without items beside whose others the error of configurations left out of the
-        fit does not fall: a name that does not pay there is none.
-
-        Judged once all are found: beside a large effect that is still missing nothing pays.
-        """
+        """The set without items beside whose others the error of configurations left out of the fit
+        does not fall: a name that does not pay there is none.  Judged once all are found: beside a
+        large effect that is still missing nothing pays."""
         while current.items:
             noise = current.noise.of_instrument()
             together = left_out_together(self.dataset, current)
@@ -590,10 +559,8 @@ class ForwardSelection:
     def _best_addition(
         self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND
     ) -> tuple[ModelSet | None, Slot]:
-        """The best set with one item more (None: none is worth it), and the slot it fills.
-
-        Beside other items it has to be better than the set without it.
-        """
+        """The best set with one item more (None: none is worth it), and the slot it fills.  Beside
+        other items it has to be better than the set without it."""
         # Scores count from the set as it is, under the noise that suits it best.
         base = current.score
         offset = sum(item.log_prior for item in current.items) - base

@@ -130,11 +130,9 @@ UNKNOWN, ANOTHER = 0.05, 0.2
 def log_prior_odds(
     hypotheses: Sequence[Hypothesis], blocks: Sequence[Generic], something: float = SOMETHING
 ) -> Array:
-    """Log prior odds against nothing, of each hypothesis and then of each block.
-
-    Effects are equally probable, and so are the places of one effect; kinds of blocks are equally
-    probable, and so are the blocks of one kind.
-    """
+    """Log prior odds against nothing, of each hypothesis and then of each block.  Effects are
+    equally probable, and so are the places of one effect; kinds of blocks are equally probable, and
+    so are the blocks of one kind."""
     shares: list[float] = []
     for names, whole in (
         ([h.name for h in hypotheses], 1 - UNKNOWN), ([g.kind for g in blocks], UNKNOWN),
@@ -322,8 +320,7 @@ class Grams:
         return self._entries[key]
 
     def of(self, what: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
-        """A block, or a hypothesis at every one of the `settings` (G, …), by default those of the
-        search."""
+        """A block, or a hypothesis at all `settings` (G, …), by default those of the search."""
         dataset = self.dataset
         if isinstance(what, Generic) and what.entry is not None and what.direction is not None:
             return self.entry(what.entry).driven(what.direction[:, :, :, None])
@@ -348,10 +345,8 @@ class Grams:
 
 @dataclass(frozen=True)
 class Item:
-    """One addition: a hypothesis at its settings, or a block without a name.
-
-    `log_prior` is the log of its prior odds, the search over its settings included.
-    """
+    """One addition: a hypothesis at its settings, or a block without a name.  `log_prior` is the
+    log of its prior odds, the search over its settings included."""
 
     what: Hypothesis | Generic
     settings: Array
@@ -371,8 +366,7 @@ class Scan:
     in standard deviations.  `odds` (1 + F,) is the log of the mean evidence over catalogue and
     blocks, weighted by prior, of the readings and of residuals whose configurations had their signs
     flipped, and `covariates` (1 + F,) the largest evidence among the blocks of each; `marginal` the
-    log marginal likelihood of the data beside which they were scored.
-    """
+    log marginal likelihood of the data beside which they were scored."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
@@ -404,5 +398,4 @@ class Scan:
 
     @property
     def chance(self) -> float:
-        """p-value of the odds among those that the flips yield."""
         return exceedance(self.odds[1:], float(self.odds[0]))

@@ -118,8 +118,7 @@ class Hypothesis:
 
     @property
     def bounded(self) -> BoolArray:
-        """Which parameters (k,) cannot be below their nominal value, as no compliance is below
-        zero."""
+        """Which parameters (k,) cannot be below nominal, as no compliance is below zero."""
         return np.array([p.lower == p.nominal for p in self.parameters], dtype=bool)
 
     @property
@@ -132,7 +131,6 @@ class Hypothesis:
         return self.effect.starts(self.where, model.chain, model.cell)
 
     def entry_key(self, model: Model) -> EntryKey:
-        """The entry of the chain that a driven hypothesis acts on."""
         assert isinstance(self.effect, DrivenEffect)
         entry = self.effect.entry_at(self.where)
         return entry.name, self.effect.entered_at(self.where, model.chain)
@@ -227,12 +225,10 @@ CHOICES = (
 
 
 def with_recorded_drivers(model: Model, table: Measurements) -> Model:
-    """The model with effects driven by the best that the table records.
-
-    Growth follows a measured temperature rather than a warm-up curve, and play rests where the
-    last motion left it where that is known.  Effects that the cell has active stay as they are.
-    Where there are no times, what changes once does so between rows, if the poses are in any order.
-    """
+    """The model with effects driven by the best that the table records, but for those that the cell
+    has active: growth follows a measured temperature rather than a warm-up curve, and play rests
+    where the last motion left it where that is known.  Where there are no times, what changes once
+    does so between rows, if the poses are in any order."""
     active = {p.effect for p in model.parameters}
     keys = {
         key: value
@@ -288,11 +284,9 @@ NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
 
 
 def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
-    """Grid of a hypothesis' settings for these visits; one empty point where it has none.
-
-    Of several settings, which are independent, it holds every combination.  Where those are more
-    than MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long.
-    """
+    """Grid of a hypothesis' settings for these visits; one empty point where it has none.  Of
+    several settings, which are independent, it holds every combination.  Where those are more than
+    MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long."""
     axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
     if not axes:
         return NO_SETTINGS
@@ -373,8 +367,7 @@ class StartSearch:
     the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
     equation for the prior of each fitted parameter; `whitening` (N, size, size) divides by the
     noise.  Of the effect's parameters, whose numbers are `own`, the first is the amplitude that the
-    others have no columns without.
-    """
+    others have no columns without."""
 
     def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
         self.full, self.h, self.base, self.x = full, h, base, x
@@ -450,8 +443,7 @@ class StartSearch:
     ) -> dict[str, float]:
         """The start near `best` that leaves the least: least squares with the amplitude solved for
         (variable projection; Golub and Pereyra 1973).  Where the residual, over `noise`, does not
-        ask for another value, a value stays: each is tied to that of `best` by a spread of all.
-        """
+        ask for another value, a value stays: each is tied to that of `best` by a spread of all."""
         keys = list(best)
         width = np.array([np.std([start[key] for start in starts]) for key in keys])
         x0 = np.array([best[key] for key in keys])
@@ -538,12 +530,10 @@ ENTRIES: tuple[Entry, ...] = (
 @dataclass(frozen=True)
 class Columns:
     """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
-
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
-    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,); `shares`
-    are of effects that were looked for from many starts the logarithms of their mean likelihood
-    over all of these relative to that at the best one, which is in x.
-    """
+    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,); `shares` are
+    of effects that were looked for from many starts the logarithms of their mean likelihood over
+    all of these relative to that at the best one, which is in x."""
 
     base: Baseline
     rows: Array
@@ -563,9 +553,7 @@ class Columns:
 
     def torques(self) -> Array:
         """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.
-
-        δq = k τ, so ∂(reading)/∂k = ∂(reading)/∂q · τ.
-        """
+        δq = k τ, so ∂(reading)/∂k = ∂(reading)/∂q · τ."""
         n = self.base.model.chain.n_joints
         tau = np.zeros((len(self.rows), n))
         for i in range(n):
@@ -593,8 +581,7 @@ def compute_columns(
     `found` are parameters of hypotheses that are not at zero, by name.
 
     Deflections enter by eq. (3), the load's torques at the undeflected pose: the columns differ
-    from those of the equilibrium by the ratio of deflection to lever arm, a part in a thousand.
-    """
+    from those of the equilibrium by the ratio of deflection to lever arm, a part in a thousand."""
     table = base.observed.table
     chain, cell = base.model.chain, base.model.cell
     direct = [h for h in hypotheses if not h.driven]
@@ -628,11 +615,9 @@ def compute_columns(
 
 
 class RegressorDirection:
-    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
-
-    The base stands as the cell says; settings of the effect are the cell's where the hypothesis
-    searches none.
-    """
+    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.  The base
+    stands as the cell says; settings of the effect are the cell's where the hypothesis searches
+    none."""
 
     def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
         effect, where = hypothesis.effect, hypothesis.where

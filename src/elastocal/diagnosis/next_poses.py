@@ -201,11 +201,9 @@ def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell
 
 def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
     """The error at new poses that is kept with 95 %, and what the model lacks of it, in m; 0 and
-    that of distances, of which no position follows: the plan's own figures say it.
-
-    That configurations scatter beyond their noise is lack of fit with the probability that
-    something `unknown` is at work; else it is their noise.
-    """
+    that of distances, of which no position follows: the plan's own figures say it.  That
+    configurations scatter beyond their noise is lack of fit with the probability that something
+    `unknown` is at work; else it is their noise."""
     model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
     if observed.kind == "distance":

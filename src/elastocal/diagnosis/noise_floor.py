@@ -49,10 +49,8 @@ def _left_over(data: NoisyData, at: Projection) -> Array:
 
 def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int]:
     """Sum of squares (m²) per axis among repeats of pose, load and marker, and degrees of freedom.
-
     `come_back`: of those for which the arm was elsewhere in between, in the order of times or rows.
-    Readings one after the other, the arm standing still, show the tracker's noise alone.
-    """
+    Readings one after the other, the arm standing still, show the tracker's noise alone."""
     good, observed = ~dataset.data.faulty, dataset.base.observed
     values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
     group = observed.place[good]
@@ -83,10 +81,8 @@ ENOUGH_PAIRS = 8  # that are stated by themselves
 
 
 def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> NearRepeats | None:
-    """Scatter in m per axis among near-repeats, beside the model of `data` at `at`; None without.
-
-    Half the mean square of e_i − e_j over pairs of nearest neighbours, e = r − Xβ̂.
-    """
+    """Scatter in m per axis among near-repeats, beside the model of `data` at `at`; None without:
+    half the mean square of e_i − e_j over pairs of nearest neighbours, e = r − Xβ̂."""
     pairs = near_pairs(dataset, ~data.faulty)
     if not len(pairs):
         return None
@@ -149,11 +145,9 @@ FALSE_SMOOTH = 0.01  # chance that any joint of an arm whose joints only scatter
 
 
 def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Array:
-    """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.
-
-    Functions of several angles add up; what goes with all joints or with the order of measuring
-    holds them.
-    """
+    """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.  Functions
+    of several angles add up; what goes with all joints or with the order of measuring holds
+    them."""
     G = data.masked(data.G)
     J = G.shape[2]
     out = np.zeros(J)
@@ -198,12 +192,10 @@ MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
 
 
 def scatter_beyond(noise: NoiseValues) -> Array:
-    """Variance (joints,) of each joint's scatter beyond what the others let expect.
-
-    The logarithms of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its
-    own spread, so that the others tell what one is to be expected of; beyond its limit any joint of
-    an arm is with a chance of FALSE_SMOOTH.
-    """
+    """Variance (joints,) of each joint's scatter beyond what the others let expect.  The logarithms
+    of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its own spread, so
+    that the others tell what one is to be expected of; beyond its limit any joint of an arm is with
+    a chance of FALSE_SMOOTH."""
     J, usual = len(noise.joint), np.log(REPEATABILITY)
     off = np.log(noise.joint) - usual
     told = (J - 1) / JOINT_SPREAD**2
@@ -223,8 +215,7 @@ class SupportedFloor:
     `best` (m) is the smallest error left at held-out poses, which no noise exceeds.  Repeats and
     near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted variance σ²
     where νs²/σ² is below the χ² quantile; they are then the floor themselves, with what
-    is stated as common to a configuration, which its repeats do not show.
-    """
+    is stated as common to a configuration, which its repeats do not show."""
 
     def __init__(
         self, dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
@@ -261,7 +252,6 @@ class SupportedFloor:
 
     @property
     def told(self) -> NoiseFloor:
-        """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
         (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
         variance = np.diagonal(data.covariance, axis1=1, axis2=2)
         ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
@@ -348,9 +338,7 @@ def each_left_out(P: Array, u: Array) -> Array:
 
 def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
     """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
-
-    Of a pose the position counts, of a distance its one component.
-    """
+    Of a pose the position counts, of a distance its one component."""
     C, M = data.blocks.member.shape
     size = data.blocks.size
     used = ~data.left_out.reshape(C, M, size)[:, :, 0]
@@ -378,11 +366,9 @@ def rms_with_interval(
 def first_steps(
     dataset: DiagnosisData, noise: NoiseValues, rng: np.random.Generator
 ) -> list[BudgetStep]:
-    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.
-
-    By the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
-    effect is that effect, and weights by it would spare it.
-    """
+    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
+    the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
+    effect is that effect, and weights by it would spare it."""
     placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
     # Stage by stage, effects of the later step held at nominal.
@@ -414,10 +400,8 @@ RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray, BoolArray]:
     """The faulty ones (N,) among the readings of `data`, those of `dataset` with what was found
     beside, and suspects (N,) that were kept: too many, or too near each other to be accidents.
-
     Runs of one marker's readings are kept: something happened to it; so are visits all of whose
-    markers are off together, unless repeats contradict them: the flange was elsewhere.
-    """
+    markers are off together, unless repeats contradict them: the flange was elsewhere."""
     base, blocks = dataset.base, dataset.blocks
     readings = linearised(base.model, base.observed, base.x, np.zeros(0, dtype=np.int64))
     r = blocks.unpack(data.r[..., None])
@@ -458,7 +442,7 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
 
 
 def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
-    """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
+    """Suspects (N,) in a row of RUN or more readings of one marker in time."""
     marker_of, out = dataset.table.marker[dataset.lead], np.zeros(len(suspect), dtype=bool)
     for marker in np.unique(marker_of):
         mine = np.flatnonzero(marker_of == marker)

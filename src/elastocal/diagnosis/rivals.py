@@ -46,10 +46,8 @@ Key = tuple[str, str]
 
 
 class RivalSet:
-    """Items of which one is at work, `beside` other items that are.
-
-    `probability` (rivals,) of each given that it is one of them, none below the `smallest`.
-    """
+    """Items of which one is at work, `beside` other items that are.  `probability` (rivals,) of
+    each given that it is one of them, none below the `smallest`."""
 
     def __init__(
         self, rivals: Sequence[Item], probability: Sequence[float], beside: Sequence[Item],
@@ -221,8 +219,7 @@ class Discrimination:
     rivals.  Counted from there come each rival's, at the spans of `columns`, its own first, then
     those with which it may imitate others instead.  `draws`: γ (draws, k) of each rival; `before`
     (rivals, rivals, draws) d² in the data so far; `apart` (rivals, rivals) d by all candidates;
-    `classes` (rivals,): those with the same number even these do not tell apart.
-    """
+    `classes` (rivals,): those with the same number even these do not tell apart."""
 
     def __init__(
         self, dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, candidates: int,
@@ -297,13 +294,10 @@ class Discrimination:
         return np.asarray((weight * bound).sum(axis=(-2, -1)))
 
     def probability(self, squared: Array) -> float:
-        """Of naming the right class, averaged over the right one and its size.
-
-        By the union bound over its rival classes, each as dangerous as its strongest
-        member; not below what naming the likeliest so far gives, which nobody has to give up.
-        While a pair is as near as the verdict calls alike, no odds name one of the two with more
-        than TOO_NEAR_PROBABILITY.
-        """
+        """Of naming the right class, averaged over the right one and its size.  By the union bound
+        over its rival classes, each as dangerous as its strongest member; not below what naming the
+        likeliest so far gives, which nobody has to give up.  While a pair is as near as the verdict
+        calls alike, no odds name one of the two with more than TOO_NEAR_PROBABILITY."""
         p = self.rivals.probability
         of_class = np.bincount(self.classes, p)
         odds = np.log(of_class[self.classes])
@@ -343,11 +337,9 @@ class Discrimination:
 
 
 def _posterior_draws(item: Item, A: Array, b: Array, rng: np.random.Generator) -> Array:
-    """γ (2·DRAWS, k) of a rival as if it were the one at work, antithetic about its estimate.
-
-    γ | data ~ N(mean, (A + I/s²)⁻¹) by its part A (k, k) of S and b (k,) of the readings, at the
-    scale s of the size prior that explains the data best.
-    """
+    """γ (2·DRAWS, k) of a rival as if it were the one at work, antithetic about its estimate.  γ |
+    data ~ N(mean, (A + I/s²)⁻¹) by its part A (k, k) of S and b (k,) of the readings, at the scale
+    s of the size prior that explains the data best."""
     lam, U = np.linalg.eigh(A)
     lam, beta = np.maximum(lam, 0.0), U.T @ b
     each = at_scales(lam[None], beta[None, :, None], item.what.scales)

@@ -98,11 +98,9 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
 
 
 def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
-    """One test per covariate, most telling first; none names an effect.
-
-    The statistic is the largest evidence among the covariate's blocks; its distribution without
-    structure comes from flipping the signs of whole configurations.
-    """
+    """One test per covariate, most telling first; none names an effect.  The statistic is the
+    largest evidence among the covariate's blocks; its distribution without structure comes from
+    flipping the signs of whole configurations."""
     if not (each := observed.covariates):
         return ()
     odds = {covariate: float(own[0]) for covariate, own in each.items()}
@@ -141,7 +139,6 @@ class FewAnswer(SumAnswer):
 
     @cached_property
     def rivals(self) -> tuple[Rivals, ...]:
-        """Of each item of the chosen set."""
         return tuple(rivals_of(self.selected, k) for k in range(len(self.selected.chosen.items)))
 
     @property
@@ -338,8 +335,8 @@ OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the re
 
 
 def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
-    """Every hypothesis with its probability: in the slot where it is likeliest.  Last those that
-    the data do not show at their typical size and do not ask for: they have their prior alone."""
+    """Every hypothesis with its probability, in the slot where it is likeliest.  Last come those
+    that the data do not show at typical size and do not ask for: they have their prior alone."""
     found = few.selected
     best: dict[tuple[str, str], Candidate] = {}
     alone = zip(dataset.hypotheses, found.alone.distance.tolist(), strict=False)
@@ -430,7 +427,6 @@ def unheard_of(found: Sequence[FoundEffect], model: Model) -> dict[str, tuple[st
 
 
 def confirm(far: Mapping[str, tuple[str, float]]) -> Iterator[str]:
-    """What to do about causes that are unheard of."""
     if far:
         each = [f"{name} ({rounded(times, 2)} times)" for name, (_, times) in far.items()]
         yield (
