@@ -201,8 +201,6 @@ def prior_deviations(base: Baseline) -> Array:
     return np.where(is_placed(base.model), PLACED, wide)
 
 
-# Large tables are looked at in part: what more readings would add is time and memory.
-
 # Evidence grows with the readings, and an effect worth finding has hundreds of nats in so many.
 MOST_ROWS = 12_000
 # The same of poses: curves and fields have a thousand columns.  Identified from all poses, a cell
@@ -236,8 +234,6 @@ def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measuremen
         f"{min(len(order), wanted)} of {len(order)} configurations, evenly spaced"
     )
 
-
-# Models that are derived from another one, kept for as long as that one is.
 
 MOST = 12  # models that are kept of each; those asked for last
 

@@ -273,8 +273,6 @@ class SumAnswer:
         Y, W = at.H @ D, np.linalg.inv(D.T @ D)
         return at.P + Y @ W @ Y.transpose(0, 2, 1), at.u + Y @ (W @ at.beta[index])
 
-    # Shares.
-
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first; none for what hardly
@@ -318,8 +316,6 @@ class SumAnswer:
             if own := key(c):
                 groups.setdefault(own, []).append(k)
         return groups
-
-    # How far the gap falls.
 
     @cached_property
     def _true(self) -> Array:
@@ -368,8 +364,6 @@ class SumAnswer:
     def _mistimed(self, k: int) -> Array | float:
         """Mean square in m² by which new readings err for the moment of a change alone."""
         return 0.0
-
-    # Names.
 
     @cached_property
     def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
@@ -585,8 +579,6 @@ class SumAnswer:
             yield FittedParameter(
                 f"{c.where}.{p.key}", float(p.nominal + m * size), p.unit, float(s * size)
             )
-
-    # The budget, and shapes.
 
     def budget(self, first: Sequence[BudgetStep]) -> tuple[BudgetStep, ...]:
         steps: list[BudgetStep] = list(first)

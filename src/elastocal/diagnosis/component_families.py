@@ -71,9 +71,6 @@ def moved(dataset: DiagnosisData, key: EntryKey, D: Array) -> Array:
     return dataset.pack(dataset.columns.entry(key) @ D)
 
 
-# What is tried from the start: a curve of every joint, and every effect that needs no search.
-
-
 def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
     effect, model = JointCurve(), dataset.base.model
     joints = turning_joints(model.chain)
@@ -138,8 +135,6 @@ def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Componen
         return None
     return field_component(dataset, c.where, "time", share)
 
-
-# Smooth fields.
 
 FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
 # What a drift's shortest length is divided by where it is not short enough, the least share of a

@@ -412,8 +412,6 @@ def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
     return score
 
 
-# What else could stand in a component's place, the others given.
-
 WIDE = np.exp(np.linspace(-3.0, 5.0, 9))  # sizes that are tried, in typical ones
 
 

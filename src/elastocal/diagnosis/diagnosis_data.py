@@ -295,11 +295,7 @@ def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     return waves, common
 
 
-# Dependences without a name: any place moves smoothly with anything that was recorded.
-
 UNKNOWN_EFFECT = "unknown_effect"  # the name of all that has none
-
-# What an unknown effect may depend on: angles, time, torque, load, direction, force, view.
 
 WAVES, FEW_WAVES = 8, 3  # functions of a smooth dependence, and of one in a product
 

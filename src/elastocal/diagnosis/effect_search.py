@@ -35,8 +35,6 @@ from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, IntArray
 
-# A set of additions to the model: its noise, its evidence, its estimates, its imitators.
-
 REFINED_ROUNDS = 3  # of settings that depend on each other
 
 
@@ -195,8 +193,6 @@ def with_items(
     return replace(data, X=X, precision=_precision(data, items, scales))
 
 
-# Which other effects would look the same in these poses: what no size of noise can tell apart.
-
 PLAUSIBLE = 5.0
 
 
@@ -243,9 +239,6 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
 
 def settings_of(item: Item) -> dict[str, float]:
     return {s.key: float(v) for s, v in zip(item.what.settings, item.settings, strict=True)}
-
-
-# Estimates of a set: what its columns stand for, and the fit of the model with them in it.
 
 
 def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
@@ -328,9 +321,6 @@ def gains(better: NoisyData, other: NoisyData, noise: NoiseValues) -> Array:
     return np.asarray((squares[0] - squares[1]) / 2)
 
 
-# What a search found: the set, what else could stand in each of its places, and the odds.
-
-
 @dataclass(frozen=True)
 class Slot:
     """What could stand in one place of the set, the other items given: `items`, every hypothesis
@@ -379,8 +369,6 @@ class SelectedEffects:
     first: Scan
     alone: Scan
 
-
-# Columns anew at the nonlinear fit with a large effect in it, before anything else is sought.
 
 # Rms signal in m beyond which the products of an effect with the fitted parameters, which it
 # moves by a tenth or so, are no longer small beside the noise.

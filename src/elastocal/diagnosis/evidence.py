@@ -120,8 +120,6 @@ def evidence_of_groups(
     return best.tolist()
 
 
-# Prior probabilities, fixed before any data: nothing, something unknown, or a known effect.
-
 # SOMETHING that anything is missing; of that a twentieth that the catalogue lacks it.
 # A second effect beside a first is rarer.
 UNKNOWN, ANOTHER = 0.05, 0.2
@@ -338,9 +336,6 @@ class Grams:
         D = self.dataset.direction(what, settings)
         A, b = self.entry(what.entry_key(self.dataset.base.model)).products(D)
         return np.asarray(np.linalg.solve(A + np.eye(what.width) / scale**2, b[..., :1]))[..., 0]
-
-
-# Everything that may be missing, scored under one noise.
 
 
 @dataclass(frozen=True)

@@ -32,8 +32,6 @@ from elastocal.planning.poses import draw
 from elastocal.simulation import simulate
 from elastocal.units import Array, BoolArray, Progress
 
-# What may be measured next: poses in all load states, from any side, at once or later.
-
 CANDIDATES = 256
 NEWTON = 1.0  # forces are told apart to this
 RARE = 0.1  # share of the visits below which a load state is not asked for again
@@ -203,9 +201,6 @@ def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
     return math.prod(c.probability(c.squared(chosen)) for c in tasks)
 
 
-# The extra visits as one would make them: a short way through the poses, all loads at each.
-
-
 def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements) -> Measurements:
     """One row per visit of the chosen candidates, after the campaign of `table`: what is to be
     measured later comes later, otherwise the nearest pose in joint space is next.  A pose is
@@ -235,8 +230,6 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
         time=time,
     )  # fmt: skip
 
-
-# The plan, and what to do besides measuring it, in words.
 
 # What a plan can aim at, and from which probability it goes without saying that one is at work.
 MOST_CERTAIN, MOSTLY = 0.99, 0.9

@@ -205,8 +205,6 @@ def recorded(table: Measurements, need: str) -> bool:
     return values is not None and bool(np.any(values != values[:1]))
 
 
-# What the table records decides how some effects are driven.
-
 # Effects of the last move that take it from the order of the visits.
 BY_LAST_MOVE = tuple(
     name for name, effect in CATALOGUE.items()
@@ -254,8 +252,6 @@ def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     changes = any(s.kind == "change_time" for n in names for s in CATALOGUE[n].constants)
     return keys | {"clock": spec.clock} if changes and spec.clock != "column" else keys
 
-
-# Where an effect's constants are searched: change times, time constants, orders, ranges.
 
 CHANGE_TIMES = 120  # at most; more moments are refined after the search
 TIME_CONSTANTS = 8
@@ -518,8 +514,6 @@ class StartSearch:
         explained = C.T @ self._unexplained
         return self._unexplained @ self._unexplained - explained**2, explained / size, C
 
-
-# Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
 
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
 ENTRIES: tuple[Entry, ...] = (

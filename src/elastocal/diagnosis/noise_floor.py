@@ -307,9 +307,6 @@ def mean_square(data: NoisyData, packed: Array) -> float:
     return float(squares.sum() / count.sum())
 
 
-# Errors on configurations, or blocks of time, left out of the fit, in closed form.
-
-
 def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
     """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
 
@@ -350,8 +347,6 @@ def left_out_square(data: NoisyData, noise: NoiseValues, together: IntArray | No
     """Mean square (m²) of the 3-D error of a reading whose configuration was left out."""
     return mean_square(data, left_out_residual(project(data, noise), together))
 
-
-# How the error at poses left out of the fit falls, step by step, and how sure that is.
 
 NEW_POSES = 100  # in the set that the intervals of a reduction are for
 

@@ -44,8 +44,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray
 
-# From scores to an answer: explained, ambiguous, unknown, or nothing significant.
-
 SET = 0.95  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
@@ -94,9 +92,6 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
     return tuple((slot.items[i], float(p[i])) for i in chosen)
 
 
-# What the residual depends on, whatever the effect.
-
-
 def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     """One test per covariate, most telling first; none names an effect.  The statistic is the
     largest evidence among the covariate's blocks; its distribution without structure comes from
@@ -111,8 +106,6 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     ]
     return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
 
-
-# The shape of a dependence that has no name: the motion as a function of the covariate.
 
 MOST_CURVES = 3
 TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
@@ -324,8 +317,6 @@ def beside_unknown(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
     """Names beside something without a name, which may be part of its imitation."""
     return tuple(replace(f, probability=min(f.probability, TOO_NEAR_PROBABILITY)) for f in effects)
 
-
-# Everything that was tried, best first; what could not be tested; what to beware of.
 
 DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the data
 STATED_LOW, STATED_HIGH = 0.67, 1.5
