@@ -185,8 +185,7 @@ PLACED = 0.1
 
 def from_centre(base: Baseline) -> Array:
     """How far (parameters,) the fit is from the prior's centre: nominal, or where registration
-    placed it.  An unmodelled effect bends parameters that little else holds; they must be free to
-    return."""
+    placed it.  An unmodelled effect bends what little else holds; it must be free to return."""
     return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
 
 

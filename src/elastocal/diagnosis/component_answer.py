@@ -241,8 +241,7 @@ class SumAnswer:
     def _not_paying(self) -> dict[tuple[str, str], float]:
         """Named effects at their places without which configurations that are left out of the fit
         are predicted better, or worse by less than PAYS: by how many standard errors worse.  The
-        one that matters least is judged first, and stays out then: of two that say the same, one
-        remains."""
+        one that matters least is judged first and stays out: of two alike, one remains."""
         gone: list[int] = []
         out: dict[tuple[str, str], float] = {}
         free = {k for k, c in enumerate(self.found.components) if c.named and not c.given}

@@ -382,9 +382,8 @@ MOST_FOUND = MOST_LINES - 3
 def _best_family(
     grams: Grams, h: Hypothesis, m: int, now: float
 ) -> tuple[float, tuple[float, int, float, float]]:
-    """What the best family of m lines of a joint gains, and its order, m, how well these data know
-    the order, and what finding it cost; `now` is the log marginal likelihood of the sum as it is.
-    """
+    """What the best family of m lines of a joint gains, its order, m, how well these data know the
+    order, and what finding it cost; `now` is the log marginal likelihood of the sum as it is."""
     step = STEP * _apart(grams.dataset, h.where) / m
     orders = np.arange(LOWEST, HIGHEST / m, step)
     # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.

@@ -178,14 +178,12 @@ def _with_lines_first(growth: Growth, found: FittedSum, instrument: NoiseValues)
 
 
 def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
-    """The data about where the sum has the arm's own parameters and the weights of its links.
-
-    Not about a fit of these alone: a compliance that little else holds, and the moment that
-    deflects its joint, would take up what the other components explain, and the product of both
-    stand in the columns.  Nor do weights stand in the columns of the compliances: twice as soft an
-    arm under half the load would look like one that bends by its weight.  Of one kind all are of
-    one size here: the eccentricity of a joint, which looks like its sag, must not take the weights.
-    """
+    """The data about where the sum has the arm's own parameters and the weights of its links.  Not
+    about a fit of these alone: a compliance that little else holds, and the moment that deflects
+    its joint, would take up what the other components explain, and the product of both stand in the
+    columns.  Nor do weights stand in the columns of the compliances: twice as soft an arm under
+    half the load would look like one that bends by its weight.  Of one kind all are of one size
+    here: the eccentricity of a joint, which looks like its sag, must not take the weights."""
     sizes = found.sizes.size.copy()
     for _, kind in found.sums.pool.kinds:
         sizes[kind] = np.median(sizes[kind])

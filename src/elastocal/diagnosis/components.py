@@ -115,8 +115,7 @@ class Component:
 
     @property
     def scalings(self) -> Array:
-        """What makes its columns ones of equal prior variance (L, k), of a smooth function at L
-        lengths."""
+        """Scalings (L, k) that give its columns equal prior variances, at L lengths if smooth."""
         lengths = [0.0] if self.waves is None else np.linspace(*self.lengths, 3)
         return np.sqrt([self.shares(v)[0] for v in lengths])
 
@@ -350,8 +349,7 @@ class SumOfComponents:
 
     def earned(self, at: Standardised) -> tuple[Array, Array]:
         """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
-        (K,) is due to coefficients that cannot be negative, by the posterior's share of that half.
-        """
+        (K,) is due to coefficients that cannot be negative: the posterior's share of that half."""
         inverse, within = at.covariance, np.zeros(len(self.components))
         for k, span in enumerate(self.spans):
             i = np.arange(span.start, span.stop)[self.components[k].bounded]

@@ -91,8 +91,7 @@ def write_extended_cell(
     is left to be chosen for a plan.  Comments are not carried over.  Without effects the model is
     the one that was read.
 
-    Raises InputError where `source` is no valid cell file or `target` cannot be written.
-    """
+    Raises InputError where `source` is no valid cell file or `target` cannot be written."""
     source, target = Path(source), Path(target)
     cell = read_cell(source)
     data = {"name": cell.name} | read_toml(source, "cell file")
@@ -151,8 +150,7 @@ class DiagnosisOptions:
 
     `false_alarm`: probability that something is claimed where nothing is, for the whole family of
     hypotheses.  `without`: effects taken out of the catalogue.  `seed`: of the sign flips and of
-    the draws behind intervals.
-    """
+    the draws behind intervals."""
 
     seed: int = 0
     without: tuple[str, ...] = ()
@@ -188,8 +186,7 @@ def diagnose(
     marginal likelihood; what is claimed has to beat the whole family under sign flips.
 
     Raises InputError for data that contradict robot or cell, InsufficientDataError where there
-    are too few configurations to tell an effect from noise.
-    """
+    are too few configurations to tell an effect from noise."""
     options = options or DiagnosisOptions()
     found = _diagnosed(model, table, options, progress)
     assert found.calibrated is not None

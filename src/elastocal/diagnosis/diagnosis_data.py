@@ -146,8 +146,7 @@ class DiagnosisData:
 
     @cached_property
     def moments(self) -> Array:
-        """Every moment at which something may have changed between two visits; none without
-        times."""
+        """Moments between visits at which something may have changed, if times are known."""
         time = self.visits.time
         return np.zeros(0) if time is None else moments_between(time)
 

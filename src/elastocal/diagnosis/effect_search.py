@@ -141,9 +141,8 @@ def _mixed_scales(
 
 
 def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
-    """Item k's settings refined between the grid's points, at the set's noise; and, where its wrong
-    settings may have made joints scatter from pose to pose, at one with no more of that than usual.
-    """
+    """Item k's settings refined between the grid's points, at the set's noise; and, where wrong
+    settings may have made joints scatter from pose to pose, at one with no more than usual."""
     noise = chosen.noise
     quiet = replace(noise, shared=np.minimum(noise.shared, SHARED))
     tried = [noise, quiet] if (noise.shared > 2 * SHARED).any() else [noise]

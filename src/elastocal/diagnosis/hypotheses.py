@@ -610,8 +610,7 @@ def compute_columns(
 
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.  The base
-    stands as the cell says; settings of the effect are the cell's where the hypothesis searches
-    none."""
+    stands as the cell says; so do the effect's settings where none is searched."""
 
     def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
         effect, where = hypothesis.effect, hypothesis.where

@@ -76,8 +76,7 @@ class NextPoses(Result):
 
     @property
     def doubts(self) -> tuple[tuple[str, str, float], ...]:
-        """What it may lack besides, or instead: effect, place and probability, the likeliest
-        first."""
+        """What it may lack besides, or instead: effect, place and probability, likeliest first."""
         found = {(f.effect, f.where) for f in self.found}
         every = () if self.diagnosis is None else self.diagnosis.candidates
         likely = ((c.effect, c.where, c.probability) for c in every if c.probability > DOUBT)

@@ -146,8 +146,7 @@ FALSE_SMOOTH = 0.01  # chance that any joint of an arm whose joints only scatter
 
 def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Array:
     """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.  Functions
-    of several angles add up; what goes with all joints or with the order of measuring holds
-    them."""
+    of several angles add up; what goes with all joints or with the order holds them."""
     G = data.masked(data.G)
     J = G.shape[2]
     out = np.zeros(J)
@@ -309,12 +308,8 @@ def mean_square(data: NoisyData, packed: Array) -> float:
 
 def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
     """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
-
     `together` (C,) numbers the group that each is left out with; by itself where None.  For a
-    group, with V and H of its configurations,
-
-        P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
-    """
+    group, with V and H of its configurations, P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u."""
     if together is None:
         return each_left_out(at.P, at.u)
     Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
