@@ -103,15 +103,6 @@ class Blocks:
         out[:, place, :, place, :] = padded.transpose(1, 0, 2, 3)
         return out.reshape(C, M * self.size, M * self.size)
 
-    def unpack_square(self, packed: Array) -> Array:
-        """Diagonal blocks (N, size, size) of (C, M·size, M·size)."""
-        C, M = self.member.shape
-        place = np.arange(M)
-        own = packed.reshape(C, M, self.size, M, self.size)[:, place, :, place, :]
-        rows = np.empty((self.n + 1, self.size, self.size))
-        rows[self.member.T.ravel()] = own.reshape(M * C, self.size, self.size)
-        return rows[:-1]
-
     @property
     def absent(self) -> BoolArray:
         """Rows (C, M·size) that hold no observation."""
@@ -356,8 +347,7 @@ class NoisyData:
     @property
     def mean_variance(self) -> float:
         """Of the readings, as stated, or its shape."""
-        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
-        return float(variances[~self.left_out].mean())
+        return float(np.diagonal(self.covariance, axis1=1, axis2=2)[~self.left_out].mean())
 
     def masked(self, packed: Array) -> Array:
         """Rows that do not count set to zero (C, m, …)."""

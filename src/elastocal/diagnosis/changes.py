@@ -405,8 +405,7 @@ def _whitener(V: Array, least: float) -> tuple[Array, BoolArray]:
     of the correlations below `least`, which stands in its place."""
     rho, unit = correlations(V)
     value, axes = np.linalg.eigh(rho)
-    white = axes.T / unit / np.sqrt(np.maximum(value, least))[:, None]
-    return white, np.asarray(value < least)
+    return axes.T / unit / np.sqrt(np.maximum(value, least))[:, None], np.asarray(value < least)
 
 
 def _tested(

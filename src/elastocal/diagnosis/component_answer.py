@@ -154,17 +154,7 @@ class SumAnswer:
         kept: IntArray = np.flatnonzero(np.isin(rows, some))
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
-        times = self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
-        return kept, times
-
-    def _of_new_poses(self, left: Array) -> Array:
-        """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
-        kept, times = self._poses
-        rows = np.nonzero(self._rows)[0][kept]
-        starts = np.flatnonzero(np.diff(rows, prepend=-1))
-        each = np.add.reduceat(left**2, starts, axis=0)
-        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
-        return np.asarray((times * each).sum(axis=0) / (times * count[:, None]).sum(axis=0))
+        return kept, self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
@@ -338,8 +328,14 @@ class SumAnswer:
 
     def _error_without(self, gone: Sequence[int]) -> Array:
         """Mean square (draws,) in m² by which new poses err with these in no model."""
-        predicted = self._predicted(*self._fitted_without(gone))
-        return self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
+        left = self._predicted(*self._fitted_without(gone))[:, None] - self._true  # (rows, draws)
+        kept, times = self._poses
+        rows = np.nonzero(self._rows)[0][kept]
+        starts = np.flatnonzero(np.diff(rows, prepend=-1))
+        each = (times * np.add.reduceat(left**2, starts, axis=0)).sum(axis=0)
+        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
+        each /= (times * count[:, None]).sum(axis=0)
+        return np.asarray(each + self.supported.unexplained**2)
 
     @cached_property
     def _error(self) -> Array:

@@ -492,8 +492,7 @@ def family_component(
         settings |= {f"order_{k}": k * order, f"order_sd_{k}": k * sd}
     # The cell with these constants is all that their direction asks of a model.
     chain, cell = dataset.base.model.chain, dataset.base.model.cell
-    spec = replace(cell.model, nominal=cell.model.nominal.at(where, settings))
-    cell = replace(cell, model=spec)
+    cell = replace(cell, model=replace(cell.model, nominal=cell.model.nominal.at(where, settings)))
     lines = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
     D = RegressorDirection(lines, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
     D = D * [LINE * (p.typical or 0.0) for p in lines.parameters]
@@ -550,8 +549,7 @@ class OrderPosterior:
         self.multiples = np.repeat(MULTIPLES, [len(part) for part in grid])
         fellows = [family for where, family in families_of(found).items() if where != h.where]
         mean, variance = alike(np.array([size for *_, size in fellows]), 0.0, ALONE)
-        spread = np.sqrt(variance) * ndtri((np.arange(SIZES) + 0.5) / SIZES)
-        self.scales = np.exp(mean + spread)
+        self.scales = np.exp(mean + np.sqrt(variance) * ndtri((np.arange(SIZES) + 0.5) / SIZES))
         n, k = len(turning_joints(dataset.base.model.chain)), len(fellows)
         self.presence = presence_cost(n, k) - presence_cost(n, k + 1)
         # What is not known of its lines counts as scatter of the joint.

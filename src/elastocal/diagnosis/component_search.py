@@ -198,8 +198,7 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     for c, span in zip(found.components, found.spans, strict=True):
         if (h := c.hypothesis) is not None and isinstance(c.effect, LinkWeights):
             weights.append(h)
-            moved = beta[span] * dataset.sizes[h.key]
-            keyed = zip(h.parameters, moved, strict=True)
+            keyed = zip(h.parameters, beta[span] * dataset.sizes[h.key], strict=True)
             x |= {f"{h.where}.{p.key}": p.nominal + m for p, m in keyed}
     model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in weights])
     at_sum = np.array([x[name] for name in model.names])
@@ -473,8 +472,7 @@ def evidence_beside(
     """Log evidence of each component beside the sum, of a smooth one at its best length; or times
     its `scalings`."""
     scalings = scalings or [c.scalings for c in components]
-    left = Beside(found, [c.columns for c in components]).left
-    return evidence_of_groups(left, scales, scalings)
+    return evidence_of_groups(Beside(found, [c.columns for c in components]).left, scales, scalings)
 
 
 def imitators(
@@ -623,8 +621,7 @@ def with_own_axes(found: FittedSum) -> FittedSum:
                        for c in (data.covariance, V))  # fmt: skip
     if own_axes > equal - 2 * cost:
         return found
-    other = replace(data, covariance=V)
-    return fit_sum(other, found.components, found.noise, found.sizes)
+    return fit_sum(replace(data, covariance=V), found.components, found.noise, found.sizes)
 
 
 AXES = 0.5  # spread of the logarithms of an instrument's noise along its axes

@@ -437,8 +437,7 @@ class FittedSum:
         """The data beside all but some of the components, these by the directions that show: half
         as many columns, for searches."""
         every = zip(self.components, self._shown, strict=True)
-        columns = [shown for c, shown in every if c not in some]
-        joined = side_by_side(self.sums.data, columns)
+        joined = side_by_side(self.sums.data, [shown for c, shown in every if c not in some])
         return self.sums.data.with_columns(joined, np.ones(joined.shape[2]))
 
 

@@ -23,6 +23,7 @@ from elastocal.diagnosis.component_search import (
     compared_score,
     hidden_fellows,
     search_components,
+    sum_of,
 )
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
@@ -93,8 +94,7 @@ def write_extended_cell(
 
     Raises InputError where `source` is no valid cell file or `target` cannot be written."""
     source, target = Path(source), Path(target)
-    cell = read_cell(source)
-    data = {"name": cell.name} | read_toml(source, "cell file")
+    data = {"name": read_cell(source).name} | read_toml(source, "cell file")
     # The real folders: ".." of a link to a folder is not where the link stands.
     data = _redirected(data, source.parent, os.path.realpath(target.parent))
     model = data.setdefault("model", {}) if found else {}
@@ -232,7 +232,8 @@ def _diagnosed(
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
     dataset, found, suspects = _searched(dataset, options, progress)
-    few = FewAnswer.of(dataset, found, np.random.default_rng(options.seed))
+    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
+    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
     tests, answer = structure_tests(found.first), whole or few

@@ -593,8 +593,7 @@ def _found(f: FoundEffect) -> dict[str, Any]:
     def told(p: FittedParameter) -> dict[str, Any]:
         if math.isinf(p.std):
             return vars(p) | {"value": None, "ci95": None}
-        ends = [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
-        return vars(p) | {"ci95": ends}
+        return vars(p) | {"ci95": [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]}
 
     return vars(f) | {"parameters": [told(p) for p in f.parameters]}
 

@@ -404,8 +404,7 @@ def waves(x: Array, present: BoolArray, count: int) -> Array:
 
 def monomials(x: Array) -> Array:
     """The components of x (n, 3) and their products, without the constant."""
-    several = range(x.shape[1])
-    products = [x[:, [i]] * x[:, [j]] for i in several for j in range(i + 1)]
+    products = [x[:, [i]] * x[:, [j]] for i in range(x.shape[1]) for j in range(i + 1)]
     return np.concatenate([x, *products], axis=1)
 
 

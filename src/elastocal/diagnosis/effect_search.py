@@ -494,7 +494,8 @@ class ForwardSelection:
             current = best
             slots.append(slot)
             if (anew := relinearised(self.dataset, current)) is not self.dataset:
-                self._turn_to(anew)
+                self.dataset = anew
+                self._fitted.clear()  # what was fitted about another fit is void
                 current = ModelSet(anew, current.items, current.noise)
             if len(current.items) > 1:
                 current, slots = self._reexamined(current, slots)
@@ -509,11 +510,6 @@ class ForwardSelection:
             self.dataset = dataset
         slots = slots or [start]
         return SelectedEffects(self.dataset, current, tuple(slots), p, nothing, first, alone)
-
-    def _turn_to(self, dataset: DiagnosisData) -> None:
-        """What was fitted about another fit is void."""
-        self.dataset = dataset
-        self._fitted.clear()
 
     def _paying(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
         """The set without items beside whose others the error of configurations left out of the fit

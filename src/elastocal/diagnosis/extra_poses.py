@@ -188,7 +188,7 @@ def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -
     `enough`; `most` where fewer do not reach it."""
     chosen: list[int] = []
     while len(chosen) < min(most, len(tasks[0].pool)):
-        error = np.sum([c.error_bound(c.squared_with_each(chosen)) for c in tasks], axis=0)
+        error = np.sum([c.errors_with_each(chosen) for c in tasks], axis=0)
         error[chosen] = np.inf
         chosen.append(int(np.argmin(error)))
         if expected(tasks, chosen) >= enough:

@@ -199,8 +199,7 @@ def recorded(table: Measurements, need: str) -> bool:
         # arm reaches.
         points = table.position[:, :2]
         middle = points.mean(axis=0)
-        farthest = np.linalg.norm(points - middle, axis=1).max()
-        return bool(np.linalg.norm(middle) >= farthest)
+        return bool(np.linalg.norm(middle) >= np.linalg.norm(points - middle, axis=1).max())
     values = getattr(table, need)
     return values is not None and bool(np.any(values != values[:1]))
 
@@ -459,8 +458,7 @@ class StartSearch:
 
     def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """The amplitude's (rows, size, starts), by the whole model at each start."""
-        each = [self._amplitude(start, self.part.table)[1] for start in starts]
-        return np.stack(each, axis=2)
+        return np.stack([self._amplitude(start, self.part.table)[1] for start in starts], axis=2)
 
     def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
         """(rows, starts)."""
@@ -637,6 +635,5 @@ class RegressorDirection:
     def __call__(self, table: Measurements, settings: Array) -> Array:
         """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
         G, n = len(settings), len(table)
-        asked = np.repeat(self.asked(table), G, axis=0)
-        D = self._compiled(asked, np.tile(settings, (n, 1)))[0]
+        D = self._compiled(np.repeat(self.asked(table), G, axis=0), np.tile(settings, (n, 1)))[0]
         return np.asarray(D.reshape(n, G, *D.shape[1:]))

@@ -229,5 +229,4 @@ def with_effects_of(model: Model, why: Diagnosis) -> Model:
     spec = replace(model.cell.model, **why.model_keys)  # type: ignore[arg-type]
     for f in why.effects:
         spec = spec.with_effect(f.effect, f.where, f.settings, f.sizes)
-    cell = replace(model.cell, model=spec)
-    return Model.assembled(model.chain, cell) if why.effects else model
+    return Model.assembled(model.chain, replace(model.cell, model=spec)) if why.effects else model

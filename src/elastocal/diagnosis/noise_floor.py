@@ -197,8 +197,7 @@ def scatter_beyond(noise: NoiseValues) -> Array:
     a chance of FALSE_SMOOTH."""
     J, usual = len(noise.joint), np.log(REPEATABILITY)
     off = np.log(noise.joint) - usual
-    told = (J - 1) / JOINT_SPREAD**2
-    known = told + 1 / REPEATABILITY_SPREAD**2
+    known = (J - 1) / JOINT_SPREAD**2 + 1 / REPEATABILITY_SPREAD**2
     others = (off.sum() - off) / JOINT_SPREAD**2 / known
     spread = np.sqrt(JOINT_SPREAD**2 + 1 / known)
     limit = np.exp(usual + others - float(special.ndtri(FALSE_SMOOTH / J)) * spread)
@@ -254,10 +253,9 @@ class SupportedFloor:
         (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
         variance = np.diagonal(data.covariance, axis1=1, axis2=2)
         ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
-        variance = variance[~data.left_out]
         # Those left out have their error against the fit to the others.
-        e, stated = _left_over(data, self.at), data.blocks.unpack_square(data.covariance)
-        sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
+        e, stated = _left_over(data, self.at), data.blocks.unpack(variance[..., None])[:, :, 0]
+        sigma, variance = noise.factor * np.sqrt(stated), variance[~data.left_out]
         table, gone = dataset.table, np.flatnonzero(data.faulty)
         faulty = tuple(
             FaultyReading(

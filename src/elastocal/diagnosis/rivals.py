@@ -109,8 +109,7 @@ def rival_sets(so_far: DiagnosisData, noise: NoiseValues, diagnosis: Diagnosis) 
         free = sorted((k for k in items if k not in found), key=lambda k: -chance[k])[:MOST_KNOWN]
         known = [k for n, k in enumerate(free) if n < FEWEST_KNOWN or chance[k] >= CHANCE]
         rivals, p = blocks + [items[k] for k in known], p + [chance[k] for k in known]
-        at_work = [items[k] for k in found]
-        sets.append(RivalSet(rivals, p, at_work, LEAST_PROBABILITY_UNKNOWN))
+        sets.append(RivalSet(rivals, p, [items[k] for k in found], LEAST_PROBABILITY_UNKNOWN))
     return sets
 
 
@@ -260,11 +259,6 @@ class Discrimination:
         candidates; zero of a rival with itself."""
         return self._squared_by(eliminated(self._gram(chosen), self.nuisance))
 
-    def squared_with_each(self, chosen: Sequence[int]) -> Array:
-        """d² (N, rivals, rivals, draws) with each candidate added to those chosen."""
-        each = self._gram(chosen) + self.pool.transpose(0, 2, 1) @ self.pool
-        return self._squared_by(eliminated(each, self.nuisance))
-
     def _squared_by(self, S: Array) -> Array:
         n = len(self.draws)
         out = np.zeros((*S.shape[:-2], n, n, 2 * DRAWS))
@@ -280,18 +274,15 @@ class Discrimination:
             out[..., a, b, :] = np.maximum(np.min(each, axis=0), 0.0)
         return out
 
-    def gained(self, squared: Array) -> Array:
-        """δ² (…, rivals, rivals, draws)."""
-        return np.maximum(squared - self.before, 0.0)
-
-    def error_bound(self, squared: Array) -> Array:
-        """(…,) Σ_ab √(p_a p_b) E exp(−δ²_ab/8): Chernoff's bound of the pairs' errors, whose
-        largest term is that of the closest pair, and which is smooth where Φ is flat."""
-        p = self.rivals.probability
-        other = self.classes[:, None] != self.classes[None, :]
-        weight = np.sqrt(p[:, None] * p[None, :]) * other
-        bound = np.exp(-self.gained(squared) / 8).mean(axis=-1)
-        return np.asarray((weight * bound).sum(axis=(-2, -1)))
+    def errors_with_each(self, chosen: Sequence[int]) -> Array:
+        """Σ_ab √(p_a p_b) E exp(−δ²_ab/8) with each of the candidates (N,) added to those chosen:
+        Chernoff's bound of the pairs' errors, whose largest term is that of the closest pair, and
+        which is smooth where Φ is flat."""
+        each = self._gram(chosen) + self.pool.transpose(0, 2, 1) @ self.pool
+        squared = self._squared_by(eliminated(each, self.nuisance))
+        p, other = self.rivals.probability, self.classes[:, None] != self.classes[None, :]
+        bound = np.exp(-np.maximum(squared - self.before, 0.0) / 8).mean(axis=-1)
+        return np.asarray((np.sqrt(p[:, None] * p[None, :]) * other * bound).sum(axis=(-2, -1)))
 
     def probability(self, squared: Array) -> float:
         """Of naming the right class, averaged over the right one and its size.  By the union bound
@@ -302,7 +293,7 @@ class Discrimination:
         of_class = np.bincount(self.classes, p)
         odds = np.log(of_class[self.classes])
         L = (odds[:, None] - odds[None, :])[..., None]
-        delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
+        delta = np.sqrt(np.maximum(squared - self.before, 1e-12))
         beaten = special.ndtr(-(L + delta**2 / 2) / delta)
         beaten = np.where(
             squared < TOO_NEAR**2, np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY), beaten

@@ -12,7 +12,6 @@ from scipy import special
 
 from elastocal.diagnosis.baseline import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer
-from elastocal.diagnosis.component_search import sum_of
 from elastocal.diagnosis.diagnosis import (
     Candidate,
     Curve,
@@ -123,13 +122,6 @@ class FewAnswer(SumAnswer):
 
     selected: SelectedEffects
 
-    @classmethod
-    def of(
-        cls, before: DiagnosisData, selected: SelectedEffects, rng: np.random.Generator
-    ) -> FewAnswer:
-        found = sum_of(selected.dataset, selected.chosen)
-        return cls(before, selected.dataset, found, (), rng, {}, selected)
-
     @cached_property
     def rivals(self) -> tuple[Rivals, ...]:
         return tuple(rivals_of(self.selected, k) for k in range(len(self.selected.chosen.items)))
@@ -196,8 +188,7 @@ class FewAnswer(SumAnswer):
         moment = self.rng.uniform(time[after - 1], time[after])
         apart = np.abs(moment - item.settings[s]) / np.ptp(time)
         n_new = NEW_POSES * round(len(every) / len(self.dataset.blocks.member))
-        changed = (every > item.settings[s]).mean()
-        step = mean_square(chosen.data, chosen.signal(k)) / changed
+        step = mean_square(chosen.data, chosen.signal(k)) / (every > item.settings[s]).mean()
         return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
 
     @cached_property
@@ -230,8 +221,7 @@ class FewAnswer(SumAnswer):
         tried[:, s] = values
         grams = Grams(dataset, data, project(data, chosen.noise))
         evidence = grams.of(item.what, tried).evidence(item.what.scales)
-        estimates = grams.estimates(item.what, tried, chosen.scales[k])
-        return tried, special.softmax(evidence), estimates
+        return tried, special.softmax(evidence), grams.estimates(item.what, tried, chosen.scales[k])
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
         """Of the columns by the instrument's noise or, where a geometry is sought, of the exact
