@@ -172,11 +172,6 @@ def field_component(
     )  # fmt: skip
 
 
-# What corrects the arm beside a sum and names no cause: fields, steps, and responses to loads.
-# Each is scored at its place beside the whole sum by its evidence, sizes integrated out; those that
-# stand out join the sum as components and stay where they pay (`component_search`).
-
-
 def without_a_name(
     dataset: DiagnosisData, found: FittedSum, most: int, without: Container[str] = ()
 ) -> list[Component]:
@@ -296,8 +291,6 @@ def _yielding(
     return moved(dataset, entry, D * MOTION), dict(settings), 0.0
 
 
-# Families of lines of a joint's error, which are looked for beside all else.
-#
 # A wheel that turns N times per turn of the joint makes lines at N and its multiples: sought
 # together they show where none of them would by itself.  The evidence of 2m columns at N, 2N, …,
 # mN is that of any group; N runs over a grid as fine as the highest of them needs, and each point

@@ -542,8 +542,6 @@ def _compressed(columns: Array, variances: Array, inverse: Array, faint: float =
     return np.asarray(scaled @ vectors[:, values > faint])
 
 
-# Posterior draws of a sum's coefficients, the sizes of its components drawn with them.
-#
 # Two causes that look alike share what they do by their sizes; which of these are the most probable
 # decides little.  So the sizes of effects that need no search are drawn as well, one after another
 # given the others (Gibbs), their coefficients integrated out: with A and b what the others leave of

@@ -30,7 +30,6 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of,
 from elastocal.diagnosis.effect_search import (
     MANY,
     ForwardSelection,
-    SelectedEffects,
     with_likelier_backlash_model,
 )
 from elastocal.diagnosis.hypotheses import (
@@ -350,13 +349,13 @@ def _pieces(
 
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, SelectedEffects, BoolArray]:
+) -> tuple[DiagnosisData, ForwardSelection, BoolArray]:
     """What is missing, the data without the faulty readings, which are sought twice, since beside
     a large effect nothing looks faulty, or the wrong readings do, and suspects (N,) that stay."""
 
-    def search_without(faulty: BoolArray) -> SelectedEffects:
+    def search_without(faulty: BoolArray) -> ForwardSelection:
         good = dataset.without(faulty)
-        return ForwardSelection(good, generic_blocks(good), options.false_alarm, options.seed).run()
+        return ForwardSelection(good, generic_blocks(good), options.false_alarm, options.seed)
 
     progress("noise floor")
     faulty, suspects = screen_outliers(dataset, dataset.data)

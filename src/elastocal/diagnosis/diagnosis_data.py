@@ -408,10 +408,7 @@ def monomials(x: Array) -> Array:
     return np.concatenate([x, *products], axis=1)
 
 
-# Blocks: each is one covariate at one place of the chain.  Joint i's angle moves joint k or frame
-# k; time, torque, load and approach direction move joints, frames, markers; the load's force and
-# moment give way at a link; a field over the workspace or a marker's angle of view moves the
-# reading; and products of load with time, angle and direction.  Where a block explains the residual
+# Blocks: each is one covariate at one place of the chain.  Where a block explains the residual
 # better than every effect of the catalogue, the effect is unknown and the block is its location.
 
 # Prior sizes of an entry's components at the largest of a smooth dependence.

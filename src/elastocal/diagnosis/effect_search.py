@@ -4,7 +4,7 @@ step re-examined, under noise fitted beside it."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -260,8 +260,6 @@ def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]
     return fit_baseline(whole, dataset.base.observed.table, x0=x0)
 
 
-# The backlash model of an arm's gears: whether play follows load alone, or load and last motion.
-#
 # A gear whose friction is small swings into the middle of its play, or onto the flank that any
 # load pushes it to; one that is stiff in its bearings stays where the last motion left it until the
 # load exceeds the friction.  Both are met, and the wrong one leaves most of the effect standing.
@@ -353,22 +351,6 @@ class Slot:
         return bool(max(named, each[~known].sum()) > nothing and nothing <= most)
 
 
-@dataclass(frozen=True)
-class SelectedEffects:
-    """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
-    p-value of the first of them, or else of the likeliest addition, against all that chance could
-    have found.  The set was fitted on `dataset`: columns about a fit with its large effects.
-    `first` is the scan beside nothing under its own noise, `alone` under the final noise."""
-
-    dataset: DiagnosisData
-    chosen: ModelSet
-    slots: tuple[Slot, ...]
-    p_value: float
-    nothing: ModelSet
-    first: Scan
-    alone: Scan
-
-
 # Rms signal in m beyond which the products of an effect with the fitted parameters, which it
 # moves by a tenth or so, are no longer small beside the noise.
 FAR = 2e-4
@@ -450,22 +432,19 @@ def left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | No
     return np.asarray(order * TENTHS // len(first))
 
 
-@dataclass
 class ForwardSelection:
-    dataset: DiagnosisData
-    generic: list[Generic]
-    level: float
-    seed: int
-    _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
+    """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
+    p-value of the first of them, or else of the likeliest addition, against all that chance could
+    have found, which is to be below `level`.  The set was fitted on `dataset`: columns about a fit
+    with its large effects.  `first` is the scan beside nothing under its own noise, `alone` under
+    the final noise; `signs` (FLIPS, C) are the flips."""
 
-    @cached_property
-    def signs(self) -> Array:
-        """The flips (FLIPS, C)."""
-        rng = np.random.default_rng(self.seed)
-        return rng.choice([-1.0, 1.0], (FLIPS, len(self.dataset.blocks.member)))
-
-    def run(self) -> SelectedEffects:
-        dataset = self.dataset
+    def __init__(
+        self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
+    ) -> None:
+        self.dataset, self.generic, self._fitted = dataset, generic, dict[tuple, ModelSet]()
+        flips = FLIPS, len(dataset.blocks.member)
+        self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)
         first = alone = scanned = self._scan(nothing, beside=nothing)
         slots, visited, p = list[Slot](), set[frozenset[int]](), None
@@ -487,7 +466,7 @@ class ForwardSelection:
                 break
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
-            if observed.chance > self.level or key in visited:
+            if observed.chance > level or key in visited:
                 break
             visited.add(key)
             p = observed.chance if p is None else p
@@ -508,8 +487,9 @@ class ForwardSelection:
         if not current.items or p is None:
             current, p = nothing, first.chance
             self.dataset = dataset
-        slots = slots or [start]
-        return SelectedEffects(self.dataset, current, tuple(slots), p, nothing, first, alone)
+        self.chosen, self.slots, self.p_value = current, tuple(slots or [start]), p
+        self.nothing, self.first, self.alone = nothing, first, alone
+        self._fitted.clear()
 
     def _paying(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
         """The set without items beside whose others the error of configurations left out of the fit

@@ -20,8 +20,6 @@ from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
 
-# Marginal likelihood of a group of columns in closed form.
-#
 # With columns C scaled to their typical sizes, γ ~ N(0, s² I) and everything else integrated out,
 #
 #     log ev(s) = −½ log|I + s²A| + ½ s² bᵀ(I + s²A)⁻¹ b,   A = CᵀPC,   b = CᵀPr,

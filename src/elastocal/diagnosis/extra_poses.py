@@ -173,8 +173,6 @@ def discriminations(
     ]
 
 
-# The fewest candidates that tell the rivals apart, one more at a time until they are enough.
-#
 # The design module's criteria are functions of one information matrix, convex and homogeneous of
 # degree −1, which its bounds rest on.  Distances of rivals are neither: they start from data in
 # hand, and a pair's distance is a difference of two informations.  So this choice is its own.

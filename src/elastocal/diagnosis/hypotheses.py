@@ -384,6 +384,9 @@ class StartSearch:
         X, r = ((self.whitening @ each).reshape(rows, -1) for each in (X, r))
         self.r = np.append(r[:, 0], np.zeros(X.shape[1]))
         self.X = np.vstack([X, np.eye(X.shape[1])])
+        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
+        self._span: Array = U[:, s > 1e-9 * s.max(initial=0.0)]
+        self._unexplained = self.r - self._span @ (self._span.T @ self.r)
 
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
@@ -476,11 +479,6 @@ class StartSearch:
         products = np.einsum("nis,ns->ni", self._columns(references), profiles)
         return np.asarray(products / np.maximum((profiles**2).sum(axis=1), 1e-300)[:, None])
 
-    @cached_property
-    def _span(self) -> Array:
-        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
-        return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
-
     def _left(self, starts: Sequence[Mapping[str, float]]) -> tuple[Array, Array]:
         """What is left of the residual's sum of squares (starts,), all of it where the amplitude
         is one that the effect cannot have, and the unit columns (rows, starts)."""
@@ -496,10 +494,6 @@ class StartSearch:
             if self.h.effect.unphysical({name: float(amplitude)}, chain, cell):
                 left[k] = self._unexplained @ self._unexplained
         return left, C
-
-    @cached_property
-    def _unexplained(self) -> Array:
-        return np.asarray(self.r - self._span @ (self._span.T @ self.r))
 
     def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
         """Of each of the columns (rows, size, k) by itself what it leaves of the residual's sum

@@ -64,8 +64,6 @@ def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int
     return pure_error(group, values)
 
 
-# Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
-#
 # Two readings i, j whose joints all differ by less than NEAR see the same arm.  A Gaussian process
 # of length ℓ and variance A² (squared exponential) has half the mean square difference
 #

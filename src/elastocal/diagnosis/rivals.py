@@ -26,8 +26,6 @@ from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.units import Array
 
-# Who the rivals are: the named sets of an ambiguous verdict, or what an unknown effect may be.
-#
 # A set names three effects at most.  Whichever of them is at work, further poses leave open what
 # imitates it, whether it was listed or not; a plan that did not know of it would promise too much.
 
@@ -139,10 +137,8 @@ def covered(sets: Sequence[RivalSet], diagnosis: Diagnosis) -> float:
     return min(max(1 - diagnosis.probability_nothing - sum(missed), 0.0), 1.0)
 
 
-# With what one rival may imitate the others: its order, its time, where its spring is anchored.
-#
-# The best in the data so far need not be the best once further poses are measured, when the
-# diagnosis seeks them anew: what is nearly as good stays possible.
+# The order, time or anchor that imitates another best so far need not be the best once further
+# poses are measured, when the diagnosis seeks it anew: what is nearly as good stays possible.
 
 NEARLY = 4.0  # in d²: two standard deviations
 SETTINGS = 6  # of a rival that are tried, at most

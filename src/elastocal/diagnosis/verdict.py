@@ -26,7 +26,7 @@ from elastocal.diagnosis.diagnosis import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.effect_search import (
     LARGEST_SET,
-    SelectedEffects,
+    ForwardSelection,
     distances,
     fit_extended,
     settings_of,
@@ -53,7 +53,7 @@ TOO_NEAR_PROBABILITY = 0.89
 Rivals = tuple[tuple[Item, float], ...]
 
 
-def rivals_of(found: SelectedEffects, k: int) -> Rivals:
+def rivals_of(found: ForwardSelection, k: int) -> Rivals:
     """Item k of what the search found and the other effects that it may be."""
     slot, item = found.slots[k], found.chosen.items[k]
     each, nothing = slot.probabilities()
@@ -120,7 +120,7 @@ FARTHEST = 10.0  # times what was found that a time constant may be, or part of 
 class FewAnswer(SumAnswer):
     """The pieces of a diagnosis that the few causes fill which the forward search `selected`."""
 
-    selected: SelectedEffects
+    selected: ForwardSelection
 
     @cached_property
     def rivals(self) -> tuple[Rivals, ...]:
@@ -340,7 +340,7 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
     return tuple(sorted(likeliest, key=lambda c: c.detectable < DETECTABLE and c.score <= 0))
 
 
-def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
+def too_small(dataset: DiagnosisData, found: ForwardSelection) -> tuple[Untested, ...]:
     """Hypotheses whose typical size these poses would not show."""
     chosen = {id(item.what) for item in found.chosen.items}
     reason = (
@@ -356,7 +356,7 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
 
 
 def warnings(
-    dataset: DiagnosisData, found: SelectedEffects, suspects: BoolArray, noise: NoiseValues
+    dataset: DiagnosisData, found: ForwardSelection, suspects: BoolArray, noise: NoiseValues
 ) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
     out, data = list[str](), found.chosen.data
