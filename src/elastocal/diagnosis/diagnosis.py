@@ -435,6 +435,10 @@ class Diagnosis(Result):
         it.  A number that is not known or not finite is null, as JSON has none."""
         model = self.model
         assert model is not None  # `diagnose` states it
+        location = dict(vars(self.location)) if self.location else {}
+        if location:
+            parts = ("stages", "places", "drivers", "shares")
+            location["evidence"] = {key: location.pop(key) for key in parts}
         content = {
             "schema": SCHEMA,
             "robot": model.chain.name,
@@ -454,7 +458,7 @@ class Diagnosis(Result):
             ],
             "fields": [_found(effect) for effect in self.fields],
             "slight": [_found(effect) for effect in self.slight],
-            "location": self.location and _with_evidence(self.location),
+            "location": location or None,
             "noise": _noise(self.noise, model),
             "extra_plan": self.extra and {k: v for k, v in vars(self.extra).items() if k != "plan"},
             "backend": model.backend_report(),
@@ -596,9 +600,3 @@ def _found(f: FoundEffect) -> dict[str, Any]:
         return vars(p) | {"ci95": [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]}
 
     return vars(f) | {"parameters": [told(p) for p in f.parameters]}
-
-
-def _with_evidence(location: Location) -> dict[str, Any]:
-    out = dict(vars(location))
-    parts = ("stages", "places", "drivers", "shares")
-    return out | {"evidence": {key: out.pop(key) for key in parts}}

@@ -28,7 +28,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
-from elastocal.measurements import Measurements, first_of_visit, numbered
+from elastocal.measurements import Measurements, first_of_visit
 from elastocal.messages import InsufficientDataError
 from elastocal.model.effects.base import Setting, Stage, usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -84,11 +84,6 @@ class DiagnosisData:
     def lead(self) -> IntArray:
         """Row (N,) of the table that each observation stands in first."""
         return self.base.observed.lead
-
-    @cached_property
-    def kind(self) -> IntArray:
-        """The marker and load of each observation (N,), numbered."""
-        return numbered(self.table.marker[self.lead], self.base.observed.load)
 
     @cached_property
     def visit_table(self) -> Measurements:
@@ -214,12 +209,9 @@ class DiagnosisData:
 
 
 def diagnosis_data_of(
-    base: Baseline,
-    hypotheses: list[Hypothesis],
-    around: Model | None = None,
-    x: Array | None = None,
-    apart: bool = False,
-) -> DiagnosisData:
+    base: Baseline, hypotheses: list[Hypothesis], around: Model | None = None,
+    x: Array | None = None, apart: bool = False,
+) -> DiagnosisData:  # fmt: skip
     """Compute all columns at the baseline's fit and gather them by configuration.  `around` is the
     base's model with some of the hypotheses in it, at its values x: columns are those there, and
     the residual is the baseline's.  `apart`: those of the base's own parameters are without the
@@ -262,15 +254,12 @@ def diagnosis_data_of(
     B = B[:, :, used]
     joints = tuple(f"joint{i + 1}" for i in range(model.chain.n_joints))
     data = NoisyData(
-        blocks=blocks,
-        r=blocks.pack(residual[:, :, None])[:, :, 0],
-        X=blocks.pack(B),
-        precision=np.ones(B.shape[2]),
+        blocks, r=blocks.pack(residual[:, :, None])[:, :, 0],
+        X=blocks.pack(B), precision=np.ones(B.shape[2]),
         covariance=blocks.pack_square(base.covariance) + common,
         G=blocks.pack(columns.entry(("joint_motion", joints))[observed.lead]),
-        left_out=blocks.absent,
-        stated=base.stated is not None,
-    )
+        left_out=blocks.absent, stated=base.stated is not None,
+    )  # fmt: skip
     fitted = tuple(n for n, u in zip(names, used, strict=True) if u)
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
 

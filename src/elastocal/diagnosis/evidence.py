@@ -46,11 +46,6 @@ class Spectrum:
         seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
         return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
 
-    @property
-    def distance(self) -> Array:
-        """d (V,): what the group's typical size moves the data, √tr A, in standard deviations."""
-        return np.sqrt(self.lam.sum(axis=1))
-
     def explained(self, scale: float) -> Array:
         """What each group takes off eᵀPe, its coefficients γ charged with |γ|²/scale² (V,)."""
         squared = scale**2
@@ -355,11 +350,12 @@ class Scan:
     missing with this probability, and the odds of all together.
 
     `items` are hypotheses, then blocks, each at its best settings, of log posterior `scores` (W,)
-    over the model without it, up to what they share; `distance` (W,) is d of a typical size there,
-    in standard deviations.  `odds` (1 + F,) is the log of the mean evidence over catalogue and
-    blocks, weighted by prior, of the readings and of residuals whose configurations had their signs
-    flipped, and `covariates` (1 + F,) the largest evidence among the blocks of each; `marginal` the
-    log marginal likelihood of the data beside which they were scored."""
+    over the model without it, up to what they share; `distance` (W,) is what a typical size moves
+    the data there, √tr A, in standard deviations.  `odds` (1 + F,) is the log of the mean evidence
+    over catalogue and blocks, weighted by prior, of the readings and of residuals whose
+    configurations had their signs flipped, and `covariates` (1 + F,) the largest evidence among the
+    blocks of each; `marginal` the log marginal likelihood of the data beside which they were
+    scored."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
@@ -380,7 +376,7 @@ class Scan:
             # What the search over settings costs stays with the item.
             spent = float(evidence[0] - own[k] + grid.log_prior[k])
             items.append(Item(what, grid.values[k], w + spent))
-            distance.append(float(spectra.distance[k]))
+            distance.append(float(np.sqrt(spectra.lam[k].sum())))
             if isinstance(what, Generic):
                 largest = self.covariates.get(what.covariate, evidence)
                 self.covariates[what.covariate] = np.maximum(largest, evidence)

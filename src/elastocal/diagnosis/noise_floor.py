@@ -36,6 +36,7 @@ from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.outliers import settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
+from elastocal.measurements import numbered
 from elastocal.messages import ElastocalError
 from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.observations import pure_error
@@ -107,12 +108,12 @@ def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
     """Pairs (k, 2) of `good` (N,) observations of one marker and load in different configurations,
     each with its nearest neighbour in the joints, all within NEAR."""
     table, lead = dataset.table, dataset.lead
+    kind = numbered(table.marker[lead], dataset.base.observed.load)
     # One reading of each configuration: the others are repeats.
-    same, some = np.column_stack([table.configuration[lead], dataset.kind]), np.flatnonzero(good)
+    same, some = np.column_stack([table.configuration[lead], kind]), np.flatnonzero(good)
     some = some[np.unique(same[some], axis=0, return_index=True)[1]]
     # Of another marker or load no reading is near.
-    place = np.column_stack([table.q[lead[some]], dataset.kind[some]])
-    pairs, distance = nearest(place, np.inf)
+    pairs, distance = nearest(np.column_stack([table.q[lead[some]], kind[some]]), np.inf)
     return _unordered(some[pairs[distance <= NEAR]])
 
 
@@ -257,14 +258,12 @@ class SupportedFloor:
         table, gone = dataset.table, np.flatnonzero(data.faulty)
         faulty = tuple(
             FaultyReading(
-                int(table.row[row]),
-                table.configuration_labels[table.configuration[row]],
+                int(table.row[row]), table.configuration_labels[table.configuration[row]],
                 table.marker_names[table.marker[row]],
-                float(np.linalg.norm(e[k, :3])),
-                float(np.linalg.norm(e[k] / sigma[k])),
+                float(np.linalg.norm(e[k, :3])), float(np.linalg.norm(e[k] / sigma[k])),
             )
             for k, row in zip(gone, dataset.lead[gone], strict=True)
-        )
+        )  # fmt: skip
         return NoiseFloor(
             data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
             tuple(noise.joint.tolist()), noise.shared_by_all,

@@ -330,10 +330,8 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
             what = item.what
             if not isinstance(what, Hypothesis):
                 continue
-            probability, key = named.get(id(what), float(p)), what.key
-            row = Candidate(
-                *key, what.stage, probability, float(score), distance[key], settings_of(item)
-            )
+            key, p = what.key, named.get(id(what), float(p))
+            row = Candidate(*key, what.stage, p, float(score), distance[key], settings_of(item))
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
     likeliest = sorted(best.values(), key=lambda c: (-c.probability, -c.score))
