@@ -339,7 +339,7 @@ class SumAnswer:
 
     @cached_property
     def _error(self) -> Array:
-        return self._error_without(self._not_written)
+        return self._error_without(())
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls when these components are added
@@ -347,14 +347,9 @@ class SumAnswer:
         there is X_c β̂₋c − W_c θ*, after it W_c (θ̂₋c − θ*), with the columns W of all that is held
         to be true.  What is unexplained is no noise, and stays; so does a change for new readings
         that fall between its moment and the one that was found."""
-        before = self._error_without([*members, *self._not_written])
+        before = self._error_without(members)
         after = self._error + sum(self._mistimed(k) for k in members)
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
-
-    @property
-    def _not_written(self) -> Sequence[int]:
-        """Components that no cell has which the answer writes."""
-        return ()
 
     def _mistimed(self, k: int) -> Array | float:
         """Mean square in m² by which new readings err for the moment of a change alone."""

@@ -218,11 +218,8 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
     have the same kinds of constants, the item's own, which were refined between them."""
     values = dataset.grids.get(rival.key, NO_SETTINGS).values
     kinds, own = ([s.kind for s in what.settings] for what in (rival, item.what))
-    within = (
-        bool(kinds)
-        and kinds == own
-        and all(s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True))
-    )
+    each = zip(rival.settings, item.settings, strict=False)
+    within = bool(kinds) and kinds == own and all(s.lower <= v <= s.upper for s, v in each)
     return np.vstack([values, item.settings]) if within else values
 
 
@@ -329,10 +326,8 @@ class Slot:
     def best_of(self, other: Slot) -> Slot:
         """The higher score of each: both bound from below what it would be under the noise that
         suits it best."""
-        higher = other.scores > self.scores
-        items = tuple(
-            b if up else a for a, b, up in zip(self.items, other.items, higher, strict=True)
-        )
+        each = zip(self.items, other.items, other.scores > self.scores, strict=True)
+        items = tuple(b if up else a for a, b, up in each)
         return Slot(items, np.maximum(self.scores, other.scores))
 
     def probabilities(self) -> tuple[Array, float]:
@@ -376,9 +371,8 @@ def about(
     back; `apart`: what they are to the model's own parameters is not in the columns of these."""
     base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
-    moved = replace(
-        base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
-    )
+    own = np.array([x[name] for name in base.model.names])
+    moved = replace(base, x=own, residual=fitted.residual)
     about_fit = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x, apart)
     # Put back by the data's own columns, which will have to explain it: those of the equilibrium
     # differ from them by a thousandth, and a large effect is a thousand deviations.

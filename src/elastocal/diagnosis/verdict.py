@@ -169,9 +169,8 @@ class FewAnswer(SumAnswer):
         """Whether its geometry was looked for from many starts."""
         return isinstance(what, Hypothesis) and bool(what.starts(self.dataset.base.model))
 
-    @property
-    def _not_written(self) -> Sequence[int]:
-        return self._unnamed
+    def _error_without(self, gone: Sequence[int]) -> Array:
+        return super()._error_without([*gone, *self._unnamed])  # which no cell has that is written
 
     def _mistimed(self, k: int) -> Array:
         """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
