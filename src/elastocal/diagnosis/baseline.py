@@ -299,9 +299,8 @@ class NoiseValues:
 @dataclass(frozen=True)
 class NoisyData:
     """Packed residual r (C, m), nuisance X (C, m, p) with prior precision Λ (p,), and what noise is
-    made of: stated covariance (C, m, m), joint columns G (C, m, joints).  `stated` says whether the
-    covariance is stated or only a shape; `left_out` (C, m) rows do not count
-    (padding, faulty readings)."""
+    made of: covariance (C, m, m), whether it is `stated` or only a shape, and joint columns G
+    (C, m, joints).  Rows `left_out` (C, m) do not count (padding, faulty readings)."""
 
     blocks: Blocks
     r: Array

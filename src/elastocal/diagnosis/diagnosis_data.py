@@ -212,10 +212,9 @@ def diagnosis_data_of(
     base: Baseline, hypotheses: list[Hypothesis], around: Model | None = None,
     x: Array | None = None, apart: bool = False,
 ) -> DiagnosisData:  # fmt: skip
-    """Compute all columns at the baseline's fit and gather them by configuration.  `around` is the
-    base's model with some of the hypotheses in it, at its values x: columns are those there, and
-    the residual is the baseline's.  `apart`: those of the base's own parameters are without the
-    hypotheses."""
+    """All columns at the baseline's fit, gathered by configuration.  `around` is the base's model
+    with some of the hypotheses in it, at its values x: columns are those there, and the residual is
+    the baseline's.  `apart`: those of the base's own parameters are without them."""
     model, observed, blocks = base.model, base.observed, base.blocks
     # The load's own error, whose load point has a tolerance in any case.
     acting = model.cell.model.torque != "measured"

@@ -299,8 +299,7 @@ def doubt(odds: float, d: Array) -> float:
     """Probability of the less likely of two models: the larger of 1/(1 + exp L) and Φ(−L / √Σ d²).
     L are the log odds, d (configurations,) what each adds to the log likelihood ratio.  Both models
     idealise, so that a few configurations may speak loudly for the wrong one; by the test of Vuong
-    (1989, Econometrica 57) for models of which none is quite true, their ratio counts against its
-    own scatter."""
+    (1989, Econometrica 57) for models none of which is true, it counts against its own scatter."""
     odds, scatter = max(odds, 0.0), max(float(np.linalg.norm(d)), 1e-300)
     return float(max(expit(-odds), ndtr(-odds / scatter)))
 

@@ -354,8 +354,7 @@ class Scan:
     the data there, √tr A, in standard deviations.  `odds` (1 + F,) is the log of the mean evidence
     over catalogue and blocks, weighted by prior, of the readings and of residuals whose
     configurations had their signs flipped, and `covariates` (1 + F,) the largest evidence among the
-    blocks of each; `marginal` the log marginal likelihood of the data beside which they were
-    scored."""
+    blocks of each; `marginal` the log marginal likelihood without them."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,

@@ -41,9 +41,8 @@ RARE = 0.1  # share of the visits below which a load state is not asked for agai
 class VisitPool:
     """N candidates, each one pose with its side of approach and moment, in all load states.  `q`
     (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces` (L, 3) N.
-    `table` holds the campaign's rows and then theirs: candidate by candidate, load by load, marker
-    by marker, with the readings that the fitted model expects; those `hidden` (rows,) the tracker
-    cannot make."""
+    `table` holds the campaign's rows and then theirs, by candidate, load and marker, with the
+    readings that the fitted model expects; those `hidden` (rows,) the tracker cannot make."""
 
     q: Array
     approach: Array | None
@@ -91,8 +90,7 @@ class VisitPool:
 def draw_pool(base: Baseline, diagnosis: Diagnosis, seed: int) -> VisitPool:
     """Candidates that the cell's rules allow, after the campaign, each joint from any side; where a
     rival relaxes with time some at once and others after as long as the campaign took.  Sides and
-    moments only where the table has such a column.  Raises InsufficientDataError where no pose is
-    feasible."""
+    moments only where the table has them.  Raises InsufficientDataError if no pose is feasible."""
     table, cell, rng = base.observed.table, base.model.cell, np.random.default_rng(seed)
     # A joint whose compliance is known at its levels only can be nowhere else.
     spec = replace(cell.design, levels=cell.design.levels or cell.model.compliance_levels)
@@ -201,9 +199,8 @@ def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
 
 def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements) -> Measurements:
     """One row per visit of the chosen candidates, after the campaign of `table`: what is to be
-    measured later comes later, otherwise the nearest pose in joint space is next.  A pose is
-    measured in all load states before the arm moves on, so that no drift passes for an effect of
-    the load."""
+    measured later comes later, otherwise the nearest pose in joint space is next.  All load states
+    of a pose come before the arm moves on, so that no drift passes for an effect of the load."""
     left, order, at = np.array(chosen), list[int](), table.q[-1]
     for moment in [None] if pool.time is None else np.unique(pool.time[left]):
         due = left if pool.time is None else left[pool.time[left] == moment]
