@@ -218,7 +218,7 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
     have the same kinds of constants, the item's own, which were refined between them."""
     values = dataset.grids.get(rival.key, NO_SETTINGS).values
     kinds, own = ([s.kind for s in what.settings] for what in (rival, item.what))
-    each = zip(rival.settings, item.settings, strict=False)
+    each = zip(rival.settings, item.settings, strict=True)
     within = bool(kinds) and kinds == own and all(s.lower <= v <= s.upper for s, v in each)
     return np.vstack([values, item.settings]) if within else values
 
