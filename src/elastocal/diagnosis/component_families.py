@@ -172,6 +172,11 @@ def field_component(
     )  # fmt: skip
 
 
+# What corrects the arm beside a sum and names no cause: fields, steps, and responses to loads.
+# Each is scored at its place beside the whole sum by its evidence, sizes integrated out; those that
+# stand out join the sum as components and stay where they pay (`component_search`).
+
+
 def without_a_name(
     dataset: DiagnosisData, found: FittedSum, most: int, without: Container[str] = ()
 ) -> list[Component]:

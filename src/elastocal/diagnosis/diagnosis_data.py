@@ -407,9 +407,11 @@ LOAD_POINT_MOTION = 1e-2
 
 @dataclass(frozen=True)
 class Generic:
-    """A block: `entry` moved by smooth functions of `covariate`, or ready columns.  `direction`
-    (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k) are packed
-    columns of blocks that vary within a visit."""
+    """A block: `entry` moved by smooth functions of `covariate`, or ready columns.
+
+    `direction` (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k)
+    are packed columns of blocks that vary within a visit.
+    """
 
     kind: str
     covariate: str
