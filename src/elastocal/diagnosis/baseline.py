@@ -36,10 +36,8 @@ from elastocal.units import Array, BoolArray, IntArray
 @dataclass(frozen=True)
 class Blocks:
     """N observations of `size` components in C blocks of M places, padded where a block is short.
-
     `member` (C, M) is the observation at each place, N where there is none; `visit` (N,) numbers
-    the times that the arm was sent to a pose (configuration, repeat and load state).
-    """
+    the times that the arm was sent to a pose (configuration, repeat and load state)."""
 
     member: IntArray
     visit: IntArray
@@ -105,15 +103,6 @@ class Blocks:
         out[:, place, :, place, :] = padded.transpose(1, 0, 2, 3)
         return out.reshape(C, M * self.size, M * self.size)
 
-    def unpack_square(self, packed: Array) -> Array:
-        """Diagonal blocks (N, size, size) of (C, M·size, M·size)."""
-        C, M = self.member.shape
-        place = np.arange(M)
-        own = packed.reshape(C, M, self.size, M, self.size)[:, place, :, place, :]
-        rows = np.empty((self.n + 1, self.size, self.size))
-        rows[self.member.T.ravel()] = own.reshape(M * C, self.size, self.size)
-        return rows[:-1]
-
     @property
     def absent(self) -> BoolArray:
         """Rows (C, M·size) that hold no observation."""
@@ -128,8 +117,7 @@ class Baseline:
     the nominal arm with only base and markers placed, NaN where the fit began elsewhere.
     `stated` (N, size, size) is the noise that cell or table state, None where they state none.
     The last `planned` of the N observations are candidates not yet measured: their residual is
-    zero and says nothing about what may be at work.
-    """
+    zero and says nothing about what may be at work."""
 
     model: Model
     observed: Observations
@@ -156,7 +144,6 @@ class Baseline:
 
     @property
     def blocks(self) -> Blocks:
-        """Readings by configuration; a visit is a configuration, repeat and load state."""
         table, lead = self.observed.table, self.observed.lead
         return Blocks.of(table.configuration[lead], visits(table)[lead], self.observed.size)
 
@@ -165,9 +152,7 @@ def fit_baseline(
     model: Model, table: Measurements, seed: int = 0, x0: Array | None = None
 ) -> Baseline:
     """Fit the cell's own effects; every parameter stays, held by a weak tie where data do not.
-
-    `x0` (parameters,) spares the search for a start.
-    """
+    `x0` (parameters,) spares the search for a start."""
     observed = observe(table, model.observe)
     free = np.arange(len(model.parameters))
     weights = weights_for(observed, model.cell.tracker, "auto")
@@ -190,28 +175,21 @@ PLACED = 0.1
 
 
 def from_centre(base: Baseline) -> Array:
-    """How far (parameters,) the fit is from the centre of the prior: nominal, but for what
-    registration placed, which is where it is.
-
-    An unmodelled effect bends parameters that little else holds; they must be free to return.
-    """
+    """How far (parameters,) the fit is from the prior's centre: nominal, or where registration
+    placed it.  An unmodelled effect bends what little else holds; it must be free to return."""
     return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
 
 
 def prior_deviations(base: Baseline) -> Array:
-    """Prior standard deviation (parameters,) of each fitted parameter.
-
-    At least how far the fit has moved it.  Where a prior is narrower than what the readings say,
-    an addition with the same columns spares the fitted parameter a part of the way, and is
-    believed for that alone: half of v in each of two columns costs v²/4w² less than v in one.
-    """
+    """Prior standard deviation (parameters,), at least how far the fit has moved each.  Where a
+    prior is narrower than what the readings say, an addition with the same columns spares the
+    fitted parameter a part of the way, and is believed for that alone: half of v in each of two
+    columns costs v²/4w² less than v in one."""
     compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
     wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
     wide = np.maximum(wide, np.abs(from_centre(base)))
     return np.where(is_placed(base.model), PLACED, wide)
 
-
-# Large tables are looked at in part: what more readings would add is time and memory.
 
 # Evidence grows with the readings, and an effect worth finding has hundreds of nats in so many.
 MOST_ROWS = 12_000
@@ -223,12 +201,10 @@ MOST_IN_ONE = 60
 
 
 def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measurements, str | None]:
-    """The table, or a part of it that is large enough, and what was left out.
-
-    Of each configuration the first readings of every marker under every load, as many of each as
-    leave MOST_IN_ONE in it; of too many configurations those evenly spaced in the order they were
-    measured, so that whatever changes with time still does.
-    """
+    """The table, or a part of it that is large enough, and what was left out.  Of each
+    configuration the first readings of every marker under every load, as many of each as leave
+    MOST_IN_ONE in it; of too many configurations those evenly spaced in the order they were
+    measured, so that whatever changes with time still does."""
     kind = numbered(table.configuration, load_states(table.force), table.marker)
     order, at = np.argsort(kind, kind="stable"), numbered(table.configuration)
     rank = np.empty(len(table), dtype=np.int64)
@@ -249,17 +225,12 @@ def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measuremen
     )
 
 
-# Models that are derived from another one, kept for as long as that one is.
-
 MOST = 12  # models that are kept of each; those asked for last
 
 
 def made_once(model: Model, key: Hashable, make: Callable[[], Model]) -> Model:
-    """What `make` derives from the model, or what it derived under the same `key` before.
-
-    A diagnosis comes back to the same few models, and to write and differentiate an arm takes
-    longer than to evaluate it at sixty poses.
-    """
+    """What `make` derives from the model, or what it derived under the same `key` before.  A
+    diagnosis comes back to the same few models, and to write and differentiate one takes long."""
     known: dict[Hashable, Model] = vars(model).setdefault("_derived", {})
     known[key] = known.pop(key) if key in known else make()
     while len(known) > MOST:
@@ -297,7 +268,6 @@ class NoiseValues:
 
     @classmethod
     def usual(cls, joints: int) -> NoiseValues:
-        """What one expects before any reading: noise as stated, joints as good as usual."""
         return cls(1.0, np.full(joints, REPEATABILITY), np.full(joints, SHARED))
 
     def of_instrument(self) -> NoiseValues:
@@ -328,12 +298,9 @@ class NoiseValues:
 
 @dataclass(frozen=True)
 class NoisyData:
-    """Packed residual r (C, m), nuisance X (C, m, p) with prior precision Λ (p,), and what noise
-    is made of: stated covariance (C, m, m), joint columns G (C, m, joints).
-
-    `stated` says whether the covariance is stated or only a shape; `left_out` (C, m) rows do not
-    count (padding, faulty readings).
-    """
+    """Packed residual r (C, m), nuisance X (C, m, p) with prior precision Λ (p,), and what noise is
+    made of: covariance (C, m, m), whether it is `stated` or only a shape, and joint columns G
+    (C, m, joints).  Rows `left_out` (C, m) do not count (padding, faulty readings)."""
 
     blocks: Blocks
     r: Array
@@ -379,8 +346,7 @@ class NoisyData:
     @property
     def mean_variance(self) -> float:
         """Of the readings, as stated, or its shape."""
-        variances = np.diagonal(self.covariance, axis1=1, axis2=2)
-        return float(variances[~self.left_out].mean())
+        return float(np.diagonal(self.covariance, axis1=1, axis2=2)[~self.left_out].mean())
 
     def masked(self, packed: Array) -> Array:
         """Rows that do not count set to zero (C, m, …)."""
@@ -414,10 +380,8 @@ class NoisyData:
 
 @cache
 def log_prior_of(stated: bool, joints: int) -> LogPrior:
-    """Prior of the logarithms of θ (1 + 2 joints,), from that of a, c and s.
-
-    The joints' own have a common mean that is itself uncertain.
-    """
+    """Prior of the logarithms of θ (1 + 2 joints,), from that of a, c and s.  The joints' own have
+    a common mean that is itself uncertain."""
     own = (
         _precision(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
         _precision(joints, SHARED_SPREAD, 0.0),
@@ -456,12 +420,10 @@ def _precision(n: int, apart: float, common: float) -> Array:
 
 
 class Projection:
-    """The data under one noise, their coefficients under a prior of precision Λ (p,): V⁻¹ (C, m, m)
-    and H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ.
-
-    P = V⁻¹ − HHᵀ; `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
-    likelihood ℓ; `beta_deviation` L⁻¹ (p, p), so that the posterior covariance of β is L⁻ᵀL⁻¹.
-    """
+    """The data under one noise, their coefficients under a prior of precision Λ (p,): V⁻¹
+    (C, m, m), H = V⁻¹X L⁻ᵀ (C, m, p) with LLᵀ = XᵀV⁻¹X + Λ, and P = V⁻¹ − HHᵀ of each configuration
+    by itself.  `u` = P r (C, m); `beta` (p,) the posterior mean β̂; `marginal` the log marginal
+    likelihood ℓ; `beta_deviation` L⁻¹ (p, p), so that the posterior covariance of β is L⁻ᵀL⁻¹."""
 
     def __init__(self, weighted: Weighted, precision: Array) -> None:
         at, self.marginal = weighted.factored(precision)
@@ -478,16 +440,13 @@ class Projection:
 
     @cached_property
     def P(self) -> Array:
-        """P (C, m, m) of each configuration by itself."""
         return self.inverse - self.H @ self.H.transpose(0, 2, 1)
 
     @cached_property
     def scattered(self) -> Array:
-        """Residuals e (C, m) that scatter as the noise does.
-
-        The fit's own residuals are too small, its leverage less than V: u_c has the covariance
-        P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
-        """
+        """Residuals e (C, m) that scatter as the noise does.  The fit's own residuals are too
+        small, its leverage less than V: u_c has the covariance P_cc, so e_c = V_c^½ P_cc^−½ u_c has
+        V_c (Bell and McCaffrey 2002)."""
         e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
         return np.asarray(e[..., 0])
 
@@ -548,12 +507,9 @@ ENOUGH = 1e-3  # change of −2ℓ at which a search ends
 def fit_noise(
     data: NoisyData, start: NoiseValues | None = None, enough: float = ENOUGH
 ) -> NoiseValues:
-    """The most probable noise values.
-
-    Where nothing is stated it starts from two ends, unless a start is given; with many
-    configurations it comes from some of them to all.  The search ends where −2ℓ changes by less
-    than `enough`.
-    """
+    """The most probable noise values.  Where nothing is stated it starts from two ends, unless a
+    start is given; with many configurations it comes from some of them to all.  The search ends
+    where −2ℓ changes by less than `enough`."""
     if start is None and len(data.r) >= 2 * SOME:
         start = fit_noise(data.every(len(data.r) // SOME))
     if start is None:
@@ -575,10 +531,8 @@ def fit_noise(
 
 
 def balanced(data: NoisyData) -> NoiseValues:
-    """Instrument and joints share the scatter of the data equally.
-
-    From far below it the likelihood is flat in a joint's logarithm, and no climb leaves.
-    """
+    """Instrument and joints share the scatter of the data equally.  From far below it the
+    likelihood is flat in a joint's logarithm, and no climb leaves."""
     used = ~data.left_out
     square = max(float((data.r[used] ** 2).mean()), SMALLEST_NOISE**2)
     moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)

@@ -261,7 +261,6 @@ def _compared(
     old: CalibratedArm, new: CalibratedArm, own: set[str], forces: Array, whose: str, level: float,
     poses: int, seed: int,
 ) -> Comparison:  # fmt: skip
-    """Of the parameters `own` of the arm itself, under `forces` (L, 3), which are `whose`."""
     conditions = Conditions()
     unstated = unstated_needs(old, conditions)
     before = arm_with(old, [name for name, needs in unstated.items() if not needs])
@@ -315,12 +314,10 @@ def _compared(
 
 
 def _estimates(arm: CalibratedArm, own: list[str]) -> tuple[IntArray, Array, Array, Array, Array]:
-    """Which of the parameters `own` it determined (k,), y (k,) and A (k, own) with y = A X + ε, N
+    """Which of the parameters `own` it determined (k,); y (k,) and A (k, own) with y = A X + ε; N
     and V (2, k, k) of ε: noise, and what was left open of the set-up; and the typical sizes (own,)
-    of those left open, 0 where none is known, −∞ for the others.
-
-    Raises InputError where the covariance has no numbers.
-    """
+    of those left open, 0 where none is known, −∞ for the others.  Raises InputError where the
+    covariance has no numbers."""
     # What constraints fix is held.
     place = {name: i for i, name in enumerate(arm.determined) if arm.covariance[i, i] != 0}
     kept = np.array([k for k, name in enumerate(own) if name in place], dtype=np.int64)
@@ -346,11 +343,9 @@ def _estimates(arm: CalibratedArm, own: list[str]) -> tuple[IntArray, Array, Arr
 def _difference(
     old: CalibratedArm, new: CalibratedArm, own: list[str]
 ) -> tuple[list[str], Array, Array, list[str]]:
-    """Names, ẑ (p,), N and V of it (2, p, p), and which of `own` one campaign alone shows.
-
-    Raises InputError where users held a parameter at two values, or at one that the other campaign
-    contradicts, or a covariance has no numbers.
-    """
+    """Names, ẑ (p,), N and V of it (2, p, p), and which of `own` one campaign alone shows.  Raises
+    InputError where a parameter is held at two values, or at one that the other campaign
+    contradicts, or a covariance has no numbers."""
     found = (_estimates(arm, own) for arm in (old, new))
     (first, y1, A1, V1, left1), (second, y2, A2, V2, left2) = found
     both, alone = np.intersect1d(first, second), np.setxor1d(first, second)
@@ -410,8 +405,7 @@ def _whitener(V: Array, least: float) -> tuple[Array, BoolArray]:
     of the correlations below `least`, which stands in its place."""
     rho, unit = correlations(V)
     value, axes = np.linalg.eigh(rho)
-    white = axes.T / unit / np.sqrt(np.maximum(value, least))[:, None]
-    return white, np.asarray(value < least)
+    return axes.T / unit / np.sqrt(np.maximum(value, least))[:, None], np.asarray(value < least)
 
 
 def _tested(

@@ -64,12 +64,10 @@ def pays(without: Array, now: Array) -> bool:
 
 @dataclass(frozen=True)
 class SumAnswer:
-    """The pieces of a diagnosis that a sum of components fills.
-
-    `before` has the columns of the cell's own parameters, `dataset` those beside the weights of
-    links where the sum has them.  `hidden` may be there as well: shares and intervals, not names,
-    count with them.  `instead` is what the sum would be if some kinds of it did not exist.
-    """
+    """The pieces of a diagnosis that a sum of components fills.  `before` has the columns of the
+    cell's own parameters, `dataset` those beside the weights of links where the sum has them.
+    `hidden` may be there as well: shares and intervals, not names, count with them.  `instead` is
+    what the sum would be if some kinds of it did not exist."""
 
     before: DiagnosisData
     dataset: DiagnosisData
@@ -130,11 +128,9 @@ class SumAnswer:
     @cached_property
     def moved(self) -> Array:
         """C (rows, Σ k) in m: C w is what coefficients w leave of the positions once the fitted
-        parameters have followed them, at equal weights.
-
-        They follow in the directions that the readings determine, not in what rounding leaves of
-        parallel axes; what is only uncertain of the load's point is no fitted parameter.
-        """
+        parameters have followed them, at equal weights.  They follow in the directions that the
+        readings determine, not in what rounding leaves of parallel axes; what is only uncertain of
+        the load's point is no fitted parameter."""
         before = self.before
         B = before.data.X[self._rows][:, np.isin(before.fitted, before.base.model.names)]
         B = B / np.maximum(np.linalg.norm(B, axis=0), 1e-300)
@@ -158,17 +154,7 @@ class SumAnswer:
         kept: IntArray = np.flatnonzero(np.isin(rows, some))
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
-        times = self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
-        return kept, times
-
-    def _of_new_poses(self, left: Array) -> Array:
-        """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
-        kept, times = self._poses
-        rows = np.nonzero(self._rows)[0][kept]
-        starts = np.flatnonzero(np.diff(rows, prepend=-1))
-        each = np.add.reduceat(left**2, starts, axis=0)
-        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
-        return np.asarray((times * each).sum(axis=0) / (times * count[:, None]).sum(axis=0))
+        return kept, self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
@@ -217,7 +203,6 @@ class SumAnswer:
 
     @cached_property
     def total(self) -> Array:
-        """Mean squares (draws,) in m² of the whole."""
         return self.squares(range(len(self._spans)))
 
     @property
@@ -245,11 +230,8 @@ class SumAnswer:
     @cached_property
     def _not_paying(self) -> dict[tuple[str, str], float]:
         """Named effects at their places without which configurations that are left out of the fit
-        are predicted better, or worse by less than PAYS: by how many standard errors worse.
-
-        The one that matters least is judged first, and stays out then: of two that say the same,
-        one remains.
-        """
+        are predicted better, or worse by less than PAYS: by how many standard errors worse.  The
+        one that matters least is judged first and stays out: of two alike, one remains."""
         gone: list[int] = []
         out: dict[tuple[str, str], float] = {}
         free = {k for k, c in enumerate(self.found.components) if c.named and not c.given}
@@ -272,17 +254,13 @@ class SumAnswer:
         return squared_lengths(self.found.data, each_left_out(*self._fitted_without(gone)))
 
     def _fitted_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
-        """P (C, m, m) of each configuration and u = P r (C, m) without these components.
-
-        With S the posterior covariance of their coefficients, β̂ the mean, and Y = HL⁻¹ there, P
-        grows by Y S⁻¹Yᵀ and u by Y S⁻¹β̂.
-        """
+        """P (C, m, m) of each configuration and u = P r (C, m) without these components.  With S
+        the posterior covariance of their coefficients, β̂ the mean, and Y = HL⁻¹ there, P grows by
+        Y S⁻¹Yᵀ and u by Y S⁻¹β̂."""
         at, index = self._fitted, self._index(gone) + self._own
         D = at.beta_deviation[:, index]
         Y, W = at.H @ D, np.linalg.inv(D.T @ D)
         return at.P + Y @ W @ Y.transpose(0, 2, 1), at.u + Y @ (W @ at.beta[index])
-
-    # Shares.
 
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
@@ -321,22 +299,18 @@ class SumAnswer:
         return [k for k, c in enumerate(self._every) if _kind(c) == name]
 
     def _by(self, key: Callable[[Component], Any]) -> dict[Any, list[int]]:
-        """The components' numbers by what `key` says of each; without those that it denies."""
+        """The components' numbers by what `key` says of each, without those that it denies."""
         groups: dict[Any, list[int]] = {}
         for k, c in enumerate(self.found.components):
             if own := key(c):
                 groups.setdefault(own, []).append(k)
         return groups
 
-    # How far the gap falls.
-
     @cached_property
     def _true(self) -> Array:
         """Readings without noise (rows, draws) of the configurations that are kept, each left out.
-
         θ* is drawn about the fit to the others, as uncertain as that is: what is read there then
-        has the covariance P_cc⁻¹.
-        """
+        has the covariance P_cc⁻¹."""
         kept, _ = self._poses
         at, configuration = self.at, np.nonzero(self._rows)[0][kept]
         moved = self._wide.X[self._rows][kept] @ (self._drawn - at.beta[:, None])
@@ -353,37 +327,33 @@ class SumAnswer:
         return (self.found.data.r - each_left_out(P, u))[self._rows][self._poses[0]]
 
     def _error_without(self, gone: Sequence[int]) -> Array:
-        """Mean square (draws,) in m² by which new poses err if these are in no model."""
-        predicted = self._predicted(*self._fitted_without(gone))
-        return self._of_new_poses(predicted[:, None] - self._true) + self.supported.unexplained**2
+        """Mean square (draws,) in m² by which new poses err with these in no model."""
+        left = self._predicted(*self._fitted_without(gone))[:, None] - self._true  # (rows, draws)
+        kept, times = self._poses
+        rows = np.nonzero(self._rows)[0][kept]
+        starts = np.flatnonzero(np.diff(rows, prepend=-1))
+        each = (times * np.add.reduceat(left**2, starts, axis=0)).sum(axis=0)
+        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
+        each /= (times * count[:, None]).sum(axis=0)
+        return np.asarray(each + self.supported.unexplained**2)
 
     @cached_property
     def _error(self) -> Array:
-        return self._error_without(self._not_written)
+        return self._error_without(())
 
     def _reduction(self, members: Sequence[int]) -> tuple[float, Interval, Interval]:
         """Fraction by which the noise-free error of new poses falls when these components are added
-        last.
-
-        A configuration c that is left out of a fit is a new pose for it.  Before, the error there
-        is X_c β̂₋c − W_c θ*, after it W_c (θ̂₋c − θ*), with the columns W of all that is held to be
-        true.  What is unexplained is no noise, and stays; so does a change for new readings
-        that fall between its moment and the one that was found.
-        """
-        before = self._error_without([*members, *self._not_written])
+        last.  A configuration c that is left out of a fit is a new pose for it.  Before, the error
+        there is X_c β̂₋c − W_c θ*, after it W_c (θ̂₋c − θ*), with the columns W of all that is held
+        to be true.  What is unexplained is no noise, and stays; so does a change for new readings
+        that fall between its moment and the one that was found."""
+        before = self._error_without(members)
         after = self._error + sum(self._mistimed(k) for k in members)
         return with_intervals(1 - np.sqrt(after / np.maximum(before, 1e-300)))
-
-    @property
-    def _not_written(self) -> Sequence[int]:
-        """Components that no cell has which the answer writes."""
-        return ()
 
     def _mistimed(self, k: int) -> Array | float:
         """Mean square in m² by which new readings err for the moment of a change alone."""
         return 0.0
-
-    # Names.
 
     @cached_property
     def _rivals(self) -> dict[int, dict[tuple[str, str], float]]:
@@ -480,17 +450,15 @@ class SumAnswer:
 
     @cached_property
     def effects(self) -> tuple[FoundEffect, ...]:
-        """What has a name, each effect at a place once, the largest first."""
+        """Each effect at a place once, the largest first."""
         return tuple(self._found_effects(named=True))
 
     @cached_property
     def slight(self) -> tuple[FoundEffect, ...]:
-        """What has a name and moves the markers by next to nothing, or perhaps not at all."""
         return tuple(self._found_effects(named=True, slight=True))
 
     @cached_property
     def fields(self) -> tuple[FoundEffect, ...]:
-        """What has none, and corrects the arm all the same."""
         return tuple(self._found_effects(named=False))
 
     @property
@@ -499,11 +467,9 @@ class SumAnswer:
 
     @cached_property
     def _slight(self) -> set[int]:
-        """Named components, by effect and place, that probably do not matter, or do not pay.
-
-        Where a kind does, and at which of its places these data do not tell, one of them stands for
-        all: the most probable.
-        """
+        """Named components, by effect and place, that probably do not matter, or do not pay.  Where
+        a kind does, and at which of its places these data do not tell, one of them stands for all:
+        the most probable."""
         chance = {own[0]: self._matters(own) for own in self._at_place.values()}
         slight = set()
         for name, members in self._by(_kind).items():
@@ -604,10 +570,7 @@ class SumAnswer:
                 f"{c.where}.{p.key}", float(p.nominal + m * size), p.unit, float(s * size)
             )
 
-    # The budget, and shapes.
-
     def budget(self, first: Sequence[BudgetStep]) -> tuple[BudgetStep, ...]:
-        """The steps so far, one for each named step, and one with what has no name."""
         steps: list[BudgetStep] = list(first)
         members: list[int] = []
         for name, own in self._named_steps():
@@ -622,7 +585,6 @@ class SumAnswer:
         return tuple(steps)
 
     def _named_steps(self) -> Iterator[tuple[str, list[int]]]:
-        """Each group of components, the largest first."""
         for group in self.groups[:MOST_STEPS]:
             yield f"{group.name}:{'+'.join(group.places)}", [
                 k for k, c in enumerate(self.found.components)

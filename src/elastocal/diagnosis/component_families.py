@@ -71,9 +71,6 @@ def moved(dataset: DiagnosisData, key: EntryKey, D: Array) -> Array:
     return dataset.pack(dataset.columns.entry(key) @ D)
 
 
-# What is tried from the start: a curve of every joint, and every effect that needs no search.
-
-
 def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
     effect, model = JointCurve(), dataset.base.model
     joints = turning_joints(model.chain)
@@ -107,7 +104,6 @@ def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
 
 
 def component_of(dataset: DiagnosisData, item: Item) -> Component:
-    """What the forward search found, as a component."""
     h, columns = item.what, dataset.packed(item.what, item.settings)
     if not isinstance(h, Hypothesis):
         return Component("pose", ResidualField(), h.where, columns, follows=h.covariate)
@@ -128,10 +124,8 @@ def drifts(dataset: DiagnosisData) -> Iterator[Component]:
 
 def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Component | None:
     """A drift that varies over less time than its shortest so far, where that is its length; None
-    where it is not, or no shorter one shows between the readings' times.
-
-    A campaign is as long as one likes, and what shares of it the base moves over nobody knows.
-    """
+    where it is not, or no shorter one shows between the readings' times.  A campaign is as long as
+    one likes, and what shares of it the base moves over nobody knows."""
     shortest, time = math.exp(c.lengths[0]), dataset.table.time
     if c.follows != "time" or time is None or log_length > c.lengths[0] + AT_END:
         return None
@@ -141,8 +135,6 @@ def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Componen
         return None
     return field_component(dataset, c.where, "time", share)
 
-
-# Smooth fields.
 
 FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
 # What a drift's shortest length is divided by where it is not short enough, the least share of a
@@ -190,7 +182,7 @@ def without_a_name(
 ) -> list[Component]:
     """What corrects the arm beside the sum and names no cause, the most conspicuous first: smooth
     fields, steps in time, what a joint makes of its torque or last motion, base and links of the
-    load; none of the effects `without` which to do."""
+    load; none of the effects `without`."""
     sums, model = beside(dataset, found, found.noise), dataset.base.model
     respond = partial(_response, dataset.columns.torques())
     tried: tuple[tuple[Effect, Search], ...] = (
@@ -304,8 +296,6 @@ def _yielding(
     return moved(dataset, entry, D * MOTION), dict(settings), 0.0
 
 
-# Families of lines of a joint's error, which are looked for beside all else.
-#
 # A wheel that turns N times per turn of the joint makes lines at N and its multiples: sought
 # together they show where none of them would by itself.  The evidence of 2m columns at N, 2N, …,
 # mN is that of any group; N runs over a grid as fine as the highest of them needs, and each point
@@ -329,10 +319,8 @@ def line_families(
 ) -> list[tuple[float, Component, Scatter, tuple[Component, ...]]]:
     """The most conspicuous family of lines of every joint beside the sum, the best first: what it
     earns in nats less the search, itself, the joint's scatter beside it, and whom it replaces.
-
     What is not found yet counts as scatter of its joint, or as its curve: so a family is tried
-    beside these, and in their place.
-    """
+    beside these, and in their place."""
     sums = beside(dataset, found, found.noise)
     out, now = [], sums.at.marginal
     multiples = MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
@@ -392,9 +380,8 @@ MOST_FOUND = MOST_LINES - 3
 def _best_family(
     grams: Grams, h: Hypothesis, m: int, now: float
 ) -> tuple[float, tuple[float, int, float, float]]:
-    """What the best family of m lines of a joint gains, and its order, m, how well these data know
-    the order, and what finding it cost; `now` is the log marginal likelihood of the sum as it is.
-    """
+    """What the best family of m lines of a joint gains, its order, m, how well these data know the
+    order, and what finding it cost; `now` is the log marginal likelihood of the sum as it is."""
     step = STEP * _apart(grams.dataset, h.where) / m
     orders = np.arange(LOWEST, HIGHEST / m, step)
     # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.
@@ -411,14 +398,11 @@ def _apart(dataset: DiagnosisData, where: str) -> float:
 
 
 def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | None:
-    """The components of a sum with the orders of all lines where they fit best together; None
-    where they are there already.
-
-    Gauss–Newton in the orders N of all families at once, sizes and noise as they are: with
-    amplitudes a_k, b_k at their posterior mean, a family's column is
-    Σ_k k (q − q₀)(a_k cos kNq − b_k sin kNq), which is that of the amplitudes' shifts.  The
-    posterior says how well each order is known.
-    """
+    """The components of a sum with the orders of all lines where they fit best together; None where
+    they are there already.  Gauss–Newton in the orders N of all families at once, sizes and noise
+    as they are: with amplitudes a_k, b_k at their posterior mean, a family's column is Σ_k k
+    (q − q₀)(a_k cos kNq − b_k sin kNq), which is that of the amplitudes' shifts.  The posterior
+    says how well each order is known."""
     families = [k for k, c in enumerate(found.components) if isinstance(c.effect, GearSpectrum)]
     if not families:
         return None
@@ -506,8 +490,7 @@ def family_component(
         settings |= {f"order_{k}": k * order, f"order_sd_{k}": k * sd}
     # The cell with these constants is all that their direction asks of a model.
     chain, cell = dataset.base.model.chain, dataset.base.model.cell
-    spec = replace(cell.model, nominal=cell.model.nominal.at(where, settings))
-    cell = replace(cell, model=spec)
+    cell = replace(cell, model=replace(cell.model, nominal=cell.model.nominal.at(where, settings)))
     lines = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
     D = RegressorDirection(lines, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
     D = D * [LINE * (p.typical or 0.0) for p in lines.parameters]
@@ -550,11 +533,9 @@ ORDERS = math.log(HIGHEST / LOWEST) / math.sqrt(12)
 class OrderPosterior:
     """Of the lines of the joint of the ripple `h` beside the sum without the family `own`: what the
     odds are against no family of `orders` (G,), the lowest one of `multiples` (G,) lines.
-
     `log_odds` (G,) has prior and width of the grid in it, of which `presence` is that of any
     family; `evidence` (G,) is over none.  `grams` score lines of these `scales` under the `scatter`
-    of the joint that is the likeliest with them.
-    """
+    of the joint that is the likeliest with them."""
 
     def __init__(
         self, dataset: DiagnosisData, found: FittedSum, h: Hypothesis,
@@ -566,8 +547,7 @@ class OrderPosterior:
         self.multiples = np.repeat(MULTIPLES, [len(part) for part in grid])
         fellows = [family for where, family in families_of(found).items() if where != h.where]
         mean, variance = alike(np.array([size for *_, size in fellows]), 0.0, ALONE)
-        spread = np.sqrt(variance) * ndtri((np.arange(SIZES) + 0.5) / SIZES)
-        self.scales = np.exp(mean + spread)
+        self.scales = np.exp(mean + np.sqrt(variance) * ndtri((np.arange(SIZES) + 0.5) / SIZES))
         n, k = len(turning_joints(dataset.base.model.chain)), len(fellows)
         self.presence = presence_cost(n, k) - presence_cost(n, k + 1)
         # What is not known of its lines counts as scatter of the joint.
@@ -629,12 +609,9 @@ class OrderPosterior:
         return math.exp(self._odds(its) - np.logaddexp(0.0, logsumexp(self.log_odds)))
 
     def family(self, order: float, m: int) -> Component:
-        """The family of m lines near this order, where it fits best.
-
-        The nats that its search costs are those that make of its evidence, and of the odds that
-        there is any family, its odds against none and all other orders; what is decided here is
-        not asked again.
-        """
+        """The family of m lines near this order, where it fits best.  The nats that its search
+        costs are those that make of its evidence, and of the odds that there is any family, its
+        odds against none and all other orders; what is decided here is not asked again."""
         k = self._peak(order, m)
         width = FINE / SAME * self.resolution / m
         at = float(self.orders[k])
@@ -650,10 +627,8 @@ def log_prior_of(
     orders: Array, multiples: IntArray, unit: float, fellows: Sequence[tuple[float, int, float]]
 ) -> Array:
     """Log prior (G,) of a family's lowest order and number of lines, from those of other joints.
-
     Orders: normal in log N.  A next multiple is there with odds k + 1 to n − k + 1 where k of n
-    families that may have it have it.
-    """
+    families that may have it have it."""
     mean, variance = alike(np.log([order for order, *_ in fellows]), USUAL_ORDER, ORDERS)
     each = np.log(FINE * unit / multiples / orders) - 0.5 * (np.log(orders) - mean) ** 2 / variance
     each -= logsumexp(each[multiples == 1])
@@ -671,9 +646,7 @@ def log_prior_of(
 
 def alike(others: Array, usual: float, spread: float) -> tuple[float, float]:
     """Mean and variance of another one beside these (k,), normal about what they have in common.
-
-    Their own spread counts with one like `usual` ± `spread`, as wide as any is beforehand.
-    """
+    Their own spread counts with one like `usual` ± `spread`, as wide as any is beforehand."""
     k = len(others)
     mean = (float(others.sum()) + usual) / (k + 1)
     variance = (spread**2 + float(((others - mean) ** 2).sum()) + (usual - mean) ** 2) / (k + 1)

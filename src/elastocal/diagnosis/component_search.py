@@ -130,12 +130,9 @@ class Growth:
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, open_: bool, without: set[str], progress: Progress
 ) -> tuple[Growth, FittedSum] | None:
-    """The most probable sum beside the fitted parameters, and what it has grown by.
-
-    `chosen` is what the forward search found: its searched constants are tried as they are, the
-    effects `without` not.  None where it leaves nothing `open_` and no sum beside it promises to be
-    CLEARLY better.
-    """
+    """The most probable sum beside the fitted parameters, and what it has grown by; None where the
+    forward search leaves nothing `open_` and no sum promises to be CLEARLY better.  `chosen` is
+    what that search found: its searched constants are tried as they are."""
     full = _with_together(dataset, without)
     for weighed in (False, True):
         data = with_equal_noise(full)
@@ -163,11 +160,9 @@ def search_components(
 
 
 def _with_lines_first(growth: Growth, found: FittedSum, instrument: NoiseValues) -> FittedSum:
-    """The sum with families of lines, sought beside the others before curves join.
-
-    A curve takes up the lines of its joint as far as few poses show them, and then none of them
-    stands out.  A sum without curves is one of the others already.
-    """
+    """The sum with families of lines, sought beside the others before curves join.  A curve takes
+    up the lines of its joint as far as few poses show them, and then none of them stands out.  A
+    sum without curves is one of the others already."""
     dataset, first, pool = growth.dataset, found, growth.tried
     if curved := any(c in growth.curves for c in found.components):
         first, pool = fit_sum(found.sums.data, growth.others, instrument), growth.others
@@ -183,14 +178,12 @@ def _with_lines_first(growth: Growth, found: FittedSum, instrument: NoiseValues)
 
 
 def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
-    """The data about where the sum has the arm's own parameters and the weights of its links.
-
-    Not about a fit of these alone: a compliance that little else holds, and the moment that
-    deflects its joint, would take up what the other components explain, and the product of both
-    stand in the columns.  Nor do weights stand in the columns of the compliances: twice as soft an
-    arm under half the load would look like one that bends by its weight.  Of one kind all are of
-    one size here: the eccentricity of a joint, which looks like its sag, must not take the weights.
-    """
+    """The data about where the sum has the arm's own parameters and the weights of its links.  Not
+    about a fit of these alone: a compliance that little else holds, and the moment that deflects
+    its joint, would take up what the other components explain, and the product of both stand in the
+    columns.  Nor do weights stand in the columns of the compliances: twice as soft an arm under
+    half the load would look like one that bends by its weight.  Of one kind all are of one size
+    here: the eccentricity of a joint, which looks like its sag, must not take the weights."""
     sizes = found.sizes.size.copy()
     for _, kind in found.sums.pool.kinds:
         sizes[kind] = np.median(sizes[kind])
@@ -205,8 +198,7 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     for c, span in zip(found.components, found.spans, strict=True):
         if (h := c.hypothesis) is not None and isinstance(c.effect, LinkWeights):
             weights.append(h)
-            moved = beta[span] * dataset.sizes[h.key]
-            keyed = zip(h.parameters, moved, strict=True)
+            keyed = zip(h.parameters, beta[span] * dataset.sizes[h.key], strict=True)
             x |= {f"{h.where}.{p.key}": p.nominal + m for p, m in keyed}
     model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in weights])
     at_sum = np.array([x[name] for name in model.names])
@@ -217,10 +209,8 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
 
 
 def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum and the families of lines that stand out beside it, the best first.
-
-    With many poses all that stand out come in at once: what one hides from another is little.
-    """
+    """The sum and the families of lines that stand out beside it, the best first.  With many poses
+    all that stand out come in at once: what one hides from another is little."""
     for _ in range(LINE_SEARCHES):
         stand_out, wider = line_families(dataset, found), found
         many = len(dataset.blocks.member) > FEW_POSES
@@ -275,7 +265,6 @@ RETURNS, MOST_RETURNED = 4, 6
 
 
 def _tuned(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum with the orders of all its lines where they fit best, each beside the others."""
     components = sharpened(dataset, found)
     if components is None:
         return found
@@ -287,7 +276,7 @@ SWEEPS = 2
 
 
 def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum with a family of lines at each joint where the others let expect one, and a line at
+    """The sum with a family of lines at each joint where the others let expect one and a line at
     one order is more probable than all others and none together; the most probable first."""
     while lined := families_of(found):
         others = (h for h in ripples(dataset) if h.where not in lined)
@@ -304,11 +293,9 @@ def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSu
 
 def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with the lines of each joint at another order, a half of it or any, or with more of
-    its multiples or fewer, where this is more probable beside all others.
-
-    A single line may be the first of a family, or the second of one at half its order; which it
-    is shows in the others.  A multiple that is not there costs as much as one that is missed.
-    """
+    its multiples or fewer, where this is more probable beside all others.  A single line may be the
+    first of a family, or the second of one at half its order; which it is shows in the others.  A
+    multiple that is not there costs as much as one that is missed."""
     begun = found
     for _ in range(SWEEPS):
         before = found
@@ -329,12 +316,10 @@ def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
 
 
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
-    """Causes of kinds that are in the sum, at places where they are not, which may be there all
-    the same, or in the place of those that are.
-
-    What looks like something else that is in the sum, as an eccentricity of joint 2 looks like its
-    sag, has no evidence of its own, and what it may take from the other is uncertain.
-    """
+    """Causes of kinds that are in the sum, at places where they are not, which may be there all the
+    same, or in the place of those that are.  What looks like something else that is in the sum, as
+    an eccentricity of joint 2 looks like its sag, has no evidence of its own, and what it may take
+    from the other is uncertain."""
     here = {c.effect.name for c in found.components}
     hidden = [c for c in found.away(components) if c.effect.name in here and c.fellows > 1]
     sizes = [np.full((1, c.width), np.exp(size_of_fellows(found, c))) for c in hidden]
@@ -403,12 +388,10 @@ GAINED = 0.5  # nats that a search must bring for another one
 
 
 def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
-    """Log posterior of a sum under the priors that the forward search's sets have.
-
-    Within a sum many causes are expected, so that each costs little; to be believed instead of a
-    few, the first of each kind has to pay what one more effect of the catalogue pays there, and a
-    line or what has no name what its search costs.
-    """
+    """Log posterior of a sum under the priors that the forward search's sets have.  Within a sum
+    many causes are expected, so that each costs little; to be believed instead of a few, the first
+    of each kind has to pay what one more effect of the catalogue pays there, and a line or what has
+    no name what its search costs."""
     prior = log_prior_odds(dataset.hypotheses, [], ANOTHER)
     odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior, strict=True)}
     usual = min(odds.values(), default=0.0)
@@ -426,19 +409,15 @@ def compared_score(dataset: DiagnosisData, found: FittedSum) -> float:
     return score
 
 
-# What else could stand in a component's place, the others given.
-
 WIDE = np.exp(np.linspace(-3.0, 5.0, 9))  # sizes that are tried, in typical ones
 
 
 class Beside:
-    """Log evidence of other columns beside a sum, by sums over the rows.
-
-    Columns t are left A_t = M_tt − UᵀA U and b_t = z_t − Uᵀb of their normal matrix and right side,
-    with A and b of the sum's coefficients in units of their prior and U = A⁻¹ M_xt.  Where those of
-    a component c are gone, UᵀA U is less by U_cᵀ W U_c and Uᵀb by U_cᵀ W b_c, W the inverse of
-    (A⁻¹)_cc; and c itself is left W − 1 and W b_c.
-    """
+    """Log evidence of other columns beside a sum, by sums over the rows.  Columns t are left
+    A_t = M_tt − UᵀA U and b_t = z_t − Uᵀb of their normal matrix and right side, with A and b of
+    the sum's coefficients in units of their prior and U = A⁻¹ M_xt.  Where those of a component c
+    are gone, UᵀA U is less by U_cᵀ W U_c and Uᵀb by U_cᵀ W b_c, W the inverse of (A⁻¹)_cc; and c
+    itself is left W − 1 and W b_c."""
 
     def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
         M, z = found.sums.products.M, found.sums.products.z
@@ -465,10 +444,8 @@ class Beside:
 
 def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
     """Nats that components bring beside a set, whatever their being there costs: the best of them,
-    the best other one beside the set and this at its typical size, and so on.
-
-    About what a sum of all can be more probable by than the set.
-    """
+    the best other one beside the set and this at its typical size, and so on.  About what a sum of
+    all can be more probable by than the set."""
     taken, data = {id(item.what) for item in chosen.items}, chosen.data
     others = [c for c in components if id(c.hypothesis) not in taken]
     sums, p = posed(data, others, chosen.noise), len(data.precision)
@@ -495,8 +472,7 @@ def evidence_beside(
     """Log evidence of each component beside the sum, of a smooth one at its best length; or times
     its `scalings`."""
     scalings = scalings or [c.scalings for c in components]
-    left = Beside(found, [c.columns for c in components]).left
-    return evidence_of_groups(left, scales, scalings)
+    return evidence_of_groups(Beside(found, [c.columns for c in components]).left, scales, scalings)
 
 
 def imitators(
@@ -544,11 +520,8 @@ def with_likelier_names(
 
 def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     """The sum with a kind of cause at all its places, or in the place of another kind, where that
-    is more probable.
-
-    What acts at every joint, a little at each, comes in together or not at all; and a single one of
-    another kind that stands in its place goes with it.
-    """
+    is more probable.  What acts at every joint, a little at each, comes in together or not at all;
+    and a single one of another kind that stands in its place goes with it."""
     if found.complete is components:
         return found
     kinds: dict[str, list[Component]] = {}
@@ -597,7 +570,7 @@ def _kinds_that_show(
 
 
 def _with_together(dataset: DiagnosisData, without: Container[str]) -> DiagnosisData:
-    """The data with the effects that are judged in the sum alone, whose columns they have."""
+    """The data with the effects, whose columns they have, that are judged in the sum alone."""
     base, kept = dataset.base, list(dataset.hypotheses)
     # Lines are sought as ripples are, whether or not one may be named.
     if GearSpectrum.name in without:
@@ -623,8 +596,7 @@ def with_own_axes(found: FittedSum) -> FittedSum:
     A camera is worse along its line of sight, a tracker across it.  Beside the sum the residual is
     the instrument's, as it was not before.  Variances v_i of the axes maximise the restricted
     likelihood, uᵢᵀuᵢ = tr Pᵢᵢ at the maximum (Harville 1977); the logarithm of a ratio, known to
-    √(1/2n) afterwards, costs what finding it costs.
-    """
+    √(1/2n) afterwards, costs what finding it costs."""
     data, size = found.sums.data, min(found.data.blocks.size, 3)
     if data.stated or size < 2:
         return found
@@ -649,8 +621,7 @@ def with_own_axes(found: FittedSum) -> FittedSum:
                        for c in (data.covariance, V))  # fmt: skip
     if own_axes > equal - 2 * cost:
         return found
-    other = replace(data, covariance=V)
-    return fit_sum(other, found.components, found.noise, found.sizes)
+    return fit_sum(replace(data, covariance=V), found.components, found.noise, found.sizes)
 
 
 AXES = 0.5  # spread of the logarithms of an instrument's noise along its axes
@@ -658,10 +629,8 @@ AXIS_STEPS, AXES_SETTLED = 20, 0.02
 
 
 def with_equal_noise(dataset: DiagnosisData) -> NoisyData:
-    """The data; where no noise is stated, with the same variance along all axes.
-
-    Its shape else is that of the residual, which the missing effects make and no instrument.
-    """
+    """The data; where no noise is stated, with the same variance along all axes.  Its shape else is
+    that of the residual, which the missing effects make and no instrument."""
     data = dataset.data
     if data.stated:
         return data

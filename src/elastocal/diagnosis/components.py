@@ -69,8 +69,7 @@ class Component:
     motion.  `settings` are constants of the effect by key, `search` what finding them cost in nats;
     `follows` is what a field depends on; `fellows` at how many places there may be one of its kind.
     One that is `given` stays in the sum: the columns of others are about it, or it has been
-    compared with its absence already.
-    """
+    compared with its absence already."""
 
     family: Family
     effect: Effect
@@ -116,8 +115,7 @@ class Component:
 
     @property
     def scalings(self) -> Array:
-        """What makes its columns ones of equal prior variance (L, k), of a smooth function at L
-        lengths."""
+        """Scalings (L, k) that give its columns equal prior variances, at L lengths if smooth."""
         lengths = [0.0] if self.waves is None else np.linspace(*self.lengths, 3)
         return np.sqrt([self.shares(v)[0] for v in lengths])
 
@@ -149,13 +147,11 @@ class Sizes:
 
 
 class Pool:
-    """The prior of which components are there, and of the logarithms of their sizes.
-
-    A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  It is there
-    with probability PRESENT, then at any number of them with equal probability, and at any k of
-    them (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n
-    over k) nats.  The logarithms of a kind's sizes spread by SPREAD in all, ALONE of it their own.
-    """
+    """The prior of which components are there, and of the logarithms of their sizes.  A kind has n
+    places, the k-th family of lines of a joint as one of the k-th ones.  It is there with
+    probability PRESENT, then at any number of them with equal probability, and at any k of them
+    (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n over k)
+    nats.  The logarithms of a kind's sizes spread by SPREAD in all, ALONE of it their own."""
 
     def __init__(self, components: Sequence[Component]) -> None:
         ranks: Counter[tuple[str, str, str]] = Counter()
@@ -235,11 +231,8 @@ SETTLED, ROUGHLY, STEPS = 2e-3, 0.1, 30
 @dataclass(frozen=True)
 class SumOfComponents:
     """Components beside the data's own columns, under a noise whose factor is free: −2ℓ and its
-    slope.
-
-    Of the data under that `noise` V: `inverse` V⁻¹ (C, m, m), zero where rows do not count;
-    `products` with the components last; and what of −2ℓ no coefficient changes.
-    """
+    slope.  Of the data under that `noise` V: `inverse` V⁻¹ (C, m, m), zero where rows do not count;
+    `products` with the components last; and what of −2ℓ no coefficient changes."""
 
     data: NoisyData
     components: tuple[Component, ...]
@@ -281,21 +274,18 @@ class SumOfComponents:
         return Pool(self.components)
 
     def _beside(self, columns: Array) -> Across:
-        """Of columns beside the data's own and the components'."""
         white = _rows(self.inverse @ columns)
         others = (self.data.X, *(c.columns for c in self.components))
         across = np.concatenate([_rows(C).T @ white for C in others])
         return across, _rows(columns).T @ white, white.T @ self.data.r.ravel()
 
     def across(self, columns: Sequence[Array]) -> Iterator[Across]:
-        """Of each of these columns."""
         for some in bundles(columns):
             cross, own, z = self._beside(side_by_side(self.data, some))
             for at in spans_of([c.shape[2] for c in some], len(z)):
                 yield cross[:, at], own[at, at], z[at]
 
     def joined(self, more: Sequence[Component]) -> SumOfComponents:
-        """The sum with these as well."""
         out = self
         for columns in bundles([c.columns for c in more]):
             some, more = more[: len(columns)], more[len(columns) :]
@@ -317,13 +307,11 @@ class SumOfComponents:
         return found, self.constant + self.products.value(found)
 
     def objective(self, theta: Array) -> tuple[float, Array, Array]:
-        """−2 log posterior of the logarithms, its slope and its average information (1 + 2 K,
-        1 + 2 K): the mean of observed and expected curvature (Gilmour, Thompson and Cullis 1995,
-        Biometrics 51, 1440).
-
-        With A the coefficients' precision in units of their prior deviations and b their mean, two
-        parameters that change the logarithms of prior variances by s and t share sᵀb(1 − A⁻¹)bt.
-        """
+        """−2 log posterior of the logarithms, its slope and its average information
+        (1 + 2 K, 1 + 2 K): the mean of observed and expected curvature (Gilmour, Thompson and
+        Cullis 1995, Biometrics 51, 1440).  With A the coefficients' precision in units of their
+        prior deviations and b their mean, two parameters that change the logarithms of prior
+        variances by s and t share sᵀb(1 − A⁻¹)bt."""
         K, at = len(self.components), Sizes.of(theta)
         by_length = np.zeros_like(self.by_size)
         for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
@@ -361,8 +349,7 @@ class SumOfComponents:
 
     def earned(self, at: Standardised) -> tuple[Array, Array]:
         """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
-        (K,) is due to coefficients that cannot be negative, by the posterior's share of that half.
-        """
+        (K,) is due to coefficients that cannot be negative: the posterior's share of that half."""
         inverse, within = at.covariance, np.zeros(len(self.components))
         for k, span in enumerate(self.spans):
             i = np.arange(span.start, span.stop)[self.components[k].bounded]
@@ -389,10 +376,8 @@ def posed(
     data: NoisyData, components: Sequence[Component], noise: NoiseValues,
     known: SumOfComponents | None = None,
 ) -> SumOfComponents:  # fmt: skip
-    """The sum of these components beside the data's own columns, under one noise.
-
-    What a sum that is `known` of the same data has summed up under this noise is not summed anew.
-    """
+    """The sum of these components beside the data's own columns, under one noise.  What a sum that
+    is `known` of the same data has summed up under this noise is not summed anew."""
     if known is None or known.noise is not noise:
         own = Weighted.of(data, noise)
         inverse = own.root.transpose(0, 2, 1) @ own.root
@@ -408,12 +393,10 @@ def _rows(columns: Array) -> Array:
 @dataclass(frozen=True)
 class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
-
     `earned` (K,) nats of each, `spread` (K, K) the covariance of the logarithms of their sizes;
     `sums` are those over the rows of the data, which are without their columns, `variances` (Σ k,)
     their coefficients' prior.  `complete` are the components whose kinds have been tried at all
-    their places beside it.
-    """
+    their places beside it."""
 
     sizes: Sizes
     noise: NoiseValues
@@ -445,19 +428,16 @@ class FittedSum:
 
     @property
     def spans(self) -> tuple[slice, ...]:
-        """Where each component's coefficients stand among those of the data, last of all."""
         return self.sums.spans
 
     def away(self, components: Sequence[Component]) -> list[Component]:
-        """Those of these components that are not in it."""
         return [c for c in components if c not in self.components]
 
     def without_these(self, some: Sequence[Component] = ()) -> NoisyData:
         """The data beside all but some of the components, these by the directions that show: half
         as many columns, for searches."""
         every = zip(self.components, self._shown, strict=True)
-        columns = [shown for c, shown in every if c not in some]
-        joined = side_by_side(self.sums.data, columns)
+        joined = side_by_side(self.sums.data, [shown for c, shown in every if c not in some])
         return self.sums.data.with_columns(joined, np.ones(joined.shape[2]))
 
 
@@ -471,7 +451,6 @@ def fit_sum(
     start: Sizes | None = None, refit_noise: bool = True, known: SumOfComponents | None = None,
 ) -> FittedSum:  # fmt: skip
     """Maximise over all sizes; leave out, one after the other, what does not earn its cost.
-
     `known` are the sums of a fit to the same data, which are not summed anew."""
     at, rounds = start or Sizes.start(components), 2 if refit_noise and start is None else 1
     problem = posed(data, components, noise, known)
@@ -563,8 +542,6 @@ def _compressed(columns: Array, variances: Array, inverse: Array, faint: float =
     return np.asarray(scaled @ vectors[:, values > faint])
 
 
-# Posterior draws of a sum's coefficients, the sizes of its components drawn with them.
-#
 # Two causes that look alike share what they do by their sizes; which of these are the most probable
 # decides little.  So the sizes of effects that need no search are drawn as well, one after another
 # given the others (Gibbs), their coefficients integrated out: with A and b what the others leave of
@@ -630,11 +607,9 @@ def drawn(
 
 @dataclass(frozen=True)
 class _Kind:
-    """What has sizes that are alike: a kind's components, or an effect's parameters.
-
-    Its members' `spans` of the columns and `logs` (k,) of their sizes, −∞ of none; what finding
-    them `sought` (k,); at how many `places` there may be one, None where it is there in any case.
-    """
+    """What has sizes that are alike: a kind's components, or an effect's parameters.  Its members'
+    `spans` of the columns and `logs` (k,) of their sizes, −∞ of none; what finding them `sought`
+    (k,); at how many `places` there may be one, None where it is there in any case."""
 
     spans: Sequence[slice]
     logs: Array

@@ -23,13 +23,13 @@ from elastocal.diagnosis.component_search import (
     compared_score,
     hidden_fellows,
     search_components,
+    sum_of,
 )
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Diagnosis, FoundEffect, Gap, StructureTest
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of, generic_blocks
 from elastocal.diagnosis.effect_search import (
     MANY,
     ForwardSelection,
-    SelectedEffects,
     with_likelier_backlash_model,
 )
 from elastocal.diagnosis.hypotheses import (
@@ -91,11 +91,9 @@ def write_extended_cell(
     is left to be chosen for a plan.  Comments are not carried over.  Without effects the model is
     the one that was read.
 
-    Raises InputError where `source` is no valid cell file or `target` cannot be written.
-    """
+    Raises InputError where `source` is no valid cell file or `target` cannot be written."""
     source, target = Path(source), Path(target)
-    cell = read_cell(source)
-    data = {"name": cell.name} | read_toml(source, "cell file")
+    data = {"name": read_cell(source).name} | read_toml(source, "cell file")
     # The real folders: ".." of a link to a folder is not where the link stands.
     data = _redirected(data, source.parent, os.path.realpath(target.parent))
     model = data.setdefault("model", {}) if found else {}
@@ -151,8 +149,7 @@ class DiagnosisOptions:
 
     `false_alarm`: probability that something is claimed where nothing is, for the whole family of
     hypotheses.  `without`: effects taken out of the catalogue.  `seed`: of the sign flips and of
-    the draws behind intervals.
-    """
+    the draws behind intervals."""
 
     seed: int = 0
     without: tuple[str, ...] = ()
@@ -188,8 +185,7 @@ def diagnose(
     marginal likelihood; what is claimed has to beat the whole family under sign flips.
 
     Raises InputError for data that contradict robot or cell, InsufficientDataError where there
-    are too few configurations to tell an effect from noise.
-    """
+    are too few configurations to tell an effect from noise."""
     options = options or DiagnosisOptions()
     found = _diagnosed(model, table, options, progress)
     assert found.calibrated is not None
@@ -235,7 +231,8 @@ def _diagnosed(
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
     dataset, found, suspects = _searched(dataset, options, progress)
-    few = FewAnswer.of(dataset, found, np.random.default_rng(options.seed))
+    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
+    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
     tests, answer = structure_tests(found.first), whole or few
@@ -352,13 +349,13 @@ def _pieces(
 
 def _searched(
     dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
-) -> tuple[DiagnosisData, SelectedEffects, BoolArray]:
+) -> tuple[DiagnosisData, ForwardSelection, BoolArray]:
     """What is missing, the data without the faulty readings, which are sought twice, since beside
     a large effect nothing looks faulty, or the wrong readings do, and suspects (N,) that stay."""
 
-    def search_without(faulty: BoolArray) -> SelectedEffects:
+    def search_without(faulty: BoolArray) -> ForwardSelection:
         good = dataset.without(faulty)
-        return ForwardSelection(good, generic_blocks(good), options.false_alarm, options.seed).run()
+        return ForwardSelection(good, generic_blocks(good), options.false_alarm, options.seed)
 
     progress("noise floor")
     faulty, suspects = screen_outliers(dataset, dataset.data)

@@ -23,8 +23,7 @@ class RivalPair:
     """Two hypotheses and how far apart they are: d in standard deviations of the noise, in the
     data so far and with the extra poses, each the smaller of the two ways round.
 
-    The best possible test between two known alternatives is right with probability Φ(d/2).
-    """
+    The best possible test between two known alternatives is right with probability Φ(d/2)."""
 
     first: str
     second: str
@@ -40,8 +39,7 @@ class ExtraPlan:
     poses cannot separate them; `probability_before` and `probability_after` of naming the right
     one of the rivals; `probability_random` the same after as many random poses.  Rivals that no
     pose separates count as one: `inseparable`, groups of their names.  `advice` in words (load,
-    approach direction, time, monuments).
-    """
+    approach direction, time, monuments)."""
 
     separable: bool
     inseparable: tuple[tuple[str, ...], ...]
@@ -92,8 +90,7 @@ class FoundEffect:
     `probability` that it is this effect at this place.  `gap_reduction` is the fraction by which
     the 3-D error of noise-free new poses falls when the effect joins all others in the model, with
     90 and 95 % intervals.  `settings` are its searched constants (orders, times) by their keys,
-    `sizes` the typical deviations of its parameters from nominal by theirs, where estimated.
-    """
+    `sizes` the typical deviations of its parameters from nominal by theirs, where estimated."""
 
     effect: str
     where: str
@@ -114,8 +111,7 @@ class ComponentShare:
     "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is that of the
     squared gap after geometry which goes when it is added last, with its 90 % interval.  `rms` in
     m, with its 95 % interval.  `probability` that it is there and moves the markers by a hundredth
-    of the gap's rms or more; `named` where some effect of the catalogue is in it.
-    """
+    of the gap's rms or more; `named` where some effect of the catalogue is in it."""
 
     family: str
     where: str
@@ -133,8 +129,7 @@ class EffectGroup:
     """One finding: an effect at all the places where it acts, with its share of the gap and the
     fraction by which the error of new poses falls when it is added to all the others.
 
-    `name` is the effect's, or "gear_errors" for all that goes with a joint's own angle.
-    """
+    `name` is the effect's, or "gear_errors" for all that goes with a joint's own angle."""
 
     name: str
     places: tuple[str, ...]
@@ -151,8 +146,7 @@ class Candidate:
 
     `score` is the log of its marginal likelihood over that of no further effect (nats);
     `detectable` the distance d, in standard deviations, that its typical size moves the data
-    once the fitted parameters have followed: below about 3 these data could not show it.
-    """
+    once the fitted parameters have followed: below about 3 these data could not show it."""
 
     effect: str
     where: str
@@ -194,8 +188,7 @@ class Gap:
 
     `unexplained` is scatter that fits as if it were noise, and is none: repeats do not show it,
     neighbours in pose or time share it, or joints would have to be worse than joints are.
-    `joint_stands_out`: one scatters more than the others let expect.
-    """
+    `joint_stands_out`: one scatters more than the others let expect."""
 
     nominal: float
     calibrated: float
@@ -229,8 +222,7 @@ class StructureTest:
 
     It is "joint2 angle", "joint3 torque", "time", "load", "approach of joint1", ….  `p_value` by
     sign flips of whole configurations, for the largest statistic of the covariate's tests;
-    `p_family` the same against the largest over all covariates.
-    """
+    `p_family` the same against the largest over all covariates."""
 
     driver: str
     p_value: float
@@ -243,8 +235,7 @@ class Curve:
     `driver`.
 
     `x` in `x_unit` over the measured range, `y` and its standard deviation `sd` in `y_unit`.
-    One curve per component of the entry that moves.
-    """
+    One curve per component of the entry that moves."""
 
     driver: str
     x_unit: str
@@ -261,8 +252,7 @@ class Location:
     that name no effect.
 
     Where many causes act at once, `stage` and `where` are those of the largest, the probabilities
-    are that something acts there at all, and `shares` are those of each stage in the gap.
-    """
+    are that something acts there at all, and `shares` are those of each stage in the gap."""
 
     stage: Stage
     where: str
@@ -302,8 +292,7 @@ class NearRepeats:
 
     `scatter` (m): rms per axis of a reading, over `pairs` of which so many are `independent`;
     `soon` and `later` the same of pairs measured one soon after the other and of the others, None
-    where one of them has few.
-    """
+    where one of them has few."""
 
     scatter: float
     pairs: int
@@ -323,8 +312,7 @@ class NoiseFloor:
     `shared_by_joint` (joints,) that of each joint.  `pure_error` (m): rms per axis within repeats,
     `near_repeats`: what readings at nearly the same pose differ by, None without.  `drift` (m)
     and `configuration` (m per axis, common to one): what the cell states of them and nobody has to
-    find.
-    """
+    find."""
 
     stated: bool
     stated_factor: float
@@ -431,8 +419,7 @@ class Diagnosis(Result):
 
         d² = Σ |δ|² / σ² per axis, with a configuration as one reading of the noise floor and of
         what is unexplained, in which effects hide as well: more readings and loads per
-        configuration only make smaller effects visible.
-        """
+        configuration only make smaller effects visible."""
         independent = 3 * self.n_configurations
         hidden_in = math.hypot(self.gap.noise_floor, self.gap.unexplained)
         return VISIBLE * hidden_in / math.sqrt(independent) if independent else math.nan
@@ -445,10 +432,13 @@ class Diagnosis(Result):
         """The diagnosis as a JSON-ready dictionary (DESIGN: diagnose → JSON).
 
         Lengths are in µm where the key says _um, everything else in the SI unit that stands beside
-        it.  A number that is not known or not finite is null, as JSON has none.
-        """
+        it.  A number that is not known or not finite is null, as JSON has none."""
         model = self.model
         assert model is not None  # `diagnose` states it
+        location = dict(vars(self.location)) if self.location else {}
+        if location:
+            parts = ("stages", "places", "drivers", "shares")
+            location["evidence"] = {key: location.pop(key) for key in parts}
         content = {
             "schema": SCHEMA,
             "robot": model.chain.name,
@@ -468,7 +458,7 @@ class Diagnosis(Result):
             ],
             "fields": [_found(effect) for effect in self.fields],
             "slight": [_found(effect) for effect in self.slight],
-            "location": self.location and _with_evidence(self.location),
+            "location": location or None,
             "noise": _noise(self.noise, model),
             "extra_plan": self.extra and {k: v for k, v in vars(self.extra).items() if k != "plan"},
             "backend": model.backend_report(),
@@ -607,13 +597,6 @@ def _found(f: FoundEffect) -> dict[str, Any]:
     def told(p: FittedParameter) -> dict[str, Any]:
         if math.isinf(p.std):
             return vars(p) | {"value": None, "ci95": None}
-        ends = [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]
-        return vars(p) | {"ci95": ends}
+        return vars(p) | {"ci95": [p.value - NORMAL_95 * p.std, p.value + NORMAL_95 * p.std]}
 
     return vars(f) | {"parameters": [told(p) for p in f.parameters]}
-
-
-def _with_evidence(location: Location) -> dict[str, Any]:
-    out = dict(vars(location))
-    parts = ("stages", "places", "drivers", "shares")
-    return out | {"evidence": {key: out.pop(key) for key in parts}}

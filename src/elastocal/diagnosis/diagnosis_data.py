@@ -28,7 +28,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.identification.noise_structure import CONFIGURATION, TIME, stated_deviations
 from elastocal.identification.start import as_placed
-from elastocal.measurements import Measurements, first_of_visit, numbered
+from elastocal.measurements import Measurements, first_of_visit
 from elastocal.messages import InsufficientDataError
 from elastocal.model.effects.base import Setting, Stage, usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -51,8 +51,7 @@ class DiagnosisData:
     these columns, of the load point's the effect, of a stated drift's that of the base.
     `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a load.
     `other_backlash` is the probability that play follows the backlash model that the base's model
-    does not have.
-    """
+    does not have."""
 
     base: Baseline
     columns: Columns
@@ -85,11 +84,6 @@ class DiagnosisData:
     def lead(self) -> IntArray:
         """Row (N,) of the table that each observation stands in first."""
         return self.base.observed.lead
-
-    @cached_property
-    def kind(self) -> IntArray:
-        """The marker and load of each observation (N,), numbered."""
-        return numbered(self.table.marker[self.lead], self.base.observed.load)
 
     @cached_property
     def visit_table(self) -> Measurements:
@@ -147,8 +141,7 @@ class DiagnosisData:
 
     @cached_property
     def moments(self) -> Array:
-        """Every moment at which something may have changed between two visits; none without
-        times."""
+        """Moments between visits at which something may have changed, if times are known."""
         time = self.visits.time
         return np.zeros(0) if time is None else moments_between(time)
 
@@ -216,18 +209,12 @@ class DiagnosisData:
 
 
 def diagnosis_data_of(
-    base: Baseline,
-    hypotheses: list[Hypothesis],
-    around: Model | None = None,
-    x: Array | None = None,
-    apart: bool = False,
-) -> DiagnosisData:
-    """Compute all columns at the baseline's fit and gather them by configuration.
-
-    `around` is the base's model with some of the hypotheses in it, at its values x: columns are
-    those there, and the residual is the baseline's.  `apart`: those of the base's own parameters
-    are without the hypotheses.
-    """
+    base: Baseline, hypotheses: list[Hypothesis], around: Model | None = None,
+    x: Array | None = None, apart: bool = False,
+) -> DiagnosisData:  # fmt: skip
+    """All columns at the baseline's fit, gathered by configuration.  `around` is the base's model
+    with some of the hypotheses in it, at its values x: columns are those there, and the residual is
+    the baseline's.  `apart`: those of the base's own parameters are without them."""
     model, observed, blocks = base.model, base.observed, base.blocks
     # The load's own error, whose load point has a tolerance in any case.
     acting = model.cell.model.torque != "measured"
@@ -266,15 +253,12 @@ def diagnosis_data_of(
     B = B[:, :, used]
     joints = tuple(f"joint{i + 1}" for i in range(model.chain.n_joints))
     data = NoisyData(
-        blocks=blocks,
-        r=blocks.pack(residual[:, :, None])[:, :, 0],
-        X=blocks.pack(B),
-        precision=np.ones(B.shape[2]),
+        blocks, r=blocks.pack(residual[:, :, None])[:, :, 0],
+        X=blocks.pack(B), precision=np.ones(B.shape[2]),
         covariance=blocks.pack_square(base.covariance) + common,
         G=blocks.pack(columns.entry(("joint_motion", joints))[observed.lead]),
-        left_out=blocks.absent,
-        stated=base.stated is not None,
-    )
+        left_out=blocks.absent, stated=base.stated is not None,
+    )  # fmt: skip
     fitted = tuple(n for n, u in zip(names, used, strict=True) if u)
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
 
@@ -282,10 +266,8 @@ def diagnosis_data_of(
 def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     """What the cell's [noise] states that readings share: columns (N, size, k) of the drift,
     coefficients of variance one, and the covariance (C, m, m) of what changes faster than its waves
-    and of what is common to a configuration.
-
-    It is noise: left out, it passes for an effect that goes with time or with the joints' angles.
-    """
+    and of what is common to a configuration.  It is noise: left out, it passes for an effect that
+    goes with time or with the joints' angles."""
     observed, member, n = base.observed, base.blocks.member, len(base.observed.lead)
     some = subset(observed, np.arange(n) < base.n_measured)
     waves = np.zeros((n, observed.size, 0))
@@ -300,11 +282,7 @@ def _stated_in_common(base: Baseline) -> tuple[Array, Array | float]:
     return waves, common
 
 
-# Dependences without a name: any place moves smoothly with anything that was recorded.
-
 UNKNOWN_EFFECT = "unknown_effect"  # the name of all that has none
-
-# What an unknown effect may depend on: angles, time, torque, load, direction, force, view.
 
 WAVES, FEW_WAVES = 8, 3  # functions of a smooth dependence, and of one in a product
 
@@ -386,12 +364,10 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
 
 def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, tuple[EntryKey, Array]]]:
     """Places that the load bends, the base and each link's end, with the entry that moves them and
-    the load's force and moment (n_rows, 6) there along the entry's axes, of a visit's first row.
-
-    A frame moved by e moves every marker by R e, so the columns of its frame are R; and turned
-    about e they move a marker by R e × lever, whose product with the force is the moment about e,
-    the load taken at the marker.
-    """
+    the load's force and moment (n_rows, 6) there along the entry's axes, of a visit's first row.  A
+    frame moved by e moves every marker by R e, so the columns of its frame are R; and turned about
+    e they move a marker by R e × lever, whose product with the force is the moment about e, the
+    load taken at the marker."""
     if not recorded(dataset.table, "load"):
         return
     n, begun = dataset.table.q.shape[1], first_of_visit(dataset.table)
@@ -405,10 +381,8 @@ def wrenches(dataset: DiagnosisData) -> Iterator[tuple[str, tuple[EntryKey, Arra
 
 
 def waves(x: Array, present: BoolArray, count: int) -> Array:
-    """cos(kπu)/k, k = 1 … count, of x (C, v) scaled to u in [0, 1]: (C, v, count).
-
-    The fall with k makes a Gaussian prior over their weights one over continuous functions.
-    """
+    """cos(kπu)/k, k = 1 … count, of x (C, v) scaled to u in [0, 1]: (C, v, count).  The fall with k
+    makes a Gaussian prior over their weights one over continuous functions."""
     known = x[present]
     span = max(float(np.ptp(known)), 1e-12)
     u = (x - known.min()) / span
@@ -418,15 +392,11 @@ def waves(x: Array, present: BoolArray, count: int) -> Array:
 
 def monomials(x: Array) -> Array:
     """The components of x (n, 3) and their products, without the constant."""
-    several = range(x.shape[1])
-    products = [x[:, [i]] * x[:, [j]] for i in several for j in range(i + 1)]
+    products = [x[:, [i]] * x[:, [j]] for i in range(x.shape[1]) for j in range(i + 1)]
     return np.concatenate([x, *products], axis=1)
 
 
-# Blocks: each is one covariate at one place of the chain.  Joint i's angle moves joint k or frame
-# k; time, torque, load and approach direction move joints, frames, markers; the load's force and
-# moment give way at a link; a field over the workspace or a marker's angle of view moves the
-# reading; and products of load with time, angle and direction.  Where a block explains the residual
+# Blocks: each is one covariate at one place of the chain.  Where a block explains the residual
 # better than every effect of the catalogue, the effect is unknown and the block is its location.
 
 # Prior sizes of an entry's components at the largest of a smooth dependence.

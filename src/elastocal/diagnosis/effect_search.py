@@ -4,7 +4,7 @@ step re-examined, under noise fitted beside it."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -35,19 +35,15 @@ from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, IntArray
 
-# A set of additions to the model: its noise, its evidence, its estimates, its imitators.
-
 REFINED_ROUNDS = 3  # of settings that depend on each other
 
 
 class ModelSet:
     """Additions `items` to the fitted model, noise fitted beside them, and the log posterior.
-
-    `score` = log evidence at the fitted noise, sizes mixed, + log prior of noise and items.
-    `data` holds the items' columns at the best of their scales, `scales` (items,).  The noise is
-    fitted from `start`, twice where the best scale is not the typical one; the items' columns, of
-    typical size, stand last in `joined`.
-    """
+    `score` = log evidence at the fitted noise, sizes mixed, + log prior of noise and items.  `data`
+    holds the items' columns at the best of their scales, `scales` (items,).  The noise is fitted
+    from `start`, twice where the best scale is not the typical one; the items' columns, of typical
+    size, stand last in `joined`."""
 
     def __init__(
         self, dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None,
@@ -115,18 +111,14 @@ def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
 
 
 def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ...]) -> Array:
-    """Of the coefficients of the data's columns and of the items'."""
     own = [np.full(item.what.width, 1 / s**2) for item, s in zip(items, scales, strict=True)]
     return np.concatenate([data.precision, *own])
 
 
 def within_bounds(z: Array) -> float:
     """Σ log 2Φ(z) over parameters that cannot be below their nominal value, z = mean/deviation of
-    each above it.
-
-    A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
-    posterior's share of that half, each parameter taken by itself.
-    """
+    each above it.  A compliance's size prior is one half of the Gaussian; the evidence gains or
+    loses by the posterior's share of that half, each parameter taken by itself."""
     return float((np.log(2) + log_ndtr(z)).sum())
 
 
@@ -134,11 +126,9 @@ def _mixed_scales(
     data: NoisyData, weighted: Weighted, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> tuple[tuple[float, ...], float]:
     """The best scale of each item, the others' at theirs, and the evidence with scales mixed.
-
     Scales of different items hardly depend on each other: the log of each one's mean over its
     scales, less its best, adds up.  Only the prior differs from scale to scale: `weighted`, the
-    data with the items' columns, stays.
-    """
+    data with the items' columns, stays."""
     if not items:
         return scales, weighted.factored(data.precision)[1]
     spent = 0.0
@@ -151,9 +141,8 @@ def _mixed_scales(
 
 
 def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
-    """Item k's settings refined between the grid's points, at the set's noise; and, where its wrong
-    settings may have made joints scatter from pose to pose, at one with no more of that than usual.
-    """
+    """Item k's settings refined between the grid's points, at the set's noise; and, where wrong
+    settings may have made joints scatter from pose to pose, at one with no more than usual."""
     noise = chosen.noise
     quiet = replace(noise, shared=np.minimum(noise.shared, SHARED))
     tried = [noise, quiet] if (noise.shared > 2 * SHARED).any() else [noise]
@@ -164,10 +153,8 @@ def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
 def _refined(
     dataset: DiagnosisData, chosen: ModelSet, k: int, noise: NoiseValues
 ) -> ModelSet | None:
-    """The same at one noise; None where nothing was searched.
-
-    One setting after the other; where there are several, they go round REFINED_ROUNDS times.
-    """
+    """The same at one noise; None where nothing was searched.  One setting after the other; where
+    there are several, they go round REFINED_ROUNDS times."""
     item = chosen.items[k]
     what = item.what
     if not what.settings:
@@ -200,24 +187,19 @@ def _refined(
 def with_items(
     dataset: DiagnosisData, items: tuple[Item, ...], scales: tuple[float, ...]
 ) -> NoisyData:
-    """The data with the items' columns at the given scales."""
     data = dataset.data
     X = np.concatenate([data.X, *(dataset.packed(i.what, i.settings) for i in items)], axis=2)
     return replace(data, X=X, precision=_precision(data, items, scales))
 
 
-# Which other effects would look the same in these poses: what no size of noise can tell apart.
-
 PLAUSIBLE = 5.0
 
 
 def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[str, str], float]:
-    """d of item k from each other hypothesis that the data could mean instead.
-
-    d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's
-    columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
-    standard deviations.  A rival larger than usual is less probable, but it is no less alike.
-    """
+    """d of item k from each other hypothesis that the data could mean instead.  d² = min over β, γ
+    of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's columns C at its best
+    settings and s = PLAUSIBLE times the widest of the size prior: in standard deviations.  A rival
+    larger than usual is less probable, but it is no less alike."""
     v, data = chosen.signal(k), chosen.beside(k)
     at = project(replace(data, r=v), chosen.noise)
     grams = Grams(dataset, data, at)
@@ -233,14 +215,11 @@ def distances(dataset: DiagnosisData, chosen: ModelSet, k: int) -> dict[tuple[st
 
 def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Array:
     """Settings (G, …) at which a rival may imitate an item: those of the search and, where both
-    have the same kind of constant, the item's own, which was refined between them."""
+    have the same kinds of constants, the item's own, which were refined between them."""
     values = dataset.grids.get(rival.key, NO_SETTINGS).values
     kinds, own = ([s.kind for s in what.settings] for what in (rival, item.what))
-    within = (
-        bool(kinds)
-        and kinds == own
-        and all(s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True))
-    )
+    each = zip(rival.settings, item.settings, strict=True)
+    within = bool(kinds) and kinds == own and all(s.lower <= v <= s.upper for s, v in each)
     return np.vstack([values, item.settings]) if within else values
 
 
@@ -258,13 +237,10 @@ def settings_of(item: Item) -> dict[str, float]:
     return {s.key: float(v) for s, v in zip(item.what.settings, item.settings, strict=True)}
 
 
-# Estimates of a set: what its columns stand for, and the fit of the model with them in it.
-
-
 def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
     """The nonlinear fit of the model with `items` of the set in it, from the posterior means of
-    its known items' parameters; where one was looked for from many starts, from its columns' own
-    point: its geometry is far from linear."""
+    their parameters; where one was looked for from many starts, from its columns' own point: its
+    geometry is far from linear."""
     model, columns = dataset.base.model, dataset.columns
     about = dict(zip(columns.full.names, columns.x, strict=True))
     start = dict(zip(model.names, dataset.base.x, strict=True))
@@ -281,8 +257,6 @@ def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]
     return fit_baseline(whole, dataset.base.observed.table, x0=x0)
 
 
-# The backlash model of an arm's gears: whether play follows load alone, or load and last motion.
-#
 # A gear whose friction is small swings into the middle of its play, or onto the flank that any
 # load pushes it to; one that is stiff in its bearings stays where the last motion left it until the
 # load exceeds the friction.  Both are met, and the wrong one leaves most of the effect standing.
@@ -292,11 +266,8 @@ ALIKE = 1e-3  # nats: the rounding of two fits must not choose between models th
 
 
 def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
-    """The data under the backlash model that its readings make likelier.
-
-    Where no side of approach is recorded, the cell has play already, or no reading tells the two
-    apart, it stays as it is.
-    """
+    """The data under the backlash model that its readings make likelier.  Where no side of approach
+    is recorded, the cell has play already, or no reading tells the two apart, it stays as it is."""
     model, noise = dataset.base.model, dataset.data.noise
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     if model.cell.model.play_side != BY_BOTH or not play:
@@ -326,12 +297,9 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
 
 def doubt(odds: float, d: Array) -> float:
     """Probability of the less likely of two models: the larger of 1/(1 + exp L) and Φ(−L / √Σ d²).
-
     L are the log odds, d (configurations,) what each adds to the log likelihood ratio.  Both models
     idealise, so that a few configurations may speak loudly for the wrong one; by the test of Vuong
-    (1989, Econometrica 57) for models of which none is quite true, their ratio counts against its
-    own scatter.
-    """
+    (1989, Econometrica 57) for models none of which is true, it counts against its own scatter."""
     odds, scatter = max(odds, 0.0), max(float(np.linalg.norm(d)), 1e-300)
     return float(max(expit(-odds), ndtr(-odds / scatter)))
 
@@ -346,27 +314,19 @@ def gains(better: NoisyData, other: NoisyData, noise: NoiseValues) -> Array:
     return np.asarray((squares[0] - squares[1]) / 2)
 
 
-# What a search found: the set, what else could stand in each of its places, and the odds.
-
-
 @dataclass(frozen=True)
 class Slot:
-    """What could stand in one place of the set, the other items given.
-
-    `options` are candidates with log posterior scores relative to nothing in that place; they
-    hold every hypothesis and block.
-    """
+    """What could stand in one place of the set, the other items given: `items`, every hypothesis
+    and block, with log posterior `scores` relative to nothing there."""
 
     items: tuple[Item, ...]
     scores: Array
 
     def best_of(self, other: Slot) -> Slot:
-        """The same options, each with the higher score: both are bounds from below on what it
-        would be under the noise that suits it best."""
-        higher = other.scores > self.scores
-        items = tuple(
-            b if up else a for a, b, up in zip(self.items, other.items, higher, strict=True)
-        )
+        """The higher score of each: both bound from below what it would be under the noise that
+        suits it best."""
+        each = zip(self.items, other.items, other.scores > self.scores, strict=True)
+        items = tuple(b if up else a for a, b, up in each)
         return Slot(items, np.maximum(self.scores, other.scores))
 
     def probabilities(self) -> tuple[Array, float]:
@@ -385,27 +345,6 @@ class Slot:
         return bool(max(named, each[~known].sum()) > nothing and nothing <= most)
 
 
-@dataclass(frozen=True)
-class SelectedEffects:
-    """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
-    p-value of the first of them, or else of the likeliest addition, against all that could have
-    been found by chance.
-
-    `dataset` is the one that the set was fitted on: columns about a fit with its large effects.
-    `first` is the scan beside nothing under its own noise, `alone` under the final noise.
-    """
-
-    dataset: DiagnosisData
-    chosen: ModelSet
-    slots: tuple[Slot, ...]
-    p_value: float
-    nothing: ModelSet
-    first: Scan
-    alone: Scan
-
-
-# Columns anew at the nonlinear fit with a large effect in it, before anything else is sought.
-
 # Rms signal in m beyond which the products of an effect with the fitted parameters, which it
 # moves by a tenth or so, are no longer small beside the noise.
 FAR = 2e-4
@@ -413,11 +352,8 @@ FAR = 2e-4
 
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     """The data about the nonlinear fit with the set's known effects in the model, where one of them
-    is large; else as they are.
-
-    The residual is that of the fitted parameters alone: what the effects explain is put back, so
-    that sets with and without them are judged on the same footing.
-    """
+    is large; else as they are.  What the effects explain is put back into the residual, so that
+    sets with and without them are judged on the same footing."""
     used, whats = ~dataset.data.left_out, [item.what for item in chosen.items]
     direct = {k: h for k, h in enumerate(whats) if isinstance(h, Hypothesis) and not h.driven}
     signals = (chosen.signal(k)[used] for k in direct)
@@ -434,9 +370,8 @@ def about(
     back; `apart`: what they are to the model's own parameters is not in the columns of these."""
     base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
-    moved = replace(
-        base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
-    )
+    own = np.array([x[name] for name in base.model.names])
+    moved = replace(base, x=own, residual=fitted.residual)
     about_fit = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x, apart)
     # Put back by the data's own columns, which will have to explain it: those of the equilibrium
     # differ from them by a thousandth, and a large effect is a thousand deviations.
@@ -490,24 +425,19 @@ def left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | No
     return np.asarray(order * TENTHS // len(first))
 
 
-@dataclass
 class ForwardSelection:
-    """The search's means: data, blocks, flips of signs, and the level of a claim."""
+    """The chosen set, a slot for each of its items (or one where nothing was chosen), and the
+    p-value of the first of them, or else of the likeliest addition, against all that chance could
+    have found, which is to be below `level`.  The set was fitted on `dataset`: columns about a fit
+    with its large effects.  `first` is the scan beside nothing under its own noise, `alone` under
+    the final noise; `signs` (FLIPS, C) are the flips."""
 
-    dataset: DiagnosisData
-    generic: list[Generic]
-    level: float
-    seed: int
-    _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
-
-    @cached_property
-    def signs(self) -> Array:
-        """The flips (FLIPS, C)."""
-        rng = np.random.default_rng(self.seed)
-        return rng.choice([-1.0, 1.0], (FLIPS, len(self.dataset.blocks.member)))
-
-    def run(self) -> SelectedEffects:
-        dataset = self.dataset
+    def __init__(
+        self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
+    ) -> None:
+        self.dataset, self.generic, self._fitted = dataset, generic, dict[tuple, ModelSet]()
+        flips = FLIPS, len(dataset.blocks.member)
+        self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)
         first = alone = scanned = self._scan(nothing, beside=nothing)
         slots, visited, p = list[Slot](), set[frozenset[int]](), None
@@ -529,14 +459,15 @@ class ForwardSelection:
                 break
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
-            if observed.chance > self.level or key in visited:
+            if observed.chance > level or key in visited:
                 break
             visited.add(key)
             p = observed.chance if p is None else p
             current = best
             slots.append(slot)
             if (anew := relinearised(self.dataset, current)) is not self.dataset:
-                self._turn_to(anew)
+                self.dataset = anew
+                self._fitted.clear()  # what was fitted about another fit is void
                 current = ModelSet(anew, current.items, current.noise)
             if len(current.items) > 1:
                 current, slots = self._reexamined(current, slots)
@@ -549,20 +480,14 @@ class ForwardSelection:
         if not current.items or p is None:
             current, p = nothing, first.chance
             self.dataset = dataset
-        slots = slots or [start]
-        return SelectedEffects(self.dataset, current, tuple(slots), p, nothing, first, alone)
-
-    def _turn_to(self, dataset: DiagnosisData) -> None:
-        """What was fitted about another fit is void."""
-        self.dataset = dataset
+        self.chosen, self.slots, self.p_value = current, tuple(slots or [start]), p
+        self.nothing, self.first, self.alone = nothing, first, alone
         self._fitted.clear()
 
     def _paying(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
-        """The set without items beside whose others the error of configurations left out of the
-        fit does not fall: a name that does not pay there is none.
-
-        Judged once all are found: beside a large effect that is still missing nothing pays.
-        """
+        """The set without items beside whose others the error of configurations left out of the fit
+        does not fall: a name that does not pay there is none.  Judged once all are found: beside a
+        large effect that is still missing nothing pays."""
         while current.items:
             noise = current.noise.of_instrument()
             together = left_out_together(self.dataset, current)
@@ -590,10 +515,8 @@ class ForwardSelection:
     def _best_addition(
         self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND
     ) -> tuple[ModelSet | None, Slot]:
-        """The best set with one item more (None: none is worth it), and the slot it fills.
-
-        Beside other items it has to be better than the set without it.
-        """
+        """The best set with one item more (None: none is worth it), and the slot it fills.  Beside
+        other items it has to be better than the set without it."""
         # Scores count from the set as it is, under the noise that suits it best.
         base = current.score
         offset = sum(item.log_prior for item in current.items) - base

@@ -20,8 +20,6 @@ from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
 
-# Marginal likelihood of a group of columns in closed form.
-#
 # With columns C scaled to their typical sizes, γ ~ N(0, s² I) and everything else integrated out,
 #
 #     log ev(s) = −½ log|I + s²A| + ½ s² bᵀ(I + s²A)⁻¹ b,   A = CᵀPC,   b = CᵀPr,
@@ -47,11 +45,6 @@ class Spectrum:
         # Rounding leaves a tiny β along directions that P removes altogether.
         seen = lam > 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
         return cls(lam * seen, (U.transpose(0, 2, 1) @ b) * seen[:, :, None])
-
-    @property
-    def distance(self) -> Array:
-        """d (V,): what the group's typical size moves the data, √tr A, in standard deviations."""
-        return np.sqrt(self.lam.sum(axis=1))
 
     def explained(self, scale: float) -> Array:
         """What each group takes off eᵀPe, its coefficients γ charged with |γ|²/scale² (V,)."""
@@ -120,8 +113,6 @@ def evidence_of_groups(
     return best.tolist()
 
 
-# Prior probabilities, fixed before any data: nothing, something unknown, or a known effect.
-
 # SOMETHING that anything is missing; of that a twentieth that the catalogue lacks it.
 # A second effect beside a first is rarer.
 UNKNOWN, ANOTHER = 0.05, 0.2
@@ -130,11 +121,9 @@ UNKNOWN, ANOTHER = 0.05, 0.2
 def log_prior_odds(
     hypotheses: Sequence[Hypothesis], blocks: Sequence[Generic], something: float = SOMETHING
 ) -> Array:
-    """Log prior odds against nothing, of each hypothesis and then of each block.
-
-    Effects are equally probable, and so are the places of one effect; kinds of blocks are equally
-    probable, and so are the blocks of one kind.
-    """
+    """Log prior odds against nothing, of each hypothesis and then of each block.  Effects are
+    equally probable, and so are the places of one effect; kinds of blocks are equally probable, and
+    so are the blocks of one kind."""
     shares: list[float] = []
     for names, whole in (
         ([h.name for h in hypotheses], 1 - UNKNOWN), ([g.kind for g in blocks], UNKNOWN),
@@ -322,8 +311,7 @@ class Grams:
         return self._entries[key]
 
     def of(self, what: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
-        """A block, or a hypothesis at every one of the `settings` (G, …), by default those of the
-        search."""
+        """A block, or a hypothesis at all `settings` (G, …), by default those of the search."""
         dataset = self.dataset
         if isinstance(what, Generic) and what.entry is not None and what.direction is not None:
             return self.entry(what.entry).driven(what.direction[:, :, :, None])
@@ -343,15 +331,10 @@ class Grams:
         return np.asarray(np.linalg.solve(A + np.eye(what.width) / scale**2, b[..., :1]))[..., 0]
 
 
-# Everything that may be missing, scored under one noise.
-
-
 @dataclass(frozen=True)
 class Item:
-    """One addition: a hypothesis at its settings, or a block without a name.
-
-    `log_prior` is the log of its prior odds, the search over its settings included.
-    """
+    """One addition: a hypothesis at its settings, or a block without a name.  `log_prior` is the
+    log of its prior odds, the search over its settings included."""
 
     what: Hypothesis | Generic
     settings: Array
@@ -367,12 +350,11 @@ class Scan:
     missing with this probability, and the odds of all together.
 
     `items` are hypotheses, then blocks, each at its best settings, of log posterior `scores` (W,)
-    over the model without it, up to what they share; `distance` (W,) is d of a typical size there,
-    in standard deviations.  `odds` (1 + F,) is the log of the mean evidence over catalogue and
-    blocks, weighted by prior, of the readings and of residuals whose configurations had their signs
-    flipped, and `covariates` (1 + F,) the largest evidence among the blocks of each; `marginal` the
-    log marginal likelihood of the data beside which they were scored.
-    """
+    over the model without it, up to what they share; `distance` (W,) is what a typical size moves
+    the data there, √tr A, in standard deviations.  `odds` (1 + F,) is the log of the mean evidence
+    over catalogue and blocks, weighted by prior, of the readings and of residuals whose
+    configurations had their signs flipped, and `covariates` (1 + F,) the largest evidence among the
+    blocks of each; `marginal` the log marginal likelihood without them."""
 
     def __init__(
         self, dataset: DiagnosisData, generic: list[Generic], something: float, data: NoisyData,
@@ -393,7 +375,7 @@ class Scan:
             # What the search over settings costs stays with the item.
             spent = float(evidence[0] - own[k] + grid.log_prior[k])
             items.append(Item(what, grid.values[k], w + spent))
-            distance.append(float(spectra.distance[k]))
+            distance.append(float(np.sqrt(spectra.lam[k].sum())))
             if isinstance(what, Generic):
                 largest = self.covariates.get(what.covariate, evidence)
                 self.covariates[what.covariate] = np.maximum(largest, evidence)
@@ -404,5 +386,4 @@ class Scan:
 
     @property
     def chance(self) -> float:
-        """p-value of the odds among those that the flips yield."""
         return exceedance(self.odds[1:], float(self.odds[0]))

@@ -32,8 +32,6 @@ from elastocal.planning.poses import draw
 from elastocal.simulation import simulate
 from elastocal.units import Array, BoolArray, Progress
 
-# What may be measured next: poses in all load states, from any side, at once or later.
-
 CANDIDATES = 256
 NEWTON = 1.0  # forces are told apart to this
 RARE = 0.1  # share of the visits below which a load state is not asked for again
@@ -41,13 +39,10 @@ RARE = 0.1  # share of the visits below which a load state is not asked for agai
 
 @dataclass(frozen=True)
 class VisitPool:
-    """N candidates, each one pose with its side of approach and moment, in all load states.
-
-    `q` (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces`
-    (L, 3) N.  `table` holds the campaign's rows and then theirs: candidate by candidate, load by
-    load, marker by marker, with the readings that the fitted model expects; those `hidden` (rows,)
-    the tracker cannot make.
-    """
+    """N candidates, each one pose with its side of approach and moment, in all load states.  `q`
+    (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces` (L, 3) N.
+    `table` holds the campaign's rows and then theirs, by candidate, load and marker, with the
+    readings that the fitted model expects; those `hidden` (rows,) the tracker cannot make."""
 
     q: Array
     approach: Array | None
@@ -93,12 +88,9 @@ class VisitPool:
 
 
 def draw_pool(base: Baseline, diagnosis: Diagnosis, seed: int) -> VisitPool:
-    """Candidates that the cell's rules allow, after the campaign, each joint from any side; where
-    a rival relaxes with time some at once and others after as long as the campaign took.  Sides and
-    moments only where the table has such a column.
-
-    Raises InsufficientDataError where no pose is feasible.
-    """
+    """Candidates that the cell's rules allow, after the campaign, each joint from any side; where a
+    rival relaxes with time some at once and others after as long as the campaign took.  Sides and
+    moments only where the table has them.  Raises InsufficientDataError if no pose is feasible."""
     table, cell, rng = base.observed.table, base.model.cell, np.random.default_rng(seed)
     # A joint whose compliance is known at its levels only can be nowhere else.
     spec = replace(cell.design, levels=cell.design.levels or cell.model.compliance_levels)
@@ -154,10 +146,8 @@ def discriminations(
     sets: Sequence[RivalSet] = (),
 ) -> list[Discrimination]:  # fmt: skip
     """Of all `sets` of rivals, by default those of the diagnosis, under the noise that it found;
-    its faulty readings and those of markers that are not seen are left out.
-
-    Candidates are read as precisely as the same marker was on average.
-    """
+    its faulty readings and those of markers that are not seen are left out.  Candidates are read as
+    precisely as the same marker was on average."""
     observed = observe(pool.table, base.model.observe)
     n, stated, marker = len(base.observed.lead), base.covariance, pool.table.marker[observed.lead]
     usual = {k: stated[marker[:n] == k].mean(axis=0) for k in np.unique(marker[:n]).tolist()}
@@ -181,8 +171,6 @@ def discriminations(
     ]
 
 
-# The fewest candidates that tell the rivals apart, one more at a time until they are enough.
-#
 # The design module's criteria are functions of one information matrix, convex and homogeneous of
 # degree −1, which its bounds rest on.  Distances of rivals are neither: they start from data in
 # hand, and a pair's distance is a difference of two informations.  So this choice is its own.
@@ -196,7 +184,7 @@ def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -
     `enough`; `most` where fewer do not reach it."""
     chosen: list[int] = []
     while len(chosen) < min(most, len(tasks[0].pool)):
-        error = np.sum([c.error_bound(c.squared_with_each(chosen)) for c in tasks], axis=0)
+        error = np.sum([c.errors_with_each(chosen) for c in tasks], axis=0)
         error[chosen] = np.inf
         chosen.append(int(np.argmin(error)))
         if expected(tasks, chosen) >= enough:
@@ -209,16 +197,10 @@ def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
     return math.prod(c.probability(c.squared(chosen)) for c in tasks)
 
 
-# The extra visits as one would make them: a short way through the poses, all loads at each.
-
-
 def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements) -> Measurements:
-    """One row per visit of the chosen candidates, after the campaign of `table`.
-
-    What is to be measured later comes later; otherwise the nearest pose in joint space is next.
-    A pose is measured in all load states before the arm moves on, so that what drifts does not
-    pass for an effect of the load.
-    """
+    """One row per visit of the chosen candidates, after the campaign of `table`: what is to be
+    measured later comes later, otherwise the nearest pose in joint space is next.  All load states
+    of a pose come before the arm moves on, so that no drift passes for an effect of the load."""
     left, order, at = np.array(chosen), list[int](), table.q[-1]
     for moment in [None] if pool.time is None else np.unique(pool.time[left]):
         due = left if pool.time is None else left[pool.time[left] == moment]
@@ -244,8 +226,6 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
     )  # fmt: skip
 
 
-# The plan, and what to do besides measuring it, in words.
-
 # What a plan can aim at, and from which probability it goes without saying that one is at work.
 MOST_CERTAIN, MOSTLY = 0.99, 0.9
 GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
@@ -254,13 +234,11 @@ GAIN = 0.02  # of probability that a horizontal pull is worth mentioning for
 def plan_extra(
     diagnosis: Diagnosis, most: int, seed: int = 0, progress: Progress = lambda message: None
 ) -> ExtraPlan:
-    """The fewest extra poses, at most `most`, that tell the rivals of an open verdict apart.
-
-    The rivals are the sets that the diagnosis calls indistinguishable, or what the unknown effect
-    may be.  Candidates are feasible poses of the cell in the table's load states, after the
-    campaign; their distances come from the columns of the fitted arm with all fitted parameters
-    free (see `Discrimination`).
-    """
+    """The fewest extra poses, at most `most`, that tell the rivals of an open verdict apart.  The
+    rivals are the sets that the diagnosis calls indistinguishable, or what the unknown effect may
+    be.  Candidates are feasible poses of the cell in the table's load states, after the campaign;
+    their distances come from the columns of the fitted arm with all fitted parameters free (see
+    `Discrimination`)."""
     base, advice, none = diagnosis.calibrated, list[str](), ""
     assert base is not None
     if base.model.cell.model.torque == "measured":
@@ -347,10 +325,8 @@ def _of_pulls(
     base: Baseline, pool: VisitPool, tasks: Sequence[Discrimination], chosen: Sequence[int],
     enough: float, share: float, diagnosis: Diagnosis, seed: int,
 ) -> Iterator[str]:  # fmt: skip
-    """Advice to pull along x and y as well, as hard as by the load, where that helps.
-
-    None without a load, nor for what is unknown: how it takes a pull nobody can say.
-    """
+    """Advice to pull along x and y as well, as hard as by the load, where that helps: not without a
+    load, nor for what is unknown, as nobody can say how it takes a pull."""
     newton, after = float(np.linalg.norm(pool.forces, axis=1).max()), expected(tasks, chosen)
     settled = after >= enough and not any(c.inseparable for c in tasks)
     if newton == 0 or settled or diagnosis.verdict == "unknown_effect":

@@ -118,8 +118,7 @@ class Hypothesis:
 
     @property
     def bounded(self) -> BoolArray:
-        """Which parameters (k,) cannot be below their nominal value, as no compliance is below
-        zero."""
+        """Which parameters (k,) cannot be below nominal, as no compliance is below zero."""
         return np.array([p.lower == p.nominal for p in self.parameters], dtype=bool)
 
     @property
@@ -132,7 +131,6 @@ class Hypothesis:
         return self.effect.starts(self.where, model.chain, model.cell)
 
     def entry_key(self, model: Model) -> EntryKey:
-        """The entry of the chain that a driven hypothesis acts on."""
         assert isinstance(self.effect, DrivenEffect)
         entry = self.effect.entry_at(self.where)
         return entry.name, self.effect.entered_at(self.where, model.chain)
@@ -201,13 +199,10 @@ def recorded(table: Measurements, need: str) -> bool:
         # arm reaches.
         points = table.position[:, :2]
         middle = points.mean(axis=0)
-        farthest = np.linalg.norm(points - middle, axis=1).max()
-        return bool(np.linalg.norm(middle) >= farthest)
+        return bool(np.linalg.norm(middle) >= np.linalg.norm(points - middle, axis=1).max())
     values = getattr(table, need)
     return values is not None and bool(np.any(values != values[:1]))
 
-
-# What the table records decides how some effects are driven.
 
 # Effects of the last move that take it from the order of the visits.
 BY_LAST_MOVE = tuple(
@@ -227,12 +222,10 @@ CHOICES = (
 
 
 def with_recorded_drivers(model: Model, table: Measurements) -> Model:
-    """The model with effects driven by the best that the table records.
-
-    Growth follows a measured temperature rather than a warm-up curve, and play rests where the
-    last motion left it where that is known.  Effects that the cell has active stay as they are.
-    Where there are no times, what changes once does so between rows, if the poses are in any order.
-    """
+    """The model with effects driven by the best that the table records, but for those that the cell
+    has active: growth follows a measured temperature rather than a warm-up curve, and play rests
+    where the last motion left it where that is known.  Where there are no times, what changes once
+    does so between rows, if the poses are in any order."""
     active = {p.effect for p in model.parameters}
     keys = {
         key: value
@@ -258,8 +251,6 @@ def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     changes = any(s.kind == "change_time" for n in names for s in CATALOGUE[n].constants)
     return keys | {"clock": spec.clock} if changes and spec.clock != "column" else keys
 
-
-# Where an effect's constants are searched: change times, time constants, orders, ranges.
 
 CHANGE_TIMES = 120  # at most; more moments are refined after the search
 TIME_CONSTANTS = 8
@@ -288,11 +279,9 @@ NO_SETTINGS = SettingsGrid(np.zeros((1, 0)), np.zeros(1), np.zeros((1, 0)))
 
 
 def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
-    """Grid of a hypothesis' settings for these visits; one empty point where it has none.
-
-    Of several settings, which are independent, it holds every combination.  Where those are more
-    than MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long.
-    """
+    """Grid of a hypothesis' settings for these visits; one empty point where it has none.  Of
+    several settings, which are independent, it holds every combination.  Where those are more than
+    MOST_POINTS, of each setting every k-th value is tried, and its step is k times as long."""
     axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
     if not axes:
         return NO_SETTINGS
@@ -373,8 +362,7 @@ class StartSearch:
     the fitted columns and `r` (equations,) the residual there, both over the noise, followed by an
     equation for the prior of each fitted parameter; `whitening` (N, size, size) divides by the
     noise.  Of the effect's parameters, whose numbers are `own`, the first is the amplitude that the
-    others have no columns without.
-    """
+    others have no columns without."""
 
     def __init__(self, full: Model, h: Hypothesis, base: Baseline, x: Array, B: Array) -> None:
         self.full, self.h, self.base, self.x = full, h, base, x
@@ -396,6 +384,9 @@ class StartSearch:
         X, r = ((self.whitening @ each).reshape(rows, -1) for each in (X, r))
         self.r = np.append(r[:, 0], np.zeros(X.shape[1]))
         self.X = np.vstack([X, np.eye(X.shape[1])])
+        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
+        self._span: Array = U[:, s > 1e-9 * s.max(initial=0.0)]
+        self._unexplained = self.r - self._span @ (self._span.T @ self.r)
 
     def tangents(self) -> Iterator[tuple[Array, Array]]:
         """About the best starts, the best first, at the amplitude that the residual asks for: the
@@ -450,8 +441,7 @@ class StartSearch:
     ) -> dict[str, float]:
         """The start near `best` that leaves the least: least squares with the amplitude solved for
         (variable projection; Golub and Pereyra 1973).  Where the residual, over `noise`, does not
-        ask for another value, a value stays: each is tied to that of `best` by a spread of all.
-        """
+        ask for another value, a value stays: each is tied to that of `best` by a spread of all."""
         keys = list(best)
         width = np.array([np.std([start[key] for start in starts]) for key in keys])
         x0 = np.array([best[key] for key in keys])
@@ -471,8 +461,7 @@ class StartSearch:
 
     def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """The amplitude's (rows, size, starts), by the whole model at each start."""
-        each = [self._amplitude(start, self.part.table)[1] for start in starts]
-        return np.stack(each, axis=2)
+        return np.stack([self._amplitude(start, self.part.table)[1] for start in starts], axis=2)
 
     def _profiles(self, starts: Sequence[Mapping[str, float]]) -> Array | None:
         """(rows, starts)."""
@@ -490,11 +479,6 @@ class StartSearch:
         products = np.einsum("nis,ns->ni", self._columns(references), profiles)
         return np.asarray(products / np.maximum((profiles**2).sum(axis=1), 1e-300)[:, None])
 
-    @cached_property
-    def _span(self) -> Array:
-        U, s, _ = np.linalg.svd(self.X, full_matrices=False)
-        return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
-
     def _left(self, starts: Sequence[Mapping[str, float]]) -> tuple[Array, Array]:
         """What is left of the residual's sum of squares (starts,), all of it where the amplitude
         is one that the effect cannot have, and the unit columns (rows, starts)."""
@@ -511,10 +495,6 @@ class StartSearch:
                 left[k] = self._unexplained @ self._unexplained
         return left, C
 
-    @cached_property
-    def _unexplained(self) -> Array:
-        return np.asarray(self.r - self._span @ (self._span.T @ self.r))
-
     def _fits(self, columns: Array) -> tuple[Array, Array, Array]:
         """Of each of the columns (rows, size, k) by itself what it leaves of the residual's sum
         of squares (k,), its amplitude (k,), and itself of unit length beside the span (rows, k)."""
@@ -527,8 +507,6 @@ class StartSearch:
         return self._unexplained @ self._unexplained - explained**2, explained / size, C
 
 
-# Columns of every hypothesis at the fitted arm: one symbolic model with everything in it.
-
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
 ENTRIES: tuple[Entry, ...] = (
     JointMotion(), LinkLength(), LinkFrame(), BaseMotion(), MarkerMotion()
@@ -538,12 +516,10 @@ ENTRIES: tuple[Entry, ...] = (
 @dataclass(frozen=True)
 class Columns:
     """B of the model, of direct hypotheses and of the chain's entries, row by row of the table.
-
     `rows` (n_rows, size, K) at the fitted values, raw; `places` says which columns of it belong to
-    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,); `shares`
-    are of effects that were looked for from many starts the logarithms of their mean likelihood
-    over all of these relative to that at the best one, which is in x.
-    """
+    an effect (or entry) at a place.  `full` is the model with all of them, at x (K,); `shares` are
+    of effects that were looked for from many starts the logarithms of their mean likelihood over
+    all of these relative to that at the best one, which is in x."""
 
     base: Baseline
     rows: Array
@@ -563,9 +539,7 @@ class Columns:
 
     def torques(self) -> Array:
         """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.
-
-        δq = k τ, so ∂(reading)/∂k = ∂(reading)/∂q · τ.
-        """
+        δq = k τ, so ∂(reading)/∂k = ∂(reading)/∂q · τ."""
         n = self.base.model.chain.n_joints
         tau = np.zeros((len(self.rows), n))
         for i in range(n):
@@ -593,8 +567,7 @@ def compute_columns(
     `found` are parameters of hypotheses that are not at zero, by name.
 
     Deflections enter by eq. (3), the load's torques at the undeflected pose: the columns differ
-    from those of the equilibrium by the ratio of deflection to lever arm, a part in a thousand.
-    """
+    from those of the equilibrium by the ratio of deflection to lever arm, a part in a thousand."""
     table = base.observed.table
     chain, cell = base.model.chain, base.model.cell
     direct = [h for h in hypotheses if not h.driven]
@@ -628,11 +601,8 @@ def compute_columns(
 
 
 class RegressorDirection:
-    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
-
-    The base stands as the cell says; settings of the effect are the cell's where the hypothesis
-    searches none.
-    """
+    """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.  The base
+    stands as the cell says; so do the effect's settings where none is searched."""
 
     def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
         effect, where = hypothesis.effect, hypothesis.where
@@ -659,6 +629,5 @@ class RegressorDirection:
     def __call__(self, table: Measurements, settings: Array) -> Array:
         """D (n_rows, G, d, k) at each of the `settings` (G, number of settings)."""
         G, n = len(settings), len(table)
-        asked = np.repeat(self.asked(table), G, axis=0)
-        D = self._compiled(asked, np.tile(settings, (n, 1)))[0]
+        D = self._compiled(np.repeat(self.asked(table), G, axis=0), np.tile(settings, (n, 1)))[0]
         return np.asarray(D.reshape(n, G, *D.shape[1:]))

@@ -76,8 +76,7 @@ class NextPoses(Result):
 
     @property
     def doubts(self) -> tuple[tuple[str, str, float], ...]:
-        """What it may lack besides, or instead: effect, place and probability, the likeliest
-        first."""
+        """What it may lack besides, or instead: effect, place and probability, likeliest first."""
         found = {(f.effect, f.where) for f in self.found}
         every = () if self.diagnosis is None else self.diagnosis.candidates
         likely = ((c.effect, c.where, c.probability) for c in every if c.probability > DOUBT)
@@ -201,11 +200,9 @@ def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell
 
 def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
     """The error at new poses that is kept with 95 %, and what the model lacks of it, in m; 0 and
-    that of distances, of which no position follows: the plan's own figures say it.
-
-    That configurations scatter beyond their noise is lack of fit with the probability that
-    something `unknown` is at work; else it is their noise.
-    """
+    that of distances, of which no position follows: the plan's own figures say it.  That
+    configurations scatter beyond their noise is lack of fit with the probability that something
+    `unknown` is at work; else it is their noise."""
     model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
     if observed.kind == "distance":
@@ -232,5 +229,4 @@ def with_effects_of(model: Model, why: Diagnosis) -> Model:
     spec = replace(model.cell.model, **why.model_keys)  # type: ignore[arg-type]
     for f in why.effects:
         spec = spec.with_effect(f.effect, f.where, f.settings, f.sizes)
-    cell = replace(model.cell, model=spec)
-    return Model.assembled(model.chain, cell) if why.effects else model
+    return Model.assembled(model.chain, replace(model.cell, model=spec)) if why.effects else model

@@ -36,6 +36,7 @@ from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.outliers import settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
+from elastocal.measurements import numbered
 from elastocal.messages import ElastocalError
 from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.observations import pure_error
@@ -49,10 +50,8 @@ def _left_over(data: NoisyData, at: Projection) -> Array:
 
 def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int]:
     """Sum of squares (m²) per axis among repeats of pose, load and marker, and degrees of freedom.
-
     `come_back`: of those for which the arm was elsewhere in between, in the order of times or rows.
-    Readings one after the other, the arm standing still, show the tracker's noise alone.
-    """
+    Readings one after the other, the arm standing still, show the tracker's noise alone."""
     good, observed = ~dataset.data.faulty, dataset.base.observed
     values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
     group = observed.place[good]
@@ -66,8 +65,6 @@ def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int
     return pure_error(group, values)
 
 
-# Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
-#
 # Two readings i, j whose joints all differ by less than NEAR see the same arm.  A Gaussian process
 # of length ℓ and variance A² (squared exponential) has half the mean square difference
 #
@@ -83,10 +80,8 @@ ENOUGH_PAIRS = 8  # that are stated by themselves
 
 
 def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> NearRepeats | None:
-    """Scatter in m per axis among near-repeats, beside the model of `data` at `at`; None without.
-
-    Half the mean square of e_i − e_j over pairs of nearest neighbours, e = r − Xβ̂.
-    """
+    """Scatter in m per axis among near-repeats, beside the model of `data` at `at`; None without:
+    half the mean square of e_i − e_j over pairs of nearest neighbours, e = r − Xβ̂."""
     pairs = near_pairs(dataset, ~data.faulty)
     if not len(pairs):
         return None
@@ -113,12 +108,12 @@ def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
     """Pairs (k, 2) of `good` (N,) observations of one marker and load in different configurations,
     each with its nearest neighbour in the joints, all within NEAR."""
     table, lead = dataset.table, dataset.lead
+    kind = numbered(table.marker[lead], dataset.base.observed.load)
     # One reading of each configuration: the others are repeats.
-    same, some = np.column_stack([table.configuration[lead], dataset.kind]), np.flatnonzero(good)
+    same, some = np.column_stack([table.configuration[lead], kind]), np.flatnonzero(good)
     some = some[np.unique(same[some], axis=0, return_index=True)[1]]
     # Of another marker or load no reading is near.
-    place = np.column_stack([table.q[lead[some]], dataset.kind[some]])
-    pairs, distance = nearest(place, np.inf)
+    pairs, distance = nearest(np.column_stack([table.q[lead[some]], kind[some]]), np.inf)
     return _unordered(some[pairs[distance <= NEAR]])
 
 
@@ -149,11 +144,8 @@ FALSE_SMOOTH = 0.01  # chance that any joint of an arm whose joints only scatter
 
 
 def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Array:
-    """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.
-
-    Functions of several angles add up; what goes with all joints or with the order of measuring
-    holds them.
-    """
+    """Variance (joints,) in rad² or m² of each joint's deviation that neighbours share.  Functions
+    of several angles add up; what goes with all joints or with the order holds them."""
     G = data.masked(data.G)
     J = G.shape[2]
     out = np.zeros(J)
@@ -198,16 +190,13 @@ MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
 
 
 def scatter_beyond(noise: NoiseValues) -> Array:
-    """Variance (joints,) of each joint's scatter beyond what the others let expect.
-
-    The logarithms of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its
-    own spread, so that the others tell what one is to be expected of; beyond its limit any joint of
-    an arm is with a chance of FALSE_SMOOTH.
-    """
+    """Variance (joints,) of each joint's scatter beyond what the others let expect.  The logarithms
+    of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its own spread, so
+    that the others tell what one is to be expected of; beyond its limit any joint of an arm is with
+    a chance of FALSE_SMOOTH."""
     J, usual = len(noise.joint), np.log(REPEATABILITY)
     off = np.log(noise.joint) - usual
-    told = (J - 1) / JOINT_SPREAD**2
-    known = told + 1 / REPEATABILITY_SPREAD**2
+    known = (J - 1) / JOINT_SPREAD**2 + 1 / REPEATABILITY_SPREAD**2
     others = (off.sum() - off) / JOINT_SPREAD**2 / known
     spread = np.sqrt(JOINT_SPREAD**2 + 1 / known)
     limit = np.exp(usual + others - float(special.ndtri(FALSE_SMOOTH / J)) * spread)
@@ -223,8 +212,7 @@ class SupportedFloor:
     `best` (m) is the smallest error left at held-out poses, which no noise exceeds.  Repeats and
     near-repeats together (ν degrees of freedom, mean square s²) contradict the fitted variance σ²
     where νs²/σ² is below the χ² quantile; they are then the floor themselves, with what
-    is stated as common to a configuration, which its repeats do not show.
-    """
+    is stated as common to a configuration, which its repeats do not show."""
 
     def __init__(
         self, dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, best: float
@@ -261,25 +249,21 @@ class SupportedFloor:
 
     @property
     def told(self) -> NoiseFloor:
-        """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
         (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
         variance = np.diagonal(data.covariance, axis1=1, axis2=2)
         ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
-        variance = variance[~data.left_out]
         # Those left out have their error against the fit to the others.
-        e, stated = _left_over(data, self.at), data.blocks.unpack_square(data.covariance)
-        sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
+        e, stated = _left_over(data, self.at), data.blocks.unpack(variance[..., None])[:, :, 0]
+        sigma, variance = noise.factor * np.sqrt(stated), variance[~data.left_out]
         table, gone = dataset.table, np.flatnonzero(data.faulty)
         faulty = tuple(
             FaultyReading(
-                int(table.row[row]),
-                table.configuration_labels[table.configuration[row]],
+                int(table.row[row]), table.configuration_labels[table.configuration[row]],
                 table.marker_names[table.marker[row]],
-                float(np.linalg.norm(e[k, :3])),
-                float(np.linalg.norm(e[k] / sigma[k])),
+                float(np.linalg.norm(e[k, :3])), float(np.linalg.norm(e[k] / sigma[k])),
             )
             for k, row in zip(gone, dataset.lead[gone], strict=True)
-        )
+        )  # fmt: skip
         return NoiseFloor(
             data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
             tuple(noise.joint.tolist()), noise.shared_by_all,
@@ -317,17 +301,10 @@ def mean_square(data: NoisyData, packed: Array) -> float:
     return float(squares.sum() / count.sum())
 
 
-# Errors on configurations, or blocks of time, left out of the fit, in closed form.
-
-
 def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
     """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
-
     `together` (C,) numbers the group that each is left out with; by itself where None.  For a
-    group, with V and H of its configurations,
-
-        P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
-    """
+    group, with V and H of its configurations, P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u."""
     if together is None:
         return each_left_out(at.P, at.u)
     Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
@@ -348,9 +325,7 @@ def each_left_out(P: Array, u: Array) -> Array:
 
 def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
     """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
-
-    Of a pose the position counts, of a distance its one component.
-    """
+    Of a pose the position counts, of a distance its one component."""
     C, M = data.blocks.member.shape
     size = data.blocks.size
     used = ~data.left_out.reshape(C, M, size)[:, :, 0]
@@ -362,8 +337,6 @@ def left_out_square(data: NoisyData, noise: NoiseValues, together: IntArray | No
     """Mean square (m²) of the 3-D error of a reading whose configuration was left out."""
     return mean_square(data, left_out_residual(project(data, noise), together))
 
-
-# How the error at poses left out of the fit falls, step by step, and how sure that is.
 
 NEW_POSES = 100  # in the set that the intervals of a reduction are for
 
@@ -378,11 +351,9 @@ def rms_with_interval(
 def first_steps(
     dataset: DiagnosisData, noise: NoiseValues, rng: np.random.Generator
 ) -> list[BudgetStep]:
-    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.
-
-    By the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
-    effect is that effect, and weights by it would spare it.
-    """
+    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
+    the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
+    effect is that effect, and weights by it would spare it."""
     placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
     # Stage by stage, effects of the later step held at nominal.
@@ -414,10 +385,8 @@ RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray, BoolArray]:
     """The faulty ones (N,) among the readings of `data`, those of `dataset` with what was found
     beside, and suspects (N,) that were kept: too many, or too near each other to be accidents.
-
     Runs of one marker's readings are kept: something happened to it; so are visits all of whose
-    markers are off together, unless repeats contradict them: the flange was elsewhere.
-    """
+    markers are off together, unless repeats contradict them: the flange was elsewhere."""
     base, blocks = dataset.base, dataset.blocks
     readings = linearised(base.model, base.observed, base.x, np.zeros(0, dtype=np.int64))
     r = blocks.unpack(data.r[..., None])
@@ -458,7 +427,7 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> tuple[BoolArray,
 
 
 def in_a_run(dataset: DiagnosisData, suspect: BoolArray) -> BoolArray:
-    """Suspects (N,) that stand in a row of RUN or more readings of the same marker in time."""
+    """Suspects (N,) in a row of RUN or more readings of one marker in time."""
     marker_of, out = dataset.table.marker[dataset.lead], np.zeros(len(suspect), dtype=bool)
     for marker in np.unique(marker_of):
         mine = np.flatnonzero(marker_of == marker)

@@ -26,8 +26,6 @@ from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.units import Array
 
-# Who the rivals are: the named sets of an ambiguous verdict, or what an unknown effect may be.
-#
 # A set names three effects at most.  Whichever of them is at work, further poses leave open what
 # imitates it, whether it was listed or not; a plan that did not know of it would promise too much.
 
@@ -46,10 +44,8 @@ Key = tuple[str, str]
 
 
 class RivalSet:
-    """Items of which one is at work, `beside` other items that are.
-
-    `probability` (rivals,) of each given that it is one of them, none below the `smallest`.
-    """
+    """Items of which one is at work, `beside` other items that are.  `probability` (rivals,) of
+    each given that it is one of them, none below the `smallest`."""
 
     def __init__(
         self, rivals: Sequence[Item], probability: Sequence[float], beside: Sequence[Item],
@@ -111,8 +107,7 @@ def rival_sets(so_far: DiagnosisData, noise: NoiseValues, diagnosis: Diagnosis) 
         free = sorted((k for k in items if k not in found), key=lambda k: -chance[k])[:MOST_KNOWN]
         known = [k for n, k in enumerate(free) if n < FEWEST_KNOWN or chance[k] >= CHANCE]
         rivals, p = blocks + [items[k] for k in known], p + [chance[k] for k in known]
-        at_work = [items[k] for k in found]
-        sets.append(RivalSet(rivals, p, at_work, LEAST_PROBABILITY_UNKNOWN))
+        sets.append(RivalSet(rivals, p, [items[k] for k in found], LEAST_PROBABILITY_UNKNOWN))
     return sets
 
 
@@ -142,10 +137,8 @@ def covered(sets: Sequence[RivalSet], diagnosis: Diagnosis) -> float:
     return min(max(1 - diagnosis.probability_nothing - sum(missed), 0.0), 1.0)
 
 
-# With what one rival may imitate the others: its order, its time, where its spring is anchored.
-#
-# The best in the data so far need not be the best once further poses are measured, when the
-# diagnosis seeks them anew: what is nearly as good stays possible.
+# The order, time or anchor that imitates another best so far need not be the best once further
+# poses are measured, when the diagnosis seeks it anew: what is nearly as good stays possible.
 
 NEARLY = 4.0  # in d²: two standard deviations
 SETTINGS = 6  # of a rival that are tried, at most
@@ -221,8 +214,7 @@ class Discrimination:
     rivals.  Counted from there come each rival's, at the spans of `columns`, its own first, then
     those with which it may imitate others instead.  `draws`: γ (draws, k) of each rival; `before`
     (rivals, rivals, draws) d² in the data so far; `apart` (rivals, rivals) d by all candidates;
-    `classes` (rivals,): those with the same number even these do not tell apart.
-    """
+    `classes` (rivals,): those with the same number even these do not tell apart."""
 
     def __init__(
         self, dataset: DiagnosisData, so_far: DiagnosisData, noise: NoiseValues, candidates: int,
@@ -263,11 +255,6 @@ class Discrimination:
         candidates; zero of a rival with itself."""
         return self._squared_by(eliminated(self._gram(chosen), self.nuisance))
 
-    def squared_with_each(self, chosen: Sequence[int]) -> Array:
-        """d² (N, rivals, rivals, draws) with each candidate added to those chosen."""
-        each = self._gram(chosen) + self.pool.transpose(0, 2, 1) @ self.pool
-        return self._squared_by(eliminated(each, self.nuisance))
-
     def _squared_by(self, S: Array) -> Array:
         n = len(self.draws)
         out = np.zeros((*S.shape[:-2], n, n, 2 * DRAWS))
@@ -283,32 +270,26 @@ class Discrimination:
             out[..., a, b, :] = np.maximum(np.min(each, axis=0), 0.0)
         return out
 
-    def gained(self, squared: Array) -> Array:
-        """δ² (…, rivals, rivals, draws)."""
-        return np.maximum(squared - self.before, 0.0)
-
-    def error_bound(self, squared: Array) -> Array:
-        """(…,) Σ_ab √(p_a p_b) E exp(−δ²_ab/8): Chernoff's bound of the pairs' errors, whose
-        largest term is that of the closest pair, and which is smooth where Φ is flat."""
-        p = self.rivals.probability
-        other = self.classes[:, None] != self.classes[None, :]
-        weight = np.sqrt(p[:, None] * p[None, :]) * other
-        bound = np.exp(-self.gained(squared) / 8).mean(axis=-1)
-        return np.asarray((weight * bound).sum(axis=(-2, -1)))
+    def errors_with_each(self, chosen: Sequence[int]) -> Array:
+        """Σ_ab √(p_a p_b) E exp(−δ²_ab/8) with each of the candidates (N,) added to those chosen:
+        Chernoff's bound of the pairs' errors, whose largest term is that of the closest pair, and
+        which is smooth where Φ is flat."""
+        each = self._gram(chosen) + self.pool.transpose(0, 2, 1) @ self.pool
+        squared = self._squared_by(eliminated(each, self.nuisance))
+        p, other = self.rivals.probability, self.classes[:, None] != self.classes[None, :]
+        bound = np.exp(-np.maximum(squared - self.before, 0.0) / 8).mean(axis=-1)
+        return np.asarray((np.sqrt(p[:, None] * p[None, :]) * other * bound).sum(axis=(-2, -1)))
 
     def probability(self, squared: Array) -> float:
-        """Of naming the right class, averaged over the right one and its size.
-
-        By the union bound over its rival classes, each as dangerous as its strongest
-        member; not below what naming the likeliest so far gives, which nobody has to give up.
-        While a pair is as near as the verdict calls alike, no odds name one of the two with more
-        than TOO_NEAR_PROBABILITY.
-        """
+        """Of naming the right class, averaged over the right one and its size.  By the union bound
+        over its rival classes, each as dangerous as its strongest member; not below what naming the
+        likeliest so far gives, which nobody has to give up.  While a pair is as near as the verdict
+        calls alike, no odds name one of the two with more than TOO_NEAR_PROBABILITY."""
         p = self.rivals.probability
         of_class = np.bincount(self.classes, p)
         odds = np.log(of_class[self.classes])
         L = (odds[:, None] - odds[None, :])[..., None]
-        delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
+        delta = np.sqrt(np.maximum(squared - self.before, 1e-12))
         beaten = special.ndtr(-(L + delta**2 / 2) / delta)
         beaten = np.where(
             squared < TOO_NEAR**2, np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY), beaten
@@ -343,11 +324,9 @@ class Discrimination:
 
 
 def _posterior_draws(item: Item, A: Array, b: Array, rng: np.random.Generator) -> Array:
-    """γ (2·DRAWS, k) of a rival as if it were the one at work, antithetic about its estimate.
-
-    γ | data ~ N(mean, (A + I/s²)⁻¹) by its part A (k, k) of S and b (k,) of the readings, at the
-    scale s of the size prior that explains the data best.
-    """
+    """γ (2·DRAWS, k) of a rival as if it were the one at work, antithetic about its estimate.  γ |
+    data ~ N(mean, (A + I/s²)⁻¹) by its part A (k, k) of S and b (k,) of the readings, at the scale
+    s of the size prior that explains the data best."""
     lam, U = np.linalg.eigh(A)
     lam, beta = np.maximum(lam, 0.0), U.T @ b
     each = at_scales(lam[None], beta[None, :, None], item.what.scales)

@@ -12,7 +12,6 @@ from scipy import special
 
 from elastocal.diagnosis.baseline import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer
-from elastocal.diagnosis.component_search import sum_of
 from elastocal.diagnosis.diagnosis import (
     Candidate,
     Curve,
@@ -27,7 +26,7 @@ from elastocal.diagnosis.diagnosis import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic
 from elastocal.diagnosis.effect_search import (
     LARGEST_SET,
-    SelectedEffects,
+    ForwardSelection,
     distances,
     fit_extended,
     settings_of,
@@ -44,8 +43,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray
 
-# From scores to an answer: explained, ambiguous, unknown, or nothing significant.
-
 SET = 0.95  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
@@ -56,7 +53,7 @@ TOO_NEAR_PROBABILITY = 0.89
 Rivals = tuple[tuple[Item, float], ...]
 
 
-def rivals_of(found: SelectedEffects, k: int) -> Rivals:
+def rivals_of(found: ForwardSelection, k: int) -> Rivals:
     """Item k of what the search found and the other effects that it may be."""
     slot, item = found.slots[k], found.chosen.items[k]
     each, nothing = slot.probabilities()
@@ -94,15 +91,10 @@ def rivals_of(found: SelectedEffects, k: int) -> Rivals:
     return tuple((slot.items[i], float(p[i])) for i in chosen)
 
 
-# What the residual depends on, whatever the effect.
-
-
 def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
-    """One test per covariate, most telling first; none names an effect.
-
-    The statistic is the largest evidence among the covariate's blocks; its distribution without
-    structure comes from flipping the signs of whole configurations.
-    """
+    """One test per covariate, most telling first; none names an effect.  The statistic is the
+    largest evidence among the covariate's blocks; its distribution without structure comes from
+    flipping the signs of whole configurations."""
     if not (each := observed.covariates):
         return ()
     odds = {covariate: float(own[0]) for covariate, own in each.items()}
@@ -113,8 +105,6 @@ def structure_tests(observed: Scan) -> tuple[StructureTest, ...]:
     ]
     return tuple(sorted(tests, key=lambda t: (t.p_family, t.p_value, -odds[t.driver])))
 
-
-# The shape of a dependence that has no name: the motion as a function of the covariate.
 
 MOST_CURVES = 3
 TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
@@ -130,18 +120,10 @@ FARTHEST = 10.0  # times what was found that a time constant may be, or part of 
 class FewAnswer(SumAnswer):
     """The pieces of a diagnosis that the few causes fill which the forward search `selected`."""
 
-    selected: SelectedEffects
-
-    @classmethod
-    def of(
-        cls, before: DiagnosisData, selected: SelectedEffects, rng: np.random.Generator
-    ) -> FewAnswer:
-        found = sum_of(selected.dataset, selected.chosen)
-        return cls(before, selected.dataset, found, (), rng, {}, selected)
+    selected: ForwardSelection
 
     @cached_property
     def rivals(self) -> tuple[Rivals, ...]:
-        """Of each item of the chosen set."""
         return tuple(rivals_of(self.selected, k) for k in range(len(self.selected.chosen.items)))
 
     @property
@@ -187,9 +169,8 @@ class FewAnswer(SumAnswer):
         """Whether its geometry was looked for from many starts."""
         return isinstance(what, Hypothesis) and bool(what.starts(self.dataset.base.model))
 
-    @property
-    def _not_written(self) -> Sequence[int]:
-        return self._unnamed
+    def _error_without(self, gone: Sequence[int]) -> Array:
+        return super()._error_without([*gone, *self._unnamed])  # which no cell has that is written
 
     def _mistimed(self, k: int) -> Array:
         """Mean square (draws,) in m² of new readings, made at any time of the campaign, between the
@@ -206,8 +187,7 @@ class FewAnswer(SumAnswer):
         moment = self.rng.uniform(time[after - 1], time[after])
         apart = np.abs(moment - item.settings[s]) / np.ptp(time)
         n_new = NEW_POSES * round(len(every) / len(self.dataset.blocks.member))
-        changed = (every > item.settings[s]).mean()
-        step = mean_square(chosen.data, chosen.signal(k)) / changed
+        step = mean_square(chosen.data, chosen.signal(k)) / (every > item.settings[s]).mean()
         return np.asarray(self.rng.binomial(n_new, apart) / n_new * step)
 
     @cached_property
@@ -240,8 +220,7 @@ class FewAnswer(SumAnswer):
         tried[:, s] = values
         grams = Grams(dataset, data, project(data, chosen.noise))
         evidence = grams.of(item.what, tried).evidence(item.what.scales)
-        estimates = grams.estimates(item.what, tried, chosen.scales[k])
-        return tried, special.softmax(evidence), estimates
+        return tried, special.softmax(evidence), grams.estimates(item.what, tried, chosen.scales[k])
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
         """Of the columns by the instrument's noise or, where a geometry is sought, of the exact
@@ -328,8 +307,6 @@ def beside_unknown(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
     return tuple(replace(f, probability=min(f.probability, TOO_NEAR_PROBABILITY)) for f in effects)
 
 
-# Everything that was tried, best first; what could not be tested; what to beware of.
-
 DETECTABLE = 1.0  # standard deviations: below, a typical size does not move the data
 STATED_LOW, STATED_HIGH = 0.67, 1.5
 FAULTY_SHARE = 0.02
@@ -338,8 +315,8 @@ OPEN_BACKLASH = 0.2  # probability of the other backlash model from which the re
 
 
 def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
-    """Every hypothesis with its probability: in the slot where it is likeliest.  Last those that
-    the data do not show at their typical size and do not ask for: they have their prior alone."""
+    """Every hypothesis with its probability, in the slot where it is likeliest.  Last come those
+    that the data do not show at typical size and do not ask for: they have their prior alone."""
     found = few.selected
     best: dict[tuple[str, str], Candidate] = {}
     alone = zip(dataset.hypotheses, found.alone.distance.tolist(), strict=False)
@@ -352,17 +329,15 @@ def candidates(dataset: DiagnosisData, few: FewAnswer) -> tuple[Candidate, ...]:
             what = item.what
             if not isinstance(what, Hypothesis):
                 continue
-            probability, key = named.get(id(what), float(p)), what.key
-            row = Candidate(
-                *key, what.stage, probability, float(score), distance[key], settings_of(item)
-            )
+            key, p = what.key, named.get(id(what), float(p))
+            row = Candidate(*key, what.stage, p, float(score), distance[key], settings_of(item))
             if key not in best or row.probability > best[key].probability:
                 best[key] = row
     likeliest = sorted(best.values(), key=lambda c: (-c.probability, -c.score))
     return tuple(sorted(likeliest, key=lambda c: c.detectable < DETECTABLE and c.score <= 0))
 
 
-def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested, ...]:
+def too_small(dataset: DiagnosisData, found: ForwardSelection) -> tuple[Untested, ...]:
     """Hypotheses whose typical size these poses would not show."""
     chosen = {id(item.what) for item in found.chosen.items}
     reason = (
@@ -378,7 +353,7 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
 
 
 def warnings(
-    dataset: DiagnosisData, found: SelectedEffects, suspects: BoolArray, noise: NoiseValues
+    dataset: DiagnosisData, found: ForwardSelection, suspects: BoolArray, noise: NoiseValues
 ) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
     out, data = list[str](), found.chosen.data
@@ -430,7 +405,6 @@ def unheard_of(found: Sequence[FoundEffect], model: Model) -> dict[str, tuple[st
 
 
 def confirm(far: Mapping[str, tuple[str, float]]) -> Iterator[str]:
-    """What to do about causes that are unheard of."""
     if far:
         each = [f"{name} ({rounded(times, 2)} times)" for name, (_, times) in far.items()]
         yield (
