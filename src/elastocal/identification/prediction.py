@@ -304,14 +304,15 @@ def measured_loads(observed: Observations) -> Array:
     return _evenly(_loads(observed.table.force, observed.kind), MOST_LOADS)
 
 
-def _evenly(rows: Array, most: int) -> Array:
+def _evenly(rows: NDArray[Any], most: int) -> NDArray[Any]:
     chosen = np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(int)
-    return np.asarray(rows[chosen])
+    return rows[chosen]
 
 
 def measured_visits(observed: Observations) -> MeasuredVisits:
     """Joints and force of the readings, each pair once, at most MOST_VISITS, evenly chosen."""
-    rows = np.hstack([observed.table.q, observed.table.force])[observed.lead]
+    some = observed.table.take(_evenly(observed.lead, 100 * MOST_VISITS))
+    rows = np.hstack([some.q, some.force])
     first = np.sort(np.unique(rows.round(9), axis=0, return_index=True)[1])
     rows = _evenly(rows[first], MOST_VISITS)
     return MeasuredVisits(rows[:, :-3], rows[:, -3:])
