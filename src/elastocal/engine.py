@@ -180,20 +180,33 @@ class Mixed:
     def rows(self) -> int:
         return int(sum((~pack.absent).sum() for pack in self.packs))
 
-    def state(self, theta: Array) -> State:
-        """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
-        without a prior depend on each other."""
-        packs = tuple(Whitened(pack, theta) for pack in self.packs)
-        p = len(self.precision)
-        known = self.precision > 0
-        M, z, value = np.zeros((p, p)), np.zeros(p), 0.0
+    def whitened(self, theta: Array) -> tuple[tuple[Whitened, ...], Products, float]:
+        """The packs under V, sums of products over their rows, and Σ log|V|; those of the last
+        state, once, where they are asked for again.
+
+        Raises LinAlgError where V is not positive definite.
+        """
+        last = vars(self).pop("_last", None)
+        if last is not None and np.allclose(last[0], theta, ROUNDING, 0.0):
+            return last[1]
+        del last
+        packs, p = tuple(Whitened(pack, theta) for pack in self.packs), len(self.precision)
+        M, z, squares = np.zeros((p, p)), np.zeros(p), 0.0
         for w in packs:
-            value += w.log_det + float(np.vdot(w.e, w.e))
+            squares += float(np.vdot(w.e, w.e))
             if w.B.shape[2]:
                 flat = w.B.reshape(-1, p)
                 M, z = M + flat.T @ flat, z + flat.T @ w.e.ravel()
+        return packs, Products(M, z, squares, self.rows), sum(w.log_det for w in packs)
+
+    def state(self, theta: Array) -> State:
+        """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
+        without a prior depend on each other."""
+        packs, sums, value = found = self.whitened(theta)
+        vars(self)["_last"] = theta, found
+        known, M, z = self.precision > 0, sums.M.copy(), sums.z
         # A little more than the prior: what others show as well must not drown in rounding.
-        M[np.diag_indices(p)] += self.precision + ROUNDING * known * np.diag(M)
+        M[np.diag_indices_from(M)] += self.precision + ROUNDING * known * np.diag(M)
         try:
             L = np.asarray(linalg.cholesky(M, lower=True, check_finite=False))
         except linalg.LinAlgError:
@@ -201,7 +214,7 @@ class Mixed:
                 "the columns of B depend on each other under this noise model; measure more poses"
             ) from None
         x = linalg.cho_solve((L, True), z, check_finite=False)
-        value += 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
+        value += sums.squares + 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
         value += (self.rows - int((~known).sum())) * LOG_2PI
         value -= float(np.log(self.precision[known]).sum())
         return State(theta, packs, x, L, value)
@@ -498,8 +511,17 @@ class Products:
     rows: int
 
     def at(self, variances: Array, factor: float = 0.0) -> Standardised:
-        """The coefficients under prior variances v (k,) and noise of the deviation e^factor."""
-        return Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
+        """The coefficients under prior variances v (k,) and noise of the deviation e^factor; the
+        last ones are kept, as what is left out is asked for where a climb has ended."""
+        asked, last = (variances.tobytes(), factor), vars(self).get("_last")
+        if last is None or last[0] != asked:
+            found = Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
+            last = vars(self)["_last"] = asked, found
+        return last[1]
+
+    def forget(self) -> None:
+        """Drop what is kept, which is as large as M."""
+        vars(self).pop("_last", None)
 
     def value(self, at: Standardised) -> float:
         """−2ℓ but for n log 2π."""
