@@ -36,20 +36,27 @@ class Parts:
     of: IntArray
     loading: Array
 
+    @cached_property
+    def _wide(self) -> Array:
+        """All loadings of a cluster side by side (C, m, k·r)."""
+        C, k, m, r = self.loading.shape
+        return np.ascontiguousarray(self.loading.swapaxes(1, 2)).reshape(C, m, k * r)
+
     def add(self, V: Array, theta: Array) -> None:
         """Σ θ K (C, m, m) onto V, θ (C, k)."""
-        own = self.loading * np.sqrt(theta)[:, :, None, None]
-        own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
+        own = self._wide * np.sqrt(theta).repeat(self.loading.shape[3], axis=1)[:, None]
         V += own @ own.swapaxes(1, 2)
 
     def times(self, u: Array) -> Array:
         """K u (C, k, m)."""
-        along = u[:, None, None] @ self.loading
-        return np.asarray((self.loading @ along.swapaxes(2, 3))[..., 0])
+        moved = self._wide * (u[:, None] @ self._wide)
+        each = moved.reshape(*u.shape, -1, self.loading.shape[3]).sum(axis=3)
+        return np.asarray(each.swapaxes(1, 2))
 
     def trace(self, P: Array) -> Array:
         """tr P K (C, k)."""
-        return np.asarray(((P[:, None] @ self.loading) * self.loading).sum(axis=(2, 3)))
+        each = np.einsum("cmk,cmk->ck", P @ self._wide, self._wide)
+        return np.asarray(each.reshape(len(P), -1, self.loading.shape[3]).sum(axis=2))
 
     def turned(self, root: Array) -> Array:
         """root K rootᵀ (C, k, m, m)."""
@@ -74,15 +81,24 @@ class Pack:
         """Numbers (C, k) of the variances of all parts."""
         return np.concatenate([part.of for part in self.parts], axis=1)
 
+    @cached_property
+    def alike(self) -> bool:
+        """Whether the parts of all clusters have the same numbers."""
+        return bool((self.of == self.of[:1]).all())
+
     def added(self, values: Array, K: int) -> Array:
         """Sums (K, …) of `values` (C, k, …) by the numbers of the variances."""
-        n = self.of.size
-        sums = sparse.csr_array((np.ones(n), (self.of.ravel(), np.arange(n))), shape=(K, n))
+        of = self.of
+        if self.alike:
+            of, values = of[:1], values.sum(axis=0, keepdims=True)
+        n = of.size
+        sums = sparse.csr_array((np.ones(n), (of.ravel(), np.arange(n))), shape=(K, n))
         return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
 
     def pairs(self, values: Array, K: int) -> Array:
         """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
-        at = (self.of[:, :, None] * K + self.of[:, None, :]).ravel()
+        of = self.of[: len(values)]
+        at = (of[:, :, None] * K + of[:, None, :]).ravel()
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
     def V(self, theta: Array) -> Array:
@@ -233,6 +249,9 @@ class Mixed:
             Ku = np.concatenate([part.times(u) for part in pack.parts], axis=1)
             slope += pack.added(theta * (trace - (Ku @ u[..., None])[..., 0]), K)
             own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
+            if pack.alike:  # as if they were one cluster: one product, not one for each
+                own = own.swapaxes(0, 1).reshape(1, own.shape[1], -1)
+                H = H.reshape(1, own.shape[2], H.shape[2])
             information += pack.pairs(own @ own.transpose(0, 2, 1), K)
             if H.shape[2]:
                 seen += pack.added(own @ H, K)
