@@ -26,7 +26,7 @@ from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import TOLERANCE, stated_by_observation, weights_for
 from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.evaluate import row_blocks, thread_count
+from elastocal.model.evaluate import thread_count
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, BoolArray, IntArray
@@ -283,8 +283,7 @@ JOINT_SPREAD = 0.7
 SHARED, SHARED_SPREAD = 0.2, 1.5
 SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint or reading that is exact, a loose joint
 FARTHEST = 17.0  # logarithms from a start, from an exact joint to a loose one
-# Numbers of a data's columns: below, threads would wait for each other; of those in cache together.
-LARGE, PACK = 2**19, 2**18
+LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
 
 
 @dataclass(frozen=True)
@@ -391,23 +390,11 @@ class NoisyData:
 
     def V(self, noise: NoiseValues) -> Array:
         """V (C, m, m); rows left out have unit variance of their own."""
-        return np.concatenate([pack.V(noise.theta) for pack in self.packs])
-
-    def with_precision(self, precision: Array) -> NoisyData:
-        """The same with other prior precisions (p,)."""
-        out = replace(self, precision=precision)
-        vars(out)["packs"] = self.packs
-        return out
+        return self.model.packs[0].V(noise.theta)
 
     @cached_property
     def model(self) -> Mixed:
         """Of the variances `NoiseValues.theta`, with their prior."""
-        J = self.G.shape[2]
-        return Mixed(self.packs, 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
-
-    @cached_property
-    def packs(self) -> tuple[Pack, ...]:
-        """The rows with the parts of their noise, so many at a time as stay in cache."""
         (C, _, J), visit = self.G.shape, self.blocks.in_visit
         G = np.ascontiguousarray(self.G.transpose(0, 2, 1))[..., None]  # (C, joints, m, 1)
 
@@ -420,12 +407,8 @@ class NoisyData:
             Parts(numbers(0, 1), stated[:, None]),
             Parts(numbers(1, J), G), Parts(numbers(1 + J, J), G * visit[:, None]),
         )  # fmt: skip
-        some = row_blocks(C, max(PACK // (self.X[0].size or 1), 1))
-        return tuple(
-            Pack(self.X[k], self.r[k], tuple(Parts(part.of[k], part.loading[k]) for part in parts),
-                 self.left_out[k])
-            for k in some
-        )  # fmt: skip
+        pack = Pack(self.X, self.r, parts, self.left_out)
+        return Mixed((pack,), 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
 
 
 @cache
@@ -529,9 +512,8 @@ class Weighted:
 
     @classmethod
     def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        packs, products, log_det = data.model.whitened(noise.theta)
-        root, X, r = (np.concatenate(each) for each in zip(*((w.root, w.B, w.e) for w in packs)))
-        return cls(root, X, r, products, log_det + products.rows * LOG_2PI)
+        (white,), products, log_det = data.model.whitened(noise.theta)
+        return cls(white.root, white.B, white.e, products, log_det + products.rows * LOG_2PI)
 
     def prior(self, precision: Array) -> Array:
         """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide

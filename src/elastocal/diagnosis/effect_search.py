@@ -62,7 +62,7 @@ class ModelSet:
             best, score = _mixed_scales(dataset.data, weighted, items, scales)
             if best == scales:
                 break
-            scales, data = best, joined.with_precision(_precision(dataset.data, items, best))
+            scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
         assert noise is not None and weighted is not None
         self.items, self.noise, self.data, self.scales = items, noise, data, scales
         at, _ = weighted.factored(data.precision)
