@@ -252,16 +252,11 @@ class EntrySums:
         k = d * f
         moved = (self.local.transpose(0, 1, 2, 4, 3) @ F[:, None, None]).reshape(C * v, -1)
         A = (F.reshape(-1, f).T @ moved).reshape(f, d, k).swapaxes(0, 1).reshape(k, k)
-        Z = (self._by_motion @ F.reshape(-1, f)).reshape(p, k)
+        Z = (F.reshape(-1, f).T @ self.H.reshape(p, C * v, d)).swapaxes(1, 2).reshape(p, k)
         along = (r.of.swapaxes(1, 2) @ F for r in self.residuals)
         b = [r.signs @ own.reshape(C, k) - r.h @ Z
              for r, own in zip(self.residuals, along, strict=True)]  # fmt: skip
         return Spectrum.of((A - Z.T @ Z)[None], np.concatenate(b).T[None])
-
-    @cached_property
-    def _by_motion(self) -> Array:
-        """H (p·d, C·v) with a row for each motion."""
-        return np.moveaxis(self.H, 3, 1).reshape(len(self.H) * self.H.shape[3], -1)
 
     def steps(self, time: Array, moments: Array) -> Spectrum:
         """Spectrum of all motions from each of the `moments` (M,) on, which ascend, visits being at

@@ -325,16 +325,16 @@ class SymbolicArm:
     def _of_visits(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         """The same, once for rows one after the other that differ in nothing that bends the arm, as
         those of several markers do."""
-        acting = (a for a, felt in zip([*inputs, p], self._felt, strict=True) if felt)
-        rows = np.concatenate([a for a in acting if a.ndim == 2], axis=1)
-        new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+        new = np.ones(len(inputs[0]), dtype=bool)
+        felt = (a for a, acts in zip([*inputs, p], self._acting, strict=True) if acts)
+        new[1:] = sum((a[1:] != a[:-1]).any(axis=1) for a in felt if a.ndim == 2) > 0
         at, begun = np.cumsum(new) - 1, np.flatnonzero(new)
         *given, values = (a[begun] if a.ndim == 2 else a for a in (*inputs, p))
         theta, slope = self._settled(given, values)
         return theta[at], slope[at]
 
     @cached_property
-    def _felt(self) -> list[bool]:
+    def _acting(self) -> list[bool]:
         """Which of the inputs, and the parameters, the equilibrium depends on."""
         symbols = [*self.arm.inputs.values(), self.p]
         return [bool(s.numel()) and ca.depends_on(self.residual, s) for s in symbols]
