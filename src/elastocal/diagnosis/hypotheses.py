@@ -10,13 +10,13 @@ from typing import ClassVar
 
 import casadi as ca
 import numpy as np
+import scipy  # whose `optimize` loads where it is used
 from scipy.special import logsumexp
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import EffectChoice
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import FoundEffect, Untested
-from elastocal.engine import climb
 from elastocal.measurements import Measurements, by_rows, in_any_order
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
@@ -361,8 +361,7 @@ ROWS = 3000  # of the equations, as many as tell one start from another
 REFERENCES = 12  # starts about which the whole model is evaluated, for the factors of the rows
 KEPT_STARTS, AT_ONCE = 12, 50
 ALIKE = 0.99  # correlation of what two starts leave beside the fitted parameters
-# Of the refinement: steps, of χ² what ends them, and how near its differences are to derivatives.
-MOST_STEPS, NEGLIGIBLE, NEAR = 40, 1e-8, 1e-6
+MOST_STEPS = 40  # of the refinement
 SAME = 0.05  # of χ²: a difference that is none
 
 
@@ -460,18 +459,15 @@ class StartSearch:
         def start_of(values: Array) -> dict[str, float]:
             return dict(zip(keys, map(float, x0 + width * values), strict=True))
 
-        def objective(values: Array) -> tuple[float, Array, Array]:
-            each = values + np.vstack([np.zeros(len(keys)), NEAR * np.eye(len(keys))])
-            left, C = self._left([start_of(v) for v in each])
-            # Zero where there is no amplitude that it can have.
-            explained = C * np.where(left < unexplained @ unexplained, unexplained @ C, 0.0)
-            e = np.vstack([(unexplained[:, None] - explained) / noise, each.T])
-            J = (e[:, 1:] - e[:, :1]) / NEAR
-            return float(e[:, 0] @ e[:, 0]), 2 * J.T @ e[:, 0], 2 * J.T @ J
+        def residual(values: Array) -> Array:
+            left, C = self._left([start_of(values)])
+            if left[0] >= self._unexplained @ self._unexplained:  # no amplitude that it can have
+                return np.append(self._unexplained / noise, values)
+            c = C[:, 0]
+            return np.append((self._unexplained - c * (c @ self._unexplained)) / noise, values)
 
-        free, unexplained = np.full(len(keys), np.inf), self._unexplained
-        found = climb(objective, np.zeros(len(keys)), -free, free, NEGLIGIBLE, MOST_STEPS)[0]
-        return start_of(found)
+        found = scipy.optimize.least_squares(residual, np.zeros(len(keys)), max_nfev=MOST_STEPS)
+        return start_of(found.x)
 
     def _columns(self, starts: Sequence[Mapping[str, float]]) -> Array:
         """The amplitude's (rows, size, starts), by the whole model at each start."""
