@@ -36,6 +36,28 @@ class Parts:
     of: IntArray
     loading: Array
 
+    @cached_property
+    def _wide(self) -> Array:
+        """All loadings of a cluster side by side (C, m, k·r)."""
+        C, k, m, r = self.loading.shape
+        return np.ascontiguousarray(self.loading.swapaxes(1, 2)).reshape(C, m, k * r)
+
+    def add(self, V: Array, theta: Array) -> None:
+        """Σ θ K (C, m, m) onto V, θ (C, k)."""
+        own = self._wide * np.sqrt(theta).repeat(self.loading.shape[3], axis=1)[:, None]
+        V += own @ own.swapaxes(1, 2)
+
+    def times(self, u: Array) -> Array:
+        """K u (C, k, m)."""
+        moved = self._wide * (u[:, None] @ self._wide)
+        each = moved.reshape(*u.shape, -1, self.loading.shape[3]).sum(axis=3)
+        return np.asarray(each.swapaxes(1, 2))
+
+    def trace(self, P: Array) -> Array:
+        """tr P K (C, k)."""
+        each = np.einsum("cmk,cmk->ck", P @ self._wide, self._wide)
+        return np.asarray(each.reshape(len(P), -1, self.loading.shape[3]).sum(axis=2))
+
 
 @dataclass(frozen=True)
 class Pack:
@@ -51,24 +73,31 @@ class Pack:
     def of(self) -> IntArray:
         return np.concatenate([part.of for part in self.parts], axis=1)
 
+    @cached_property
+    def alike(self) -> bool:
+        """Whether the parts of all clusters have the same numbers."""
+        return bool((self.of == self.of[:1]).all())
+
     def added(self, values: Array, K: int) -> Array:
         """Sums (K, …) of `values` (C, k, …) by the numbers of the variances."""
-        n = self.of.size
-        sums = sparse.csr_array((np.ones(n), (self.of.ravel(), np.arange(n))), shape=(K, n))
+        of = self.of
+        if self.alike:
+            of, values = of[:1], values.sum(axis=0, keepdims=True)
+        n = of.size
+        sums = sparse.csr_array((np.ones(n), (of.ravel(), np.arange(n))), shape=(K, n))
         return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
 
     def pairs(self, values: Array, K: int) -> Array:
         """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
-        at = (self.of[:, :, None] * K + self.of[:, None, :]).ravel()
+        of = self.of[: len(values)]
+        at = (of[:, :, None] * K + of[:, None, :]).ravel()
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
     def V(self, theta: Array) -> Array:
         """V (C, m, m) at θ (K,), absent rows of unit variance by themselves."""
         V, here = np.zeros((*self.e.shape, self.e.shape[1])), ~self.absent
         for part in self.parts:
-            own = part.loading * np.sqrt(theta[part.of])[:, :, None, None]
-            own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
-            V += own @ own.swapaxes(1, 2)
+            part.add(V, theta[part.of])
         if not here.all():
             V *= here[:, :, None] & here[:, None, :]
             np.einsum("cii->ci", V)[:] += self.absent
@@ -146,20 +175,37 @@ class Mixed:
     precision: Array
     prior: LogPrior | None = None
 
-    def state(self, theta: Array) -> State:
-        """LinAlgError where V is not positive definite, InsufficientDataError where columns without
-        a prior depend on each other."""
-        packs = tuple(Whitened(pack, theta) for pack in self.packs)
-        p = len(self.precision)
-        known = self.precision > 0
-        M, z, value = np.zeros((p, p)), np.zeros(p), 0.0
+    @property
+    def rows(self) -> int:
+        return int(sum((~pack.absent).sum() for pack in self.packs))
+
+    def whitened(self, theta: Array) -> tuple[tuple[Whitened, ...], Products, float]:
+        """The packs under V, sums of products over their rows, and Σ log|V|; those of the last
+        state, once, where they are asked for again.
+
+        Raises LinAlgError where V is not positive definite.
+        """
+        last = vars(self).pop("_last", None)
+        if last is not None and np.allclose(last[0], theta, ROUNDING, 0.0):
+            return last[1]
+        del last
+        packs, p = tuple(Whitened(pack, theta) for pack in self.packs), len(self.precision)
+        M, z, squares = np.zeros((p, p)), np.zeros(p), 0.0
         for w in packs:
-            value += w.log_det + float(np.vdot(w.e, w.e))
+            squares += float(np.vdot(w.e, w.e))
             if w.B.shape[2]:
                 flat = w.B.reshape(-1, p)
                 M, z = M + flat.T @ flat, z + flat.T @ w.e.ravel()
+        return packs, Products(M, z, squares, self.rows), sum(w.log_det for w in packs)
+
+    def state(self, theta: Array) -> State:
+        """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
+        without a prior depend on each other."""
+        packs, sums, value = found = self.whitened(theta)
+        vars(self)["_last"] = theta, found
+        known, M, z = self.precision > 0, sums.M.copy(), sums.z
         # A little more than the prior: what others show as well must not drown in rounding.
-        M[np.diag_indices(p)] += self.precision + ROUNDING * known * np.diag(M)
+        M[np.diag_indices_from(M)] += self.precision + ROUNDING * known * np.diag(M)
         try:
             L = np.asarray(linalg.cholesky(M, lower=True, check_finite=False))
         except linalg.LinAlgError:
@@ -167,9 +213,8 @@ class Mixed:
                 "the columns of B depend on each other under this noise model; measure more poses"
             ) from None
         x = linalg.cho_solve((L, True), z, check_finite=False)
-        value += 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
-        rows = int(sum((~pack.absent).sum() for pack in self.packs))
-        value += (rows - int((~known).sum())) * LOG_2PI
+        value += sums.squares + 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
+        value += (self.rows - int((~known).sum())) * LOG_2PI
         value -= float(np.log(self.precision[known]).sum())
         return State(theta, packs, x, L, value)
 
@@ -183,12 +228,13 @@ class Mixed:
         for w, H, z in state.each():
             pack, u, theta = w.pack, w.back(z[..., None])[..., 0], state.theta[w.pack.of]
             P = w.back((np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
-            loads, along = [part.loading for part in pack.parts], u[:, None, None]
-            traces = [((P[:, None] @ own) * own).sum(axis=(2, 3)) for own in loads]
-            products = [(own @ (along @ own).swapaxes(2, 3))[..., 0] for own in loads]
-            trace, Ku = np.concatenate(traces, axis=1), np.concatenate(products, axis=1)
+            trace = np.concatenate([part.trace(P) for part in pack.parts], axis=1)
+            Ku = np.concatenate([part.times(u) for part in pack.parts], axis=1)
             slope += pack.added(theta * (trace - (Ku @ u[..., None])[..., 0]), K)
             own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
+            if pack.alike:  # as if they were one cluster: one product, not one for each
+                own = own.swapaxes(0, 1).reshape(1, own.shape[1], -1)
+                H = H.reshape(1, own.shape[2], H.shape[2])
             information += pack.pairs(own @ own.transpose(0, 2, 1), K)
             if H.shape[2]:
                 seen += pack.added(own @ H, K)
@@ -458,8 +504,17 @@ class Products:
     rows: int
 
     def at(self, variances: Array, factor: float = 0.0) -> Standardised:
-        """The coefficients under prior variances v (k,) and noise of the deviation e^factor."""
-        return Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
+        """The coefficients under prior variances v (k,) and noise of the deviation e^factor; the
+        last ones are kept, as what is left out is asked for where a climb has ended."""
+        asked, last = (variances.tobytes(), factor), vars(self).get("_last")
+        if last is None or last[0] != asked:
+            found = Standardised.of(self.M, self.z, np.sqrt(variances), float(np.exp(factor)))
+            last = vars(self)["_last"] = asked, found
+        return last[1]
+
+    def forget(self) -> None:
+        """Drop what is kept, which is as large as M."""
+        vars(self).pop("_last", None)
 
     def value(self, at: Standardised) -> float:
         """−2ℓ but for n log 2π."""

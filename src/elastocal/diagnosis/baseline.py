@@ -19,7 +19,6 @@ from elastocal.engine import (
     Parts,
     Products,
     Standardised,
-    Whitened,
     climb,
 )
 from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit, with_placed
@@ -472,10 +471,8 @@ class Weighted:
 
     @classmethod
     def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        white, n = Whitened(data.model.packs[0], noise.theta), data.n_rows
-        flat, r = white.B.reshape(-1, white.B.shape[2]), white.e
-        products = Products(flat.T @ flat, flat.T @ r.ravel(), float(np.vdot(r, r)), n)
-        return cls(white.root, white.B, r, products, white.log_det + n * LOG_2PI)
+        (white,), products, log_det = data.model.whitened(noise.theta)
+        return cls(white.root, white.B, white.e, products, log_det + products.rows * LOG_2PI)
 
     def prior(self, precision: Array) -> Array:
         """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
@@ -527,7 +524,7 @@ def fit_noise(
     low = begin - FARTHEST
     low[0] = max(low[0], np.log(SMALLEST_NOISE / np.sqrt(data.mean_variance)))
     found = climb(objective, begin, low, begin + FARTHEST, enough, STEPS)[0]
-    return NoiseValues.of(np.exp(to @ found))
+    return start if found is begin else NoiseValues.of(np.exp(to @ found))
 
 
 def balanced(data: NoisyData) -> NoiseValues:

@@ -158,11 +158,8 @@ def field_component(
 ) -> Component:
     """A smooth motion of a place with what it follows, of lengths from the `shortest` share of its
     range: the same waves in each component of the motion."""
-    x = dataset.table.time if name == "time" else dataset.table.q[:, index(name)]
-    assert x is not None  # a field follows what is recorded: the time, or the angle of a joint
-    entry = FIELD.entry_at(where)
+    entry, (x, waves) = FIELD.entry_at(where), _field_waves(dataset, name, shortest)
     low, high, span = float(x.min()), float(x.max()), float(np.ptp(x))
-    waves = Waves.over(low, high, shortest * span, turns=name != "time")
     D = np.asarray(np.kron(np.eye(entry.size), waves.at(x)[:, None, :] * MOTION), dtype=float)
     return Component(
         "time" if name == "time" else "pose", FIELD, where,
@@ -170,6 +167,14 @@ def field_component(
         (math.log(shortest * span), math.log(FIELD_LENGTHS[1] * span)), entry.size,
         ((f"field_{name}_low", low), (f"field_{name}_high", high)),
     )  # fmt: skip
+
+
+def _field_waves(dataset: DiagnosisData, name: str, shortest: float) -> tuple[Array, Waves]:
+    """What a field follows (n_rows,), the time or the angle of a joint, and its waves."""
+    x = dataset.table.time if name == "time" else dataset.table.q[:, index(name)]
+    assert x is not None
+    low, high, span = float(x.min()), float(x.max()), float(np.ptp(x))
+    return x, Waves.over(low, high, shortest * span, turns=name != "time")
 
 
 # What corrects the arm beside a sum and names no cause: fields, steps, and responses to loads.
@@ -193,22 +198,17 @@ def without_a_name(
     taken |= {(c.effect.name, c.where) for c in found.components}
     shown: list[Conspicuous] = []
 
-    def scored(
-        c: Component, scales: Array, component: Callable[[], Component] | None = None
-    ) -> None:
-        columns = sums.data.masked(c.columns * c.scalings[0])
-        nats = float(direct(columns, sums.at).evidence(scales)[0]) - c.search
-        if nats > CONSPICUOUS:
-            of = "time" if c.family == "time" else c.follows or c.effect.name
-            shown.append((nats, (c.where, of), component or (lambda: c)))
-
     for where in FIELD.places(model.chain, model.cell):
+        # Of one place at a time: what its entries sum up to would fill the memory.
+        grams, entry = Grams(dataset, sums.data, sums.at), FIELD.entry_at(where)
         for name in () if FIELD.name in without else _followed_by(dataset, found, where):
-            coarse = field_component(dataset, where, name, FIELD_LENGTHS[0] * 2)
-            # A large table's fields would fill the memory.
-            scored(coarse, SCALES, partial(field_component, dataset, where, name))
-        # Of one place at a time: so would what its entries sum up to.
-        grams = Grams(dataset, sums.data, sums.at)
+            coarse = FIELD_LENGTHS[0] * 2
+            x, waves = _field_waves(dataset, name, coarse)
+            size = MOTION * np.sqrt(waves.variances(1.0, coarse * float(np.ptp(x))))
+            F = dataset.blocks.of_visits((waves.at(x) * size)[dataset.lead])
+            nats = float(grams.entry((entry.name, (where,))).alike(F).evidence(SCALES)[0])
+            # A large table's fields would fill the memory as well.
+            shown.append((nats, (where, name), partial(field_component, dataset, where, name)))
         for effect, search in tried:
             free = effect.name not in without and (effect.name, where) not in taken
             if not free or where not in effect.places(model.chain, model.cell):
@@ -220,8 +220,10 @@ def without_a_name(
                     settings=tuple(settings.items()),
                     fellows=len(effect.places(model.chain, model.cell)),
                 )  # fmt: skip
-                scored(c, UNSIZED_SCALES)
-    shown.sort(key=lambda c: -c[0])
+                evidence = direct(sums.data.masked(columns), sums.at).evidence(UNSIZED_SCALES)
+                of = "time" if c.family == "time" else effect.name
+                shown.append((float(evidence[0]) - cost, (where, of), partial(replace, c)))
+    shown = sorted((c for c in shown if c[0] > CONSPICUOUS), key=lambda c: -c[0])
     chosen = list(dict.fromkeys(of for _, of, _ in shown))[:most]
     return [component() for _, of, component in shown if of in chosen]
 

@@ -183,7 +183,7 @@ class DiagnosisData:
         if isinstance(h, Generic):
             if h.columns is not None:
                 return h.columns
-            assert h.entry is not None and h.direction is not None
+            assert h.entry is not None
             direction = np.einsum("cmv,cvdk->cmdk", self.blocks.in_visit, h.direction)
             return np.asarray(np.einsum("cmd,cmdk->cmk", self.entry(h.entry), direction))
         size = self.sizes[h.key]
@@ -409,8 +409,8 @@ LOAD_POINT_MOTION = 1e-2
 class Generic:
     """A block: `entry` moved by smooth functions of `covariate`, or ready columns.
 
-    `direction` (C, v, d, k) holds the functions for each component that moves; `columns` (C, m, k)
-    are packed columns of blocks that vary within a visit.
+    Each of its `components` moves by the same `functions` (C, v, f), or by its `own` (C, v, d, k);
+    `columns` (C, m, k) are packed columns of blocks that vary within a visit.
     """
 
     kind: str
@@ -418,7 +418,9 @@ class Generic:
     where: str
     stage: Stage
     entry: EntryKey | None = None
-    direction: Array | None = None
+    functions: Array | None = None
+    components: int = 1
+    own: Array | None = None
     columns: Array | None = None
     source: Covariate | None = None
 
@@ -436,9 +438,17 @@ class Generic:
 
     @property
     def width(self) -> int:
-        functions = self.direction if self.columns is None else self.columns
-        assert functions is not None
-        return functions.shape[-1]
+        given = next(a for a in (self.functions, self.own, self.columns) if a is not None)
+        return int(given.shape[-1]) * self.components
+
+    @property
+    def direction(self) -> Array:
+        """The functions for each component that moves (C, v, d, k), written out."""
+        if self.own is not None:
+            return self.own
+        assert self.functions is not None
+        D = np.einsum("de,cvf->cvdef", np.eye(self.components), self.functions)
+        return D.reshape(*D.shape[:3], -1)
 
 
 def generic_blocks(dataset: DiagnosisData) -> list[Generic]:
@@ -454,9 +464,8 @@ def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
         some = by.functions if entry == "joint_motion" else by.functions[:, :, :FRAME_WAVES]
         span = dataset.columns.places[entry, place]
         d, size = span.stop - span.start, BASE_MOTION if entry == "base_motion" else MOTION
-        direction = np.einsum("de,cvf->cvdef", size * np.eye(d), some)
-        direction = direction.reshape(*some.shape[:2], d, -1)
-        return Generic(by.kind, by.name, place, stage, (entry, (place,)), direction, source=by)
+        key = entry, (place,)
+        return Generic(by.kind, by.name, place, stage, key, some * size, d, source=by)
 
     for by in covariates(dataset):
         under_load = by.kind.startswith(("torque", "load"))
@@ -492,7 +501,7 @@ def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
         for a in range(3):
             direction[:, :, a, 3 * a : 3 * a + 3] = force
             direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = moment
-        yield Generic("force", f"force at {where}", where, "compliance", key, direction)
+        yield Generic("force", f"force at {where}", where, "compliance", key, own=direction)
 
 
 def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:

@@ -49,18 +49,20 @@ class ModelSet:
         self, dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None,
         joined: NoisyData | None = None,
     ) -> None:  # fmt: skip
-        noise, scales = start, (1.0,) * len(items)
+        noise, scales, weighted = start, (1.0,) * len(items), None
         data = joined = joined or with_items(dataset, items, scales)
         for _ in range(2):
-            noise = fit_noise(data, noise)
-            weighted = Weighted.of(joined, noise)
+            before, noise = noise, fit_noise(data, noise)
+            if weighted is None or noise is not before:
+                weighted = Weighted.of(joined, noise)
             best, score = _mixed_scales(dataset.data, weighted, items, scales)
             if best == scales:
                 break
             scales, data = best, replace(joined, precision=_precision(dataset.data, items, best))
-        assert noise is not None
+        assert noise is not None and weighted is not None
         self.items, self.noise, self.data, self.scales = items, noise, data, scales
         at, _ = weighted.factored(data.precision)
+        self.beta = at.root * at.b
         z = at.b / np.linalg.norm(at.inverse, axis=0)  # in deviations
         for item, span in zip(items, self.spans, strict=True):
             score += item.log_prior
@@ -81,7 +83,7 @@ class ModelSet:
         """Whether an effect would have to be larger than any of its kind is."""
         return any(
             isinstance(item.what, Hypothesis)
-            and np.abs(self.at.beta[span]).max(initial=0.0) > item.what.effect.most
+            and np.abs(self.beta[span]).max(initial=0.0) > item.what.effect.most
             for item, span in zip(self.items, self.spans, strict=True)
         )
 
@@ -101,7 +103,7 @@ class ModelSet:
     def signal(self, k: int) -> Array:
         """What item k does to the readings (C, m) at its estimate."""
         span = self.spans[k]
-        return self.data.masked(self.data.X[:, :, span] @ self.at.beta[span])
+        return self.data.masked(self.data.X[:, :, span] @ self.beta[span])
 
 
 def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
@@ -247,7 +249,7 @@ def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]
     for item, span in zip(chosen.items, chosen.spans, strict=True):
         what = item.what
         if isinstance(what, Hypothesis):
-            values = chosen.at.beta[span] * dataset.sizes[what.key]
+            values = chosen.beta[span] * dataset.sizes[what.key]
             starts = what.starts(model)
             for p, v in zip(what.parameters, values, strict=True):
                 name = f"{what.where}.{p.key}"

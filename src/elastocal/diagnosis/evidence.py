@@ -235,6 +235,18 @@ class EntrySums:
         """Spectrum of the groups with directions D, as `products` takes them."""
         return Spectrum.of(*self.products(D))
 
+    def alike(self, F: Array) -> Spectrum:
+        """Spectrum of one group in which all motions follow the same functions F (C, v, f)."""
+        (p, _, _, d), (C, v, f) = self.H.shape, F.shape
+        k = d * f
+        moved = (self.local.transpose(0, 1, 2, 4, 3) @ F[:, None, None]).reshape(C * v, -1)
+        A = (F.reshape(-1, f).T @ moved).reshape(f, d, k).swapaxes(0, 1).reshape(k, k)
+        Z = (F.reshape(-1, f).T @ self.H.reshape(p, C * v, d)).swapaxes(1, 2).reshape(p, k)
+        along = (r.of.swapaxes(1, 2) @ F for r in self.residuals)
+        b = [r.signs @ own.reshape(C, k) - r.h @ Z
+             for r, own in zip(self.residuals, along, strict=True)]  # fmt: skip
+        return Spectrum.of((A - Z.T @ Z)[None], np.concatenate(b).T[None])
+
     def steps(self, time: Array, moments: Array) -> Spectrum:
         """Spectrum of all motions from each of the `moments` (M,) on, which ascend, visits being at
         `time` (C, v), −∞ where there is none: sums of what comes later, not columns of each."""
@@ -313,8 +325,11 @@ class Grams:
     def of(self, what: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
         """A block, or a hypothesis at all `settings` (G, …), by default those of the search."""
         dataset = self.dataset
-        if isinstance(what, Generic) and what.entry is not None and what.direction is not None:
-            return self.entry(what.entry).driven(what.direction[:, :, :, None])
+        if isinstance(what, Generic) and what.entry is not None:
+            sums = self.entry(what.entry)
+            if what.functions is not None:
+                return sums.alike(what.functions)
+            return sums.driven(what.direction[:, :, :, None])
         if isinstance(what, Generic) or not what.driven:
             return direct(self.data.masked(dataset.packed(what)), self.at, self._residuals)
         tried = dataset.grids[what.key].values if settings is None else settings

@@ -285,7 +285,6 @@ class FewAnswer(SumAnswer):
             block = item.what
             if isinstance(block, Hypothesis) or block.source is None or block.source.values is None:
                 continue
-            assert block.direction is not None
             x, order = np.unique(block.source.values[present], return_index=True)
             direction = block.direction[present]
             motion = direction @ at.beta[span]  # (visits, d)

@@ -515,7 +515,7 @@ def tied_fit(problem: Problem, tolerance: float) -> Fit:
     """Fit of all free parameters with weak ties, scaled by a noise level found on the way.  Many
     readings start where such a fit to a sample of them ends."""
     if (rough := _sampled(problem)) is not problem:
-        found = _tied_from(rough, problem.x0, tolerance)
+        found = _tied_from(rough, problem.x0, CHOOSING)
         with suppress(ElastocalError):  # it may lead where other readings have no equilibrium
             return _tied_from(problem, found.x, tolerance, residual_sigma(found, 0))
     return _tied_from(problem, problem.x0, tolerance)

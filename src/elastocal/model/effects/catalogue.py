@@ -280,9 +280,26 @@ class SymbolicArm:
         Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
         """
         if self.implicit:
-            return self._recent((), [p, *inputs], lambda: self._settled(inputs, p))
+            return self._recent((), [p, *inputs], lambda: self._of_visits(inputs, p))
         n, size = len(inputs[0]), len(self.arm.springs)
         return np.zeros((n, size), dtype=p.dtype), np.zeros((n, size, size))
+
+    def _of_visits(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+        """The same, once for rows one after the other that differ in nothing that bends the arm, as
+        those of several markers do."""
+        new = np.ones(len(inputs[0]), dtype=bool)
+        felt = (a for a, acts in zip([*inputs, p], self._acting, strict=True) if acts)
+        new[1:] = sum((a[1:] != a[:-1]).any(axis=1) for a in felt if a.ndim == 2) > 0
+        at, begun = np.cumsum(new) - 1, np.flatnonzero(new)
+        *given, values = (a[begun] if a.ndim == 2 else a for a in (*inputs, p))
+        theta, slope = self._settled(given, values)
+        return theta[at], slope[at]
+
+    @cached_property
+    def _acting(self) -> list[bool]:
+        """Which of the inputs, and the parameters, the equilibrium depends on."""
+        symbols = [*self.arm.inputs.values(), self.p]
+        return [bool(s.numel()) and ca.depends_on(self.residual, s) for s in symbols]
 
     def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         n, size = len(inputs[0]), len(self.arm.springs)
