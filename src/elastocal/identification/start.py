@@ -579,8 +579,10 @@ def copied(observed: Observations) -> BoolArray:
     said = [table.q, table.force, table.marker[:, None]]
     said += [] if table.torque is None else [table.torque]
     key = np.column_stack(said)[own].T
-    whole = numbered(*value.T, *key)
-    found = np.unique(whole, return_index=True)[1][whole] != np.arange(n)
+    _, code, count = np.unique(value[:, 0], return_inverse=True, return_counts=True)
+    alike = np.flatnonzero(count[code] > 1)  # of a large table few
+    whole, found = numbered(*value[alike].T, *key[:, alike]), np.zeros(n, dtype=bool)
+    found[alike] = np.unique(whole, return_index=True)[1][whole] != np.arange(len(alike))
     steps = value[:, :3] / NO_FINER
     if not found.any() or np.abs(steps - np.round(steps)).max() > 1e-3:
         return found

@@ -339,12 +339,14 @@ class Problem:
         rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
         if len(index) == len(observed.lead):
             return Part(index, rows, observed, weights)
-        own = subset(observed, index)
-        # A block of rows by its ends: picking columns one by one takes as long as the table is.
-        block = len(rows) == rows[-1] + 1 - rows[0]
-        own_rows = slice(rows[0], rows[-1] + 1) if block else rows
-        inside = None if weights.whiten is None else weights.whiten[own_rows][:, own_rows]
-        mine = replace(weights, whiten=inside)
+        # A block by its ends: picked one by one its rows would be copied, and its columns looked
+        # for among those of all readings.
+        first, last = int(index[0]), int(index[-1]) + 1
+        block = last - first == len(index)
+        own = subset(observed, slice(first, last) if block else index)
+        inside = slice(first * observed.size, last * observed.size) if block else rows
+        whiten = None if weights.whiten is None else weights.whiten[inside][:, inside]
+        mine = replace(weights, whiten=whiten)
         if weights.common is not None and weights.together is not None:
             mine = replace(mine, common=weights.common[rows], together=weights.together[index])
         return Part(index, rows, own, mine)

@@ -98,21 +98,21 @@ def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     return float((left**2).sum()), int((count - 1).sum()) * values.shape[1]
 
 
-def rows_needed(observed: Observations, chosen: BoolArray | IntArray) -> IntArray:
-    if observed.kind != "deflection":  # each is of its own row, whatever else is in the table
-        return observed.lead[chosen]
+def rows_needed(observed: Observations, chosen: BoolArray) -> IntArray:
     return np.unique(observed.combine[chosen].indices).astype(np.int64)
 
 
-def subset(observed: Observations, chosen: BoolArray | IntArray) -> Observations:
-    """Of those that hold (N,), or of these numbers (n,), which ascend."""
-    rows = rows_needed(observed, chosen)
+def subset(observed: Observations, chosen: BoolArray | IntArray | slice) -> Observations:
+    """Of those that hold (N,), or of these numbers, which ascend."""
     value = observed.value.reshape(-1, observed.size)[chosen].ravel()
-    lead, combine = np.arange(len(rows)), sparse.eye_array(len(rows), format="csr")
-    if observed.kind == "deflection":
-        lead = np.searchsorted(rows, observed.lead[chosen])
-        combine = observed.combine[chosen][:, rows]
-    return Observations(observed.kind, value, combine, lead, observed.table.take(rows))
+    if observed.kind != "deflection":  # each is of its own row: nothing to look for in the table
+        table = observed.table.take(chosen)
+        own = sparse.eye_array(len(table), format="csr")
+        return Observations(observed.kind, value, own, np.arange(len(table)), table)
+    combine = observed.combine[chosen]
+    rows = np.unique(combine.indices).astype(np.int64)
+    lead = np.searchsorted(rows, observed.lead[chosen])
+    return Observations(observed.kind, value, combine[:, rows], lead, observed.table.take(rows))
 
 
 def _needed(column: Array | None, table: Measurements, names: str, kind: str) -> Array:
