@@ -580,13 +580,9 @@ class CalibratedTool:
         # outermost one's.
         for joint, stated in self.cell.model.compliance_levels.items():
             if f"level:{joint}" in found:
-                angle, levels, order = (
-                    q[:, joint_index(joint)],
-                    np.array(stated),
-                    np.argsort(stated),
-                )
-                hats = np.eye(len(levels))[:, order]
-                shares = [np.interp(angle, levels[order], hat) for hat in hats]
+                order, angle = np.argsort(stated), q[:, joint_index(joint)]
+                hats = np.eye(len(stated))[:, order]
+                shares = [np.interp(angle, np.sort(stated), hat) for hat in hats]
                 found[f"level:{joint}"] = np.column_stack(shares)
         return list(found.values())
 
