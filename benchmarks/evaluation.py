@@ -81,7 +81,7 @@ class Ways:
     """Every way to evaluate B of n rows, as name → function of the table's rows as arrays."""
 
     def __init__(self, model: Model, n: int) -> None:
-        s = model._symbolic
+        s = model.symbolic
         inputs = [*s.arm.inputs.values(), s.p]
         outputs = [ca.densify(o) for o in (s.reading, ca.jacobian(s.reading, s.p))]
         self.f = ca.Function("tape", inputs, outputs, {"cse": True})
