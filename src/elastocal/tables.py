@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 import numpy as np
 
-from elastocal.files import atomic_write, check_size, decoded, open_input
+from elastocal.files import PIECE, atomic_write, check_size, decoded, open_input
 from elastocal.messages import (
     InputError,
     cell_meaning,
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 MAX_LINE = 64 * 1024
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
-ROWS_AT_ONCE, PIECE = 10_000, 1 << 20  # of Parquet; of CSV bytes
+ROWS_AT_ONCE = 10_000
 DELIMITERS = ",;\t"
 UTF16 = (b"\xff\xfe", b"\xfe\xff")
 ARCHIVE = b"PK\x03\x04"
@@ -458,21 +458,20 @@ def _read(
     numbers, labels = ({i: name for i, name in columns.items() if every[name].is_label == whether}
                        for whether in (False, True))  # fmt: skip
     blanks = {name for name, column in every.items() if column.may_be_blank}
+    commas = delimiter not in ("", ",")  # for decimals
     found, marks = list[int](), dict[str, str]()
     read: list[tuple[Array, np.ndarray]] = []
     for some in pieces:
         found += [number for number, _ in some]
         told = f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
         require(len(found) <= MAX_ROWS, told)
-        plain = (
-            _plain([t for _, t in some], len(header), numbers, labels) if delimiter == "," else None
-        )
+        lines = [line if delimiter else ",".join(line) for _, line in some]
+        plain = None if commas else _plain(lines, len(header), numbers, labels)
         if plain is None:
             rows = some if not delimiter else _split_all(source, some, len(header), delimiter)
             for _, cells in rows:
                 for i in numbers:  # labels stay as they are written
                     cells[i] = plain_minus(cells[i])
-            commas = delimiter not in ("", ",")
             problem = first_bad_cell(source, rows, numbers, commas, blanks, marks, noun)
             if problem is not None:
                 raise problem
@@ -504,7 +503,8 @@ def _plain(
                          for kind, at in ((np.float64, numbers), (object, labels)))  # fmt: skip
     except ValueError:
         return None
-    return (values, texts) if np.isfinite(values).all() else None
+    whole = len(values) == len(texts) == len(lines)  # an empty line is passed over
+    return (values, texts) if whole and np.isfinite(values).all() else None
 
 
 def _parquet(source: str, what: str) -> pd.DataFrame:
