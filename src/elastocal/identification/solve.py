@@ -354,7 +354,7 @@ def solve(
             problem, exact = with_placed(started, PLACING)[0], True
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept, whole = reduction.kept, whole or turn == 5
-        found = fit_kept(problem if whole else _sampled(problem), found.x, reduction)
+        found = fit_kept(problem if whole else replace(few, x0=problem.x0), found.x, reduction)
         sigma, r_factor = residual_sigma(found, len(kept)), _as_of(found, problem)
     if (left := reduction.seen(problem.free, r_factor.R, problem.sizes)) is not reduction:
         reduction, found = left, fit_kept(problem, found.x, left)

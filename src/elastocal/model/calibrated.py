@@ -580,9 +580,9 @@ class CalibratedTool:
         # outermost one's.
         for joint, stated in self.cell.model.compliance_levels.items():
             if f"level:{joint}" in found:
-                order, angle = np.argsort(stated), q[:, joint_index(joint)]
-                hats = np.eye(len(stated))[:, order]
-                shares = [np.interp(angle, np.sort(stated), hat) for hat in hats]
+                levels, angle = np.sort(stated), q[:, joint_index(joint)]
+                hats = np.eye(len(stated))[:, np.argsort(stated)]
+                shares = [np.interp(angle, levels, hat) for hat in hats]
                 found[f"level:{joint}"] = np.column_stack(shares)
         return list(found.values())
 

@@ -98,7 +98,7 @@ def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     return float((left**2).sum()), int((count - 1).sum()) * values.shape[1]
 
 
-def rows_needed(observed: Observations, chosen: BoolArray) -> IntArray:
+def rows_needed(observed: Observations, chosen: BoolArray | IntArray | slice) -> IntArray:
     return np.unique(observed.combine[chosen].indices).astype(np.int64)
 
 
@@ -109,10 +109,9 @@ def subset(observed: Observations, chosen: BoolArray | IntArray | slice) -> Obse
         table = observed.table.take(chosen)
         own = sparse.eye_array(len(table), format="csr")
         return Observations(observed.kind, value, own, np.arange(len(table)), table)
-    combine = observed.combine[chosen]
-    rows = np.unique(combine.indices).astype(np.int64)
-    lead = np.searchsorted(rows, observed.lead[chosen])
-    return Observations(observed.kind, value, combine[:, rows], lead, observed.table.take(rows))
+    rows = rows_needed(observed, chosen)
+    lead, own = np.searchsorted(rows, observed.lead[chosen]), observed.combine[chosen][:, rows]
+    return Observations(observed.kind, value, own, lead, observed.table.take(rows))
 
 
 def _needed(column: Array | None, table: Measurements, names: str, kind: str) -> Array:
