@@ -418,6 +418,7 @@ class MixedFit:
 Objective = Callable[[Array], tuple[float, Array, Array]]
 
 STRIDE = 1.5  # longest step of a logarithm
+LENGTHS: tuple[float, ...] = (1.0, 0.5, 0.25, 0.0625)  # of a step that are tried
 ROUNDED = 1e-11  # of a sum over tens of thousands of rows: its rounding
 EXCHANGES = 30  # of what is held at a bound, after which another method has to end the search
 
@@ -427,35 +428,43 @@ def climb(
 ) -> tuple[Array, bool]:
     """Where −2ℓ is least, and whether it ended there.  What has no room between its limits stays.
     A step that promises less than `enough`, or than rounding, is not taken any more; none is longer
-    than STRIDE in any logarithm.  What the curvature exceeds the information by is learned from the
-    steps."""
+    than STRIDE in any logarithm.  What the information lacks of the curvature is learned from how
+    steps turn the slope (Dennis, Gay and Welsch 1981, ACM Trans. Math. Softw. 7, 348)."""
     value, slope, information = evaluate(theta)
     free = np.flatnonzero(lower < upper)
     lower, upper = lower[free], upper[free]
-    excess = np.zeros_like(information)  # of the curvature over the information, as steps met it
+    lacking = np.zeros_like(information)
     for _ in range(steps):
-        step, H = np.zeros(len(theta)), information + excess
+        step, H = np.zeros(len(theta)), information + lacking
         low = np.maximum(lower - theta[free], -STRIDE)
         high = np.minimum(upper - theta[free], STRIDE)
+        lengths = LENGTHS
         try:
             step[free] = step_within(H[np.ix_(free, free)], slope[free], low, high)
         except linalg.LinAlgError:
-            break
-        if -float(slope @ step) < max(enough, ROUNDED * abs(value)):
+            lengths = ()
+        if lengths and -float(slope @ step) < max(enough, ROUNDED * abs(value)):
             return theta, True
-        for length in (1.0, 0.5, 0.25, 0.0625):
+        for length in lengths:
             tried = evaluate(theta + length * step)
             if tried[0] < value:
                 break
         else:
-            break
-        curved, Hs = float((tried[1] - slope) @ step) / length, H @ step
-        missing, more = curved - float(step @ Hs), float(step @ excess @ step)
-        if missing > 0:
-            excess += missing * np.outer(Hs, Hs) / float(step @ Hs) ** 2
-        elif more > 0:
-            excess *= max(1 + missing / more, 0.0)
-        theta, (value, slope, information) = theta + length * step, tried
+            if not lacking.any():
+                break
+            lacking[:] = 0.0  # what was learned elsewhere misleads here
+            continue
+        step *= length
+        turned = tried[1] - slope
+        missing, known = turned - tried[2] @ step, float(step @ lacking @ step)
+        if known:
+            lacking *= min(1.0, abs(float(missing @ step) / known))
+        if (curved := float(turned @ step)) > 0:
+            missing -= lacking @ step
+            part = np.outer(missing, turned) / curved
+            part -= 0.5 * float(missing @ step) * np.outer(turned, turned) / curved**2
+            lacking += part + part.T
+        theta, (value, slope, information) = theta + step, tried
     return theta, False
 
 
