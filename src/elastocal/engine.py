@@ -592,20 +592,18 @@ class Standardised:
         half = linalg.blas.dtrmm(1.0, self.inverse, moved, lower=1)
         return moved.T @ moved - half.T @ half, half
 
-    @cached_property
-    def covariance(self) -> Array:
-        """A⁻¹ (k, k), its lower triangle."""
-        return np.asarray(linalg.lapack.dpotri(self.L, lower=1)[0])
+    def block(self, own: IntArray | slice) -> Array:
+        """That of A⁻¹ (g, g) of some of the coefficients."""
+        half = self.inverse[:, own]
+        return np.asarray(half.T @ half)
 
     def left_out(self, groups: Sequence[IntArray | slice]) -> Array:
         """By how much ℓ falls (G,) where one of these groups of coefficients is left out, all else
         as it is (Savage and Dickey): with S its block of A⁻¹, ½ (log|S| + bᵀS⁻¹b)."""
-        inverse, out = self.covariance, np.zeros(len(groups))
+        out = np.zeros(len(groups))
         for k, own in enumerate(groups):
-            index = np.arange(len(self.b))[own]
-            S = inverse[np.ix_(index, index)]
-            C = linalg.cholesky(np.tril(S) + np.tril(S, -1).T, lower=True)
-            y = linalg.solve_triangular(C, self.b[index], lower=True)
+            C = linalg.cholesky(self.block(own), lower=True)
+            y = linalg.solve_triangular(C, self.b[own], lower=True)
             out[k] = 0.5 * float(y @ y + 2 * np.log(np.diag(C)).sum())
         return out
 

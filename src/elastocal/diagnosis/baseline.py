@@ -361,20 +361,26 @@ class NoisyData:
     @cached_property
     def model(self) -> Mixed:
         """Of the variances `NoiseValues.theta`, with their prior."""
-        (C, _, J), visit = self.G.shape, self.blocks.in_visit
+        rows = np.zeros(self.r.shape[1], dtype=np.int64)
+        return self.in_parts(rows, log_prior_of(self.stated, self.G.shape[2]))
+
+    def in_parts(self, part: IntArray, prior: LogPrior) -> Mixed:
+        """The same with a variance of its own for each part (m,) of the instrument's rows, which
+        errs in each by itself."""
+        (C, m, J), visit, n = self.G.shape, self.blocks.in_visit, int(part.max()) + 1
         G = np.ascontiguousarray(self.G.transpose(0, 2, 1))[..., None]  # (C, joints, m, 1)
 
         def numbers(first: int, k: int) -> IntArray:
             return np.tile(np.arange(first, first + k), (C, 1))
 
-        absent = self.blocks.absent[:, None] * np.eye(self.r.shape[1])
+        absent = self.blocks.absent[:, None] * np.eye(m)
         stated = np.asarray(np.linalg.cholesky(self.covariance + absent), dtype=np.float64)
         parts = (
-            Parts(numbers(0, 1), stated[:, None]),
-            Parts(numbers(1, J), G), Parts(numbers(1 + J, J), G * visit[:, None]),
+            Parts(numbers(0, n), stated[:, None] * (part == np.arange(n)[:, None])[..., None]),
+            Parts(numbers(n, J), G), Parts(numbers(n + J, J), G * visit[:, None]),
         )  # fmt: skip
         pack = Pack(self.X, self.r, parts, self.left_out)
-        return Mixed((pack,), 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
+        return Mixed((pack,), n + 2 * J, self.precision, prior)
 
 
 @cache

@@ -254,13 +254,14 @@ class SumAnswer:
         return squared_lengths(self.found.data, each_left_out(*self._fitted_without(gone)))
 
     def _fitted_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
-        """P (C, m, m) of each configuration and u = P r (C, m) without these components.  With S
-        the posterior covariance of their coefficients, β̂ the mean, and Y = HL⁻¹ there, P grows by
-        Y S⁻¹Yᵀ and u by Y S⁻¹β̂."""
+        """P (C, m, m) of each configuration and u = P r (C, m) without these components.  Their
+        coefficients have the posterior covariance DᵀD, D = L⁻¹ there, and the mean β̂; with D = QR
+        and Z = HQ, P grows by ZZᵀ and u by Z R⁻ᵀβ̂."""
         at, index = self._fitted, self._index(gone) + self._own
-        D = at.beta_deviation[:, index]
-        Y, W = at.H @ D, np.linalg.inv(D.T @ D)
-        return at.P + Y @ W @ Y.transpose(0, 2, 1), at.u + Y @ (W @ at.beta[index])
+        Q, R = linalg.qr(at.beta_deviation[:, index], mode="economic")
+        Z = (at.H.reshape(-1, len(Q)) @ Q).reshape(*at.u.shape, len(index))
+        less = linalg.solve_triangular(R, at.beta[index], trans="T")
+        return at.P + Z @ Z.transpose(0, 2, 1), at.u + Z @ less
 
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:

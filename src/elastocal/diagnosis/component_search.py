@@ -12,10 +12,10 @@ from scipy import linalg
 from scipy.special import expit
 
 from elastocal.diagnosis.baseline import (
+    FARTHEST,
     NoiseValues,
     NoisyData,
     from_centre,
-    posterior,
     prior_deviations,
     project,
 )
@@ -35,7 +35,9 @@ from elastocal.diagnosis.component_families import (
     without_a_name,
 )
 from elastocal.diagnosis.components import (
+    SETTLED,
     SOME,
+    STEPS,
     Component,
     FittedSum,
     Sizes,
@@ -50,7 +52,7 @@ from elastocal.diagnosis.effect_search import ModelSet, about, extended, spans_o
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import scatter_beyond
-from elastocal.engine import ROUNDING, Standardised, beside
+from elastocal.engine import ROUNDING, LogPrior, Standardised, beside, climb
 from elastocal.model.effects.base import index
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.geometry import GearRipple, GearSpectrum
@@ -432,8 +434,7 @@ class Beside:
 
     def evidence_instead(self, gone: slice) -> list[float]:
         """Over none, of what is `gone` beside all others of the sum and of each of the columns."""
-        S = np.tril(self.sum.covariance[gone, gone])
-        W = np.linalg.inv(S + np.tril(S, -1).T)
+        W = np.linalg.inv(self.sum.block(gone))
         b, per = W @ self.sum.b[gone], 1 / self.sum.root[gone]
         groups = [((W - np.eye(len(W))) * per[:, None] * per, b * per)]
         for (A, z), moved in zip(self.left, self.moved, strict=True):
@@ -594,38 +595,32 @@ def with_own_axes(found: FittedSum) -> FittedSum:
     the readings show that it is another one along each.
 
     A camera is worse along its line of sight, a tracker across it.  Beside the sum the residual is
-    the instrument's, as it was not before.  Variances v_i of the axes maximise the restricted
-    likelihood, uᵢᵀuᵢ = tr Pᵢᵢ at the maximum (Harville 1977); the logarithm of a ratio, known to
-    √(1/2n) afterwards, costs what finding it costs."""
+    the instrument's, as it was not before.  The logarithms of the axes' noise spread by AXES about
+    their mean, whatever that is; they are believed where their evidence, by Laplace's method, is
+    larger than that of equal ones."""
     data, size = found.sums.data, min(found.data.blocks.size, 3)
     if data.stated or size < 2:
         return found
     wide = found.without_these()
     some = wide.every(max(1, len(wide.r) // SOME))  # that show the ratios
-    used, axis = ~some.left_out, np.arange(data.r.shape[1]) % data.blocks.size
-    own = [used & (axis == i) for i in range(size)]
-    cost = (size - 1) * float(np.log(AXES / np.sqrt(0.5 / own[0].sum())))
-    each = np.ones(len(axis))
-    for _ in range(AXIS_STEPS):
-        at = project(replace(some, covariance=some.covariance * each[:, None] * each), found.noise)
-        left = np.diagonal(at.P, axis1=1, axis2=2)
-        ratio = np.array([(at.u[k] ** 2).sum() / left[k].sum() for k in own])
-        ratio /= np.exp(np.log(ratio).mean())
-        if np.abs(np.log(ratio)).max() < AXES_SETTLED:
-            break
-        each[axis < size] *= np.sqrt(ratio)[axis[axis < size]]
-    if (each == 1.0).all():
+    part = np.minimum(np.arange(data.r.shape[1]) % data.blocks.size, size)
+    ratios, spread = linalg.null_space(np.ones((1, size))), 2 * AXES  # of variances
+    model = some.in_parts(part, LogPrior(np.zeros(size), ratios @ ratios.T / spread**2))
+    logs, n = found.noise.logs(), int(part.max()) + 1
+    begun = np.append(np.full(n, logs[0]), logs[1:])
+    room = np.where(np.arange(len(begun)) < size, FARTHEST, 0.0)
+    at = climb(model.objective, begun, begun - room, begun + room, SETTLED, STEPS)[0]
+    value, _, information = model.objective(at)
+    known = spread**2 * ratios.T @ information[:size, :size] @ ratios / 2
+    gained = model.objective(begun)[0] - value - float(np.linalg.slogdet(known)[1])
+    if gained < 2 * GAINED:
         return found
+    each = np.exp((at - begun)[part] / 2)
     V = data.covariance * each[:, None] * each
-    equal, own_axes = (posterior(replace(wide, covariance=c), found.noise)
-                       for c in (data.covariance, V))  # fmt: skip
-    if own_axes > equal - 2 * cost:
-        return found
     return fit_sum(replace(data, covariance=V), found.components, found.noise, found.sizes)
 
 
 AXES = 0.5  # spread of the logarithms of an instrument's noise along its axes
-AXIS_STEPS, AXES_SETTLED = 20, 0.02
 
 
 def with_equal_noise(dataset: DiagnosisData) -> NoisyData:

@@ -350,10 +350,10 @@ class SumOfComponents:
     def earned(self, at: Standardised) -> tuple[Array, Array]:
         """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
         (K,) is due to coefficients that cannot be negative: the posterior's share of that half."""
-        inverse, within = at.covariance, np.zeros(len(self.components))
+        within = np.zeros(len(self.components))
         for k, span in enumerate(self.spans):
             i = np.arange(span.start, span.stop)[self.components[k].bounded]
-            within[k] = within_bounds(at.b[i] / np.sqrt(inverse[i, i]))
+            within[k] = within_bounds(at.b[i] / np.linalg.norm(at.inverse[:, i], axis=0))
         return at.left_out(list(self.spans)) + within, within
 
 
