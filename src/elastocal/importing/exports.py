@@ -30,7 +30,15 @@ from elastocal.importing.mapping_file import (
     seconds_of,
     unit_in_comments,
 )
-from elastocal.messages import ElastocalError, InputError, did_you_mean, is_label, listed, quoted
+from elastocal.messages import (
+    ElastocalError,
+    InputError,
+    did_you_mean,
+    is_label,
+    listed,
+    quoted,
+    require,
+)
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.tables import MAX_LINE, NUMBER, column
 from elastocal.units import FACTORS, Array, IntArray, convert, quantities
@@ -54,24 +62,20 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
     character)."""
     source = str(path)
     data = read_bytes(path, "export", MAX_BYTES)
-    if not data.strip():
-        raise InputError(f"{source}: empty file; export it again")
-    if data.startswith(_BINARY):
-        raise InputError(
-            f"{source}: is a workbook, bag, archive or other binary file; export its table as text "
-            "(CSV)"
-        )
+    require(data.strip(), f"{source}: empty file; export it again")
+    told = "is a workbook, bag, archive or other binary file; export its table as text (CSV)"
+    require(not data.startswith(_BINARY), f"{source}: {told}")
     text, name = _decode(source, data, encoding)
-    if "\0" in text:
-        line = text.count("\n", 0, text.index("\0")) + 1
-        raise InputError(f"{source}, line {line}: NUL characters, so this is no text, or UTF-16 "
-                         "without its mark; export it as text (CSV), or set encoding")  # fmt: skip
     # Not splitlines: a form feed or U+2028 in a comment ends no line for an editor.
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     for number, content in enumerate(lines, start=1):
-        if len(content) > MAX_LINE:
-            raise InputError(f"{source}, line {number}: longer than {MAX_LINE // 1024} KiB; this "
-                             "is no table of readings")  # fmt: skip
+        require(
+            "\0" not in content,
+            f"{source}, line {number}: NUL characters, so this is no text, or UTF-16 without its "
+            "mark; export it as text (CSV), or set encoding",
+        )
+        told = f"longer than {MAX_LINE // 1024} KiB; this is no table of readings"
+        require(len(content) <= MAX_LINE, f"{source}, line {number}: {told}")
     return lines, name
 
 
@@ -554,34 +558,26 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     missing += [] if heights else ["zenith or elevation"]
     if not found:
         return records
-    if both:
-        raise InputError(
-            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
-            f"{listed(found)}; keep one of the two in [source.columns]"
-        )
-    if len(heights) > 1:
-        raise InputError(
-            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
-            "gives (a level line has zenith 90° and elevation 0°)"
-        )
-    if missing:
-        raise InputError(
-            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
-            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
-        )
+    for wrong, told in (
+        (both, f"positions are mapped twice, as {listed(both)} and as {listed(found)}; keep one of "
+         "the two in [source.columns]"),
+        (len(heights) > 1, "both zenith and elevation are mapped; keep the one that the file gives "
+         "(a level line has zenith 90° and elevation 0°)"),
+        (missing, f"{listed(found)} without {listed(missing)}; map range_mm, azimuth_deg, and "
+         "zenith_deg or elevation_deg in [source.columns]"),
+    ):  # fmt: skip
+        require(not wrong, f"{records.source}: {told}")
     height, numbers = heights[0], dict(records.numbers)
     d = numbers.pop("range")
     alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
-    if not (d > 0).all():
-        i = int(np.argmin(d > 0))
-        raise InputError(
-            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
-            "positive: correct the line, or the column of range in [source.columns]"
-        )
     low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
-    off = (angle < low) | (angle > high)
-    if off.any():
-        i = int(np.argmax(off))
+    # Of each the first row, if any.
+    for i in np.flatnonzero(~(d > 0))[:1]:
+        raise InputError(
+            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is positive: correct the "
+            "line, or the column of range in [source.columns]"
+        )
+    for i in np.flatnonzero((angle < low) | (angle > high))[:1]:
         raise InputError(
             f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
             f"{high:g}°; is it an angle of another unit, or {other}_deg?"
@@ -607,22 +603,20 @@ def with_labels(where: str, records: Records, names: NamesTable) -> Records:
     labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
     if "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
-    if names.in_order and "marker" not in labels:
+    elif names.in_order:
         n = len(names.in_order)
         labels["marker"] = [names.in_order[i % n] for i in range(len(records))]
-        if len(records) % n:
-            raise InputError(
-                f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
-                f"{listed(names.in_order)} of in_order; a point is missing or one too many: name "
-                "the points"
-            )
+        require(
+            len(records) % n == 0,
+            f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
+            f"{listed(names.in_order)} of in_order; a point is missing or one too many: name the "
+            "points",
+        )
     for stem, texts in labels.items():
         for i, text in enumerate(texts):
             if not is_label(text):
-                raise InputError(
-                    f"{records.where(i)}: {stem} {quoted(text)} cannot stand in a table; correct "
-                    f"the name, or {NAMED}"
-                )
+                told = f"cannot stand in a table; correct the name, or {NAMED}"
+                raise InputError(f"{records.where(i)}: {stem} {quoted(text)} {told}")
     return replace(records, texts=records.texts | labels)
 
 
@@ -631,11 +625,11 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
     patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
     expressions = [compiled(where, "pattern", text) for text in patterns]
     for expression in expressions:
-        if not set(expression.groupindex) & set(GROUPS):
-            raise InputError(
-                f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
-                f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
-            )
+        require(
+            set(expression.groupindex) & set(GROUPS),
+            f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
+            f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so",
+        )
     matches = [next((m for e in expressions if (m := e.search(n))), None) for n in named]
     groups = [match.groupdict() if match else {} for match in matches]
     bad = [i for i, match in enumerate(matches) if match is None]
@@ -648,16 +642,15 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
         )
     found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}
     present = {stem: texts for stem, texts in found.items() if any(texts)}
+    unsaid = {"repeat": "0", "load": "none"}
     for stem, texts in present.items():
-        empty = [i for i, text in enumerate(texts) if not text and matches[i]]
-        if empty and stem in ("configuration", "marker"):
-            raise InputError(
-                f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "
-                f"others do; {NAMED} that finds it in every name"
-            )
-        if empty:
-            default = "0" if stem == "repeat" else "none"
-            present[stem] = [text or default for text in texts]
+        for i, text in enumerate(texts):
+            if not text and matches[i] and stem not in unsaid:
+                raise InputError(
+                    f"{records.where(i)}: the name {quoted(named[i])} says no {stem}, others do; "
+                    f"{NAMED} that finds it in every name"
+                )
+        present[stem] = [text or unsaid.get(stem, "") for text in texts]
     reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
     good = np.setdiff1d(np.arange(len(records)), bad)
     kept = replace(records, texts=present | records.texts).take(good)
@@ -676,17 +669,14 @@ def forces_of(
     or "2.5 kg", unless [loads] has it."""
     named = points.texts.get("load")
     if named is None:
-        if loads and not points.forces:
-            raise InputError(
-                f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
-                "to; give load in [[source]], or a group (?P<load>…) in a pattern"
-            )
-        return None
-    if points.forces:
-        raise InputError(
-            f"{points.source}: the load is stated by name and in columns {listed(points.forces)}; "
-            "keep one"
+        require(
+            not loads or points.forces,
+            f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs to; "
+            "give load in [[source]], or a group (?P<load>…) in a pattern",
         )
+        return None
+    told = f"the load is stated by name and in columns {listed(points.forces)}; keep one"
+    require(not points.forces, f"{points.source}: {told}")
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in loads.items():
         if isinstance(stated, LoadStatesTable):
@@ -696,11 +686,9 @@ def forces_of(
         if name not in known and (size := load_in(name)):
             known[name] = np.array([0.0, 0.0, 0.0 - size[1]])
         if name not in known:
-            raise InputError(
-                f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
-                f"{did_you_mean(name, known)}; there are {listed(known)}: add "
-                f"{name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
-            )
+            told = f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
+            add = f"add {name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
+            raise InputError(f"{told}{did_you_mean(name, known)}; there are {listed(known)}: {add}")
     return np.array([known[name] for name in named])
 
 
