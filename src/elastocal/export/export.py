@@ -84,10 +84,8 @@ class Wish:
                 told = f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
                 require(low <= value <= high, told)
         given_force(self.load)
-        require(
-            2 <= self.poses <= MOST_POSES,
-            f"{option('poses')} takes a whole number from 2 to {MOST_POSES:,}; found {self.poses}",
-        )
+        told = f"takes a whole number from 2 to {MOST_POSES:,}; found {self.poses}"
+        require(2 <= self.poses <= MOST_POSES, f"{option('poses')} {told}")
 
     @property
     def kind(self) -> str:
@@ -368,11 +366,11 @@ class _Writing:
             ends = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
         else:
             text, ends = robot_files.new_urdf(*how), robot_files.NEW_ENDS
+            kept = ", or export as .xml, which keeps those of the model" * (robot.mjcf is not None)
             told = [
                 "inertia tensors are zero in this file: of the links masses and their centres "
                 "alone are known. Its kinematics and weights are right; before simulating motion "
-                "put in tensors"
-                + (", or export as .xml, which keeps those of the model" * (robot.mjcf is not None))
+                f"put in tensors{kept}"
                 if self.pieces.masses or self.pieces.chain.masses
                 else "the links have no <inertial> in this file, as their masses are not known"
             ]
@@ -489,8 +487,7 @@ class _Writing:
             four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
             beta = checked(dh_csv(four), largest=np.inf)
             comments.append(f"without the column beta_rad: {rounded(beta * 1e6)} um")
-        text = dh_csv(lines, comments)
-        checked(text)
+        checked(text := dh_csv(lines, comments))
         done = replace(self.done, without_beta=beta)
         return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
 
@@ -558,9 +555,8 @@ def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Arr
     with the smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of
     `like`, else `height`.
     """
-    skew = math.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
     alike, height = (0.0, height) if like is None else like[:2].tolist()
-    ways = [_skew(T, s) if skew else _parallel(T, s, height, alike) for s in (1.0, -1.0)]
+    ways = [_row(T, sign, height, alike) for sign in (1.0, -1.0)]
 
     def away(row: Array) -> float:
         if like is None:
@@ -573,18 +569,15 @@ def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Arr
     return row, np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)
 
 
-def _skew(T: Array, sign: float) -> Array:
+def _row(T: Array, sign: float, d: float, alike: float) -> Array:
+    """With its d, and `alike` as θ where any will do, where the axes are nearly parallel."""
     z, p = T[:3, 2], T[:3, 3]
-    theta = math.atan2(sign * z[0], -sign * z[1])
-    x = np.array([math.cos(theta), math.sin(theta), 0.0])
-    alpha = math.atan2(sign * math.hypot(z[0], z[1]), z[2])
-    # p = d·z₀ + a·x + h·z: the common normal meets both axes.
-    d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
-    return np.array([theta, d, a, alpha, 0.0])
-
-
-def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
-    z, p = T[:3, 2], T[:3, 3]
+    if (across := math.hypot(z[0], z[1])) > NEARLY_PARALLEL:
+        theta = math.atan2(sign * z[0], -sign * z[1])
+        x = np.array([math.cos(theta), math.sin(theta), 0.0])
+        # p = d·z₀ + a·x + h·z: the common normal meets both axes.
+        d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
+        return np.array([theta, d, a, math.atan2(sign * across, z[2]), 0.0])
     foot = p - (p[2] - d) / z[2] * z  # where the second axis passes through the height d
     a = sign * math.hypot(foot[0], foot[1])
     theta = math.atan2(sign * foot[1], sign * foot[0])
@@ -592,10 +585,8 @@ def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
         theta, a = alike, 0.0
     # z = Rz(θ) Rx(α) Ry(β) e_z = Rz(θ) (sin β, −sin α cos β, cos α cos β)
     c, s = math.cos(theta), math.sin(theta)
-    u = (c * z[0] + s * z[1], -s * z[0] + c * z[1], z[2])
-    alpha = math.atan2(-u[1], u[2])
-    beta = math.atan2(u[0], math.hypot(u[1], u[2]))
-    return np.array([theta, d, a, alpha, beta])
+    x, y = c * z[0] + s * z[1], c * z[1] - s * z[0]
+    return np.array([theta, d, a, math.atan2(-y, z[2]), math.atan2(x, math.hypot(y, z[2]))])
 
 
 # The calibrated arm as a Denavit–Hartenberg table, standard or modified.
@@ -646,15 +637,14 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     beta_rad stands there only where a row needs it; limits are those of commanded values; comments
     begin with #.
     """
-    found = []
+    found = list[dict[str, str]]()
     for name, joint, row in lines:
-        numbers = zip(HEADER[2:], row.tolist(), strict=True)
-        cells = {header: repr(value + 0.0) for header, value in numbers}
+        stated = dict(zip(HEADER[2:], row.tolist(), strict=True))
         if joint is not None:
-            ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
-            cells |= {end: repr(value + 0.0) for end, value in ends if math.isfinite(value)}
+            stated |= zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
         kind = dh.FIXED if joint is None else joint.kind
-        found.append(cells | dict(zip(HEADER[:2], (name, kind), strict=True)))
+        numbers = {k: repr(value + 0.0) for k, value in stated.items() if math.isfinite(value)}
+        found.append({"joint": name, "type": kind} | numbers)
     bounded = {name for cells in found for name in cells}
     limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
     with_beta = any(row[4] for _, _, row in lines)

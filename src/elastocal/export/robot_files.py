@@ -92,13 +92,13 @@ def calibrated_urdf(
         old = next((joint for joint in tree.joints if joint.name == name), None)
         if old is not None and (old.kind, old.parent, old.child) == ("fixed", parent, child):
             return place(name, T)
-        if old is not None or new in tree.links:
-            what = f"joint '{name}'" if old is not None else f"link '{new}'"
-            raise InputError(
-                f"{tree.path}: {what} stands where export would add its own; rename it, "
-                f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
-            )
-        lines.extend(fixed_link(new, parent, child, T))
+        what = f"joint '{name}'" if old is not None else f"link '{new}'"
+        require(
+            old is None and new not in tree.links,
+            f"{tree.path}: {what} stands where export would add its own; rename it, or leave the "
+            f"frame out ({option('frames', False)}, or no {option('base_frame')})",
+        )
+        lines.extend(map(as_text, fixed_link(new, parent, child, T)))
 
     for i, joint in enumerate(tree.serial_chain(base, flange)):
         if not nothing(correction := pieces.correction(i)):
@@ -138,13 +138,20 @@ def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
     return frames | {LOAD_POINT: pose_at(pieces.load_point)}
 
 
-def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
-    ends = element("parent", {"link": parent}), element("child", {"link": child})
-    joint = {"name": f"{new}_joint", "type": "fixed"}
-    return [
-        element("link", {"name": new}),
-        element("joint", joint, *ends, element("origin", origin_attributes(T))),
-    ]
+def fixed_link(new: str, parent: str, child: str, T: Array) -> tuple[ET.Element, ET.Element]:
+    return ET.Element("link", name=new), _joint(f"{new}_joint", "fixed", parent, child, T)
+
+
+def _joint(name: str, kind: str, parent: str, child: str, T: Array) -> ET.Element:
+    joint = ET.Element("joint", name=name, type=kind)
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    ET.SubElement(joint, "origin", origin_attributes(T))
+    return joint
+
+
+def as_text(made: ET.Element) -> str:
+    return ET.tostring(made, "unicode").replace(" />", "/>")  # a > in quotes is written as &gt;
 
 
 NEW_ENDS = NEW_BASE, NEW_FLANGE = "base_link", "flange"
@@ -155,54 +162,36 @@ def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> 
     """Links base_link, link_1 … link_n, flange with the calibrated placements.  Joints bear the
     table's names and limits (continuous where one has none); masses that are known stand with a
     zero inertia tensor."""
+    chain, root = pieces.calibrated_chain(), ET.Element("robot", name=pieces.chain.name)
     # Masses of the robot's description where no weights act in the model.
-    chain, masses = pieces.calibrated_chain(), pieces.masses or pieces.chain.masses
-    lines = []
+    masses = pieces.masses or pieces.chain.masses
     if base_frame:
-        lines += fixed_link(TRACKER, TRACKER, NEW_BASE, pieces.T_tracker_base)
-    lines += [element("link", {"name": NEW_BASE})]
+        root.extend(fixed_link(TRACKER, TRACKER, NEW_BASE, pieces.T_tracker_base))
+    ET.SubElement(root, "link", name=NEW_BASE)
     parent = NEW_BASE
     for i, joint in enumerate(chain.joints, start=1):
-        lines += _link(f"link_{i}", masses[i - 1] if masses else None)
-        lines += _joint(joint, parent, f"link_{i}")
+        link = ET.SubElement(root, "link", name=f"link_{i}")
+        for body in masses[i - 1 : i]:
+            inertial, keys = ET.SubElement(link, "inertial"), "ixx ixy ixz iyy iyz izz"
+            ET.SubElement(inertial, "origin", xyz=numbers(body.com), rpy="0 0 0")
+            ET.SubElement(inertial, "mass", value=repr(float(body.mass)))
+            ET.SubElement(inertial, "inertia", dict.fromkeys(keys.split(), "0"))
+        bounded = math.isfinite(joint.lower) and math.isfinite(joint.upper)
+        kind = joint.kind if bounded or joint.kind == "prismatic" else "continuous"
+        moving = _joint(joint.name, kind, parent, link.get("name", ""), joint.placement)
+        ET.SubElement(moving, "axis", xyz=numbers(joint.axis))
+        if kind != "continuous":
+            lower, upper = max(joint.lower, -NO_LIMIT), min(joint.upper, NO_LIMIT)
+            ends = {"lower": repr(float(lower)), "upper": repr(float(upper))}
+            ET.SubElement(moving, "limit", ends, effort="0", velocity="0")
+        root.append(moving)
         parent = f"link_{i}"
-    lines += fixed_link(NEW_FLANGE, parent, NEW_FLANGE, chain.flange_placement)
-    if tool:
-        for name, T in tool_frames(pieces).items():
-            lines += fixed_link(name, NEW_FLANGE, name, T)
-    head = ['<?xml version="1.0" encoding="UTF-8"?>', comment(note)]
-    return "\n".join([*head, *_nested("robot", {"name": chain.name}, lines)]) + "\n"
-
-
-def _link(name: str, body: LinkMass | None) -> list[str]:
-    if body is None:
-        return [element("link", {"name": name})]
-    return _nested("link", {"name": name}, _nested("inertial", {}, [
-        element("origin", {"xyz": numbers(body.com), "rpy": "0 0 0"}),
-        element("mass", {"value": repr(float(body.mass))}),
-        element("inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")),
-    ]))  # fmt: skip
-
-
-def _joint(joint: Joint, parent: str, child: str) -> list[str]:
-    bounded = math.isfinite(joint.lower) and math.isfinite(joint.upper)
-    kind = joint.kind if bounded or joint.kind == "prismatic" else "continuous"
-    lines = [
-        element("parent", {"link": parent}),
-        element("child", {"link": child}),
-        element("origin", origin_attributes(joint.placement)),
-        element("axis", {"xyz": numbers(joint.axis)}),
-    ]
-    if kind != "continuous":
-        ends = {"lower": max(joint.lower, -NO_LIMIT), "upper": min(joint.upper, NO_LIMIT)}
-        limit = {name: repr(float(end)) for name, end in ends.items()}
-        lines.append(element("limit", limit | {"effort": "0", "velocity": "0"}))
-    return _nested("joint", {"name": joint.name, "type": kind}, lines)
-
-
-def _nested(tag: str, stated: dict[str, str], lines: Sequence[str]) -> list[str]:
-    head = element(tag, stated).removesuffix("/>")
-    return [f"{head}>", *(f"  {line}" for line in lines), f"</{tag}>"]
+    root.extend(fixed_link(NEW_FLANGE, parent, NEW_FLANGE, chain.flange_placement))
+    for name, T in tool_frames(pieces).items() if tool else ():
+        root.extend(fixed_link(name, NEW_FLANGE, name, T))
+    ET.indent(root)
+    head = f'<?xml version="1.0" encoding="UTF-8"?>\n{comment(note)}\n'
+    return f"{head}{as_text(root)}\n"
 
 
 # The user's own file, of either kind, written into another folder: its meshes are found from there.
