@@ -619,17 +619,16 @@ class _MjcfText(XmlFile):
     def add_springs(self, i: int, j: int) -> int:
         """Between link i and joint i, before the joint; returns how many."""
         pieces, model = self.pieces, self.model
-        proximal = pieces.springs_at(f"link{i}" if i else "base")
-        springs = proximal | pieces.springs_at(f"joint{i + 1}")
+        springs = pieces.springs_at(f"link{i}" if i else "base")
+        springs |= pieces.springs_at(f"joint{i + 1}")
         body = int(model.jnt_bodyid[j])
-        first = int(model.body_jntadr[body])
-        tags = self.joints(body)
+        first, tags = int(model.body_jntadr[body]), self.joints(body)
         old = [k for k in range(first, j) if model.joint(k).name.startswith(SPRING)]
         for k in old:  # of an earlier export
             self.remove(tags[k - first])
+        count = len(joints_of(model, body)) + len(springs)
         if old and not springs:
             raise NotInPlace("springs of an earlier export would be lost")
-        count = len(joints_of(model, body)) + len(springs)
         if springs and count > MOST_JOINTS:
             told = f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}"
             raise NotInPlace(told)
@@ -683,23 +682,22 @@ class _MjcfText(XmlFile):
         error = pieces.error(pieces.chain.n_joints - 1)
         body, told, T = arm.flange_body, [], np.eye(4)
         sites = {tag.get("name"): tag for tag in self.bodies[body].all("site")}
-        extra: dict[str, Array] = {}
+        placed: dict[str, Array] = {}
         if arm.flange in arm.tree.frames:  # a site
             T = arm.flange_in_body @ error
-            if not nothing(error):
-                if arm.flange not in sites:
-                    raise NotInPlace(f"site '{arm.flange}' stands in a <frame>")
-                self.place(sites[arm.flange], T)
+            placed = {} if nothing(error) else {arm.flange: T}
+            if placed and arm.flange not in sites:
+                raise NotInPlace(f"site '{arm.flange}' stands in a <frame>")
         elif not nothing(error) and arm.model.body_jntnum[body] == 0:
             self.move(body, error)
         elif not nothing(error):
-            T, extra = error, {FLANGE: error}
+            T, placed = error, {FLANGE: error}
             told.append(
                 f"the flange is the body that the last joint moves: the calibrated one is site "
                 f"'{FLANGE}', and what hangs on '{arm.flange}' stays where it was"
             )
-        tool = tool_frames(pieces) if frames else {}
-        for name, place in (extra | {n: T @ P for n, P in tool.items()}).items():
+        placed |= {name: T @ P for name, P in tool_frames(pieces).items() if frames}
+        for name, place in placed.items():
             if name in sites:
                 self.place(sites[name], place)
             else:
