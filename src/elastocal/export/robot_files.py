@@ -20,18 +20,11 @@ from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
 from elastocal.files import read_bytes
 from elastocal.messages import ElastocalError, InputError, listed, option, require
+from elastocal.model import mjcf
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
-from elastocal.model.mjcf import (
-    SPRING,
-    MjcfArm,
-    before,
-    import_mujoco,
-    joints_of,
-    parsed,
-    transform,
-)
+from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, transform
 from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
@@ -212,7 +205,7 @@ def moved(path: Path, text: str, folder: Path) -> tuple[str, list[str]]:
         if any(tag.name in BESIDE for tag in named):
             return text, [f"copy it beside {path.name}: the files that it includes are there"]
         if xml.root.name == "mujoco":
-            stated = parsed(path).compiler
+            stated = mjcf.parsed(path).compiler
             places = {key: _from(there, home / (getattr(stated, key) or ""))
                       for key in ("meshdir", "texturedir")}  # fmt: skip
             if compilers := [tag for tag in xml.tags if tag.name == "compiler"]:
@@ -554,12 +547,12 @@ def corrected_mjcf(
     for i, j in enumerate(text.arm.joints):
         if not nothing(correction := pieces.correction(i)):
             body = int(text.model.jnt_bodyid[j])
-            if joints_of(text.model, body)[0] != j:
+            if mjcf.joints_of(text.model, body)[0] != j:
                 name = pieces.chain.joints[i].name
                 raise NotInPlace(
                     f"joint '{name}' shares its body with another; give it a body of its own"
                 )
-            X = before(text.model, j)
+            X = mjcf.before(text.model, j)
             text.move(body, X @ correction @ np.linalg.inv(X))
         sprung[j] = text.add_springs(i, j)
     text.lengthen_keys(sprung)
@@ -626,14 +619,14 @@ class _MjcfText(XmlFile):
         old = [k for k in range(first, j) if model.joint(k).name.startswith(SPRING)]
         for k in old:  # of an earlier export
             self.remove(tags[k - first])
-        count = len(joints_of(model, body)) + len(springs)
+        count = len(mjcf.joints_of(model, body)) + len(springs)
         if old and not springs:
             raise NotInPlace("springs of an earlier export would be lost")
         if springs and count > MOST_JOINTS:
             told = f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}"
             raise NotInPlace(told)
         # The springs' frame in that of the moved body: before the joint turns by its offset.
-        F = before(model, j) @ np.linalg.inv(pieces.offset_motion(i))
+        F = mjcf.before(model, j) @ np.linalg.inv(pieces.offset_motion(i))
         base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame there
         placed = ((s, k, base if s.site == "base" else F) for s, k in springs.items())
         joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)

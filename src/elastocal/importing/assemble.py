@@ -22,18 +22,8 @@ from numpy.typing import NDArray
 
 from elastocal.cell import Cell
 from elastocal.identification.mistakes import NominalFit, nominal_fit
-from elastocal.importing.exports import (
-    FORCES,
-    GROUPS,
-    SPHERICAL,
-    Records,
-    forces_of,
-    joint_stems,
-    read_records,
-    with_labels,
-    with_loads_of_names,
-    with_positions,
-)
+from elastocal.importing import exports
+from elastocal.importing.exports import FORCES, Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.messages import InputError, length, listed, quoted, require, rounded
@@ -143,7 +133,7 @@ def pooled(records: Sequence[Records]) -> Records:
     for other in records[1:]:
         for what, one, two in (
             ("columns", {*first.numbers}, {*other.numbers}),
-            ("labels", {*GROUPS} & {*first.texts}, {*GROUPS} & {*other.texts}),
+            ("labels", {*exports.GROUPS} & {*first.texts}, {*exports.GROUPS} & {*other.texts}),
         ):
             has, lacks = (first, other) if one - two else (other, first)
             require(
@@ -466,7 +456,7 @@ def assemble(
             'role = "joints"'
         )
     kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
-    forces = forces_of(where, points, mapping.loads)
+    forces = exports.forces_of(where, points, mapping.loads)
     if forces is not None:
         for k, stem in enumerate(FORCES):
             numbers[stem], units[stem] = forces[:, k], "N"
@@ -628,7 +618,7 @@ def import_files(
     names = () if chain is None else tuple(joint.name for joint in chain.joints)
     by_role, understood, spherical = _by_role(where, files, table, names)
     told = [doubt for own in by_role.values() for records in own for doubt in records.doubts]
-    by_role, warnings = with_loads_of_names(by_role, table.loads)
+    by_role, warnings = exports.with_loads_of_names(by_role, table.loads)
     points = pooled(by_role["points"])
     log = pooled(by_role["joints"]) if by_role["joints"] else None
     joined = None
@@ -679,9 +669,10 @@ def _by_role(
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood, spherical = [], False
     for path, source in _assigned(where, files, table.source or ()):
-        found = with_labels(where, read_records(where, path, source, table.units), source.names)
-        spherical = spherical or not found.numbers.keys().isdisjoint(SPHERICAL)
-        found = with_positions(found, clockwise=source.azimuth == "clockwise")
+        found = exports.read_records(where, path, source, table.units)
+        found = exports.with_labels(where, found, source.names)
+        spherical = spherical or not found.numbers.keys().isdisjoint(exports.SPHERICAL)
+        found = exports.with_positions(found, clockwise=source.azimuth == "clockwise")
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip
         if role in ("joints", "both") and joint_stems(found.numbers):

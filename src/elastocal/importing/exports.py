@@ -18,18 +18,7 @@ import numpy as np
 
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
-from elastocal.importing.mapping_file import (
-    ColumnKey,
-    LoadStatesTable,
-    NamesTable,
-    NumberCells,
-    SourceTable,
-    TextSourceKeys,
-    UnitsTable,
-    compiled,
-    seconds_of,
-    unit_in_comments,
-)
+from elastocal.importing.mapping_file import ColumnKey, NumberCells, SourceTable, UnitsTable
 from elastocal.messages import (
     ElastocalError,
     InputError,
@@ -104,7 +93,7 @@ class Rows:
 
 
 def table_rows(
-    source: str, lines: list[str], settings: TextSourceKeys, asked: Sequence[ColumnKey]
+    source: str, lines: list[str], settings: mapping_file.TextSourceKeys, asked: Sequence[ColumnKey]
 ) -> Rows:
     """Where columns are asked for by name the header is the line that has them; else the table
     begins at the first line with numbers where they are asked for, and the line before it is its
@@ -172,10 +161,14 @@ Numbered = list[tuple[int, str]]  # lines with their numbers
 
 
 def _sorted_lines(
-    source: str, lines: list[str], settings: TextSourceKeys
+    source: str, lines: list[str], settings: mapping_file.TextSourceKeys
 ) -> tuple[Numbered, Numbered, Numbered]:
     marks = tuple(settings.comments)
-    skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
+    skip = (
+        None
+        if settings.ignore is None
+        else mapping_file.compiled(source, "ignore", settings.ignore)
+    )
     content, comments, ignored = Numbered(), Numbered(), Numbered()
     for number, line in enumerate(lines, start=1):
         bare = line.strip()
@@ -425,7 +418,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         table = table_rows(name, lines, settings, asked)
     if len(table.rows) > MAX_ROWS:
         raise InputError(f"{name}: more than {MAX_ROWS:,} rows; thin the export out")
-    hint = unit_in_comments(where, settings.unit_comment, table.comments)
+    hint = mapping_file.unit_in_comments(where, settings.unit_comment, table.comments)
     width = len(table.rows[0][1])
     columns = {
         marker: mapping_file.resolve(
@@ -457,7 +450,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     if written is not None and "time" not in numbers:
         form = source.time_format or ()
         formats = [form] if isinstance(form, str) else form
-        seconds = seconds_of(name, line.tolist(), written, formats)
+        seconds = mapping_file.seconds_of(name, line.tolist(), written, formats)
         numbers["time"], of["time"] = np.array(seconds), "s"
     used = {i for c in every for i in c.index}
     understood = {
@@ -594,7 +587,7 @@ GROUPS = ("configuration", "marker", "repeat", "load")
 NAMED = "write pattern in [source.names]"
 
 
-def with_labels(where: str, records: Records, names: NamesTable) -> Records:
+def with_labels(where: str, records: Records, names: mapping_file.NamesTable) -> Records:
     """With the texts of GROUPS, from columns and, where a pattern is given, from names, if no
     column gives them.  A name that no pattern matches is an error, or with unmatched = "ignore"
     passed over and listed."""
@@ -620,10 +613,10 @@ def with_labels(where: str, records: Records, names: NamesTable) -> Records:
     return replace(records, texts=records.texts | labels)
 
 
-def _with_names_read(where: str, records: Records, names: NamesTable) -> Records:
+def _with_names_read(where: str, records: Records, names: mapping_file.NamesTable) -> Records:
     named = records.texts["name"]
     patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
-    expressions = [compiled(where, "pattern", text) for text in patterns]
+    expressions = [mapping_file.compiled(where, "pattern", text) for text in patterns]
     for expression in expressions:
         require(
             set(expression.groupindex) & set(GROUPS),
@@ -662,7 +655,7 @@ UNLOADED = ("none", "unloaded", "0")
 
 
 def forces_of(
-    where: str, points: Records, loads: Mapping[str, Array | LoadStatesTable]
+    where: str, points: Records, loads: Mapping[str, Array | mapping_file.LoadStatesTable]
 ) -> Array | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.  A mass m
     hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as "2600 N"
@@ -679,7 +672,7 @@ def forces_of(
     require(not points.forces, f"{points.source}: {told}")
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in loads.items():
-        if isinstance(stated, LoadStatesTable):
+        if isinstance(stated, mapping_file.LoadStatesTable):
             stated = np.array([0.0, 0.0, -stated.mass_kg * STANDARD_GRAVITY])
         known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):

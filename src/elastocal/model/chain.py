@@ -205,10 +205,8 @@ def plausible(chain: Chain, source: object) -> Chain:
 def check_angles(where: str, angles: tuple[float, ...], meant: str) -> None:
     """Raise InputError where an angle in rad is beyond two turns; `meant`: the file's unit."""
     worst = max(map(abs, angles), default=0.0)
-    require(
-        worst <= MAX_ANGLE,
-        f"{where}: {worst:g} rad is more than two turns; {meant}: convert degrees",
-    )
+    told = f"{where}: {worst:g} rad is more than two turns; {meant}: convert degrees"
+    require(worst <= MAX_ANGLE, told)
 
 
 def jaw_told(chain: Chain, moved: str = "") -> list[str]:

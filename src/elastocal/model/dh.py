@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from elastocal import tables
 from elastocal.cell_tables import Convention
 from elastocal.files import read_text
 from elastocal.messages import (
@@ -39,16 +40,7 @@ from elastocal.model.chain import (
     near_the_arm,
 )
 from elastocal.model.rigid import nominal_flanges
-from elastocal.tables import (
-    NO_UNIT,
-    Column,
-    Columns,
-    Family,
-    RawTable,
-    check_columns,
-    match_columns,
-    read_table,
-)
+from elastocal.tables import NO_UNIT, Family, RawTable
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -160,15 +152,17 @@ def dh_number(table: RawTable, i: int, family: str, stem: str) -> float:
 def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str) -> RawTable:
     named = {family.name: family for family in known}
 
-    def choose(header: Sequence[str]) -> Columns:
+    def choose(header: Sequence[str]) -> tables.Columns:
         every = listed(way for f in known for stem in f.units for way in f.columns(stem))
-        found = match_columns(
+        found = tables.match_columns(
             str(path), header, named, explain=partial(_no_table, what), called=CALLED,
             valid=f"; a {what} takes {every}",
         )  # fmt: skip
-        return check_columns(str(path), found, named, [(n,) for n in needed], f"a {what} needs")
+        return tables.check_columns(
+            str(path), found, named, [(n,) for n in needed], f"a {what} needs"
+        )
 
-    return read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
+    return tables.read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
 
 
 def link(
@@ -197,7 +191,9 @@ def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
     return value
 
 
-def _too_much(table: RawTable, i: int, column: Column, value: float, wrong: str) -> InputError:
+def _too_much(
+    table: RawTable, i: int, column: tables.Column, value: float, wrong: str
+) -> InputError:
     meant = {"rad": ("degrees", "deg"), "m": ("millimetres", "mm")}.get(column.unit)
     remedy = "correct it"
     if meant:

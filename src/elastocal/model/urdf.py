@@ -356,10 +356,8 @@ class Tree:
         there = [*self.links, *(self.frames if role == "flange" else ())]
         hint = did_you_mean(name, there)
         hint += f" (usual here: '{usual}')" if usual and f"'{usual}'" not in hint else ""
-        require(
-            name in there,
-            f"{self.path}: {role} '{name}' is not there{hint}; {self.parts}: {listed(there)}",
-        )
+        told = f"{self.path}: {role} '{name}' is not there{hint}; {self.parts}: {listed(there)}"
+        require(name in there, told)
         return name
 
     def ends(self, base: str | None, flange: str | None, choose: bool = True) -> tuple[str, str]:
@@ -597,10 +595,8 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
     check_known(kind, JOINT_TYPES, f"{where}: unknown joint type '{kind}'", "valid:")
     axis = np.array(_vector(where, tag, "axis", "xyz", (1.0, 0.0, 0.0)))  # URDF default
     length = math.hypot(*axis)
-    require(
-        kind not in MOVING or length >= 1e-9,
-        f'{where}: axis is zero; give a direction such as xyz="0 0 1"',
-    )
+    told = f'{where}: axis is zero; give a direction such as xyz="0 0 1"'
+    require(kind not in MOVING or length >= 1e-9, told)
     limit = None
     if (stated := tag.first("limit")) is not None:
         lower, upper = (
