@@ -12,17 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from elastocal import measurements
 from elastocal.above import Result
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
-from elastocal.measurements import (
-    Measurements,
-    families,
-    in_file_units,
-    joint_columns,
-    read_measurements,
-    with_moves,
-)
+from elastocal.measurements import Measurements, in_file_units, joint_columns, with_moves
 from elastocal.messages import (
     InputError,
     InsufficientDataError,
@@ -34,15 +28,8 @@ from elastocal.messages import (
     rounded,
     some,
 )
-from elastocal.model import rigid
-from elastocal.model.calibrated import (
-    CalibratedArm,
-    CalibratedTool,
-    ToolPoint,
-    lasting,
-    numbers,
-    tool_point,
-)
+from elastocal.model import calibrated, rigid
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_index, joint_limits
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import BoundedSearch, Postures, Reaching, inverse_kinematics
@@ -97,7 +84,7 @@ def read_targets(
     (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
     (3,) N acts where the table states none.
     """
-    table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
+    table = measurements.read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None
     placed, turned = table.position is not None, table.rotation is not None
     extra = "; a rotation alone is no target" * (turned and q is None)
@@ -125,7 +112,7 @@ def read_targets(
 def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
     """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
     what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
-    values = numbers(option("target"), text, (3, 6), what)
+    values = calibrated.numbers(option("target"), text, (3, 6), what)
     position = values[None, :3] / 1e3
     rotation = None
     if len(values) == 6:
@@ -349,7 +336,7 @@ def compensate(
     calibrated model for the target within the joint limits, nearest to the nominal one where
     joints or a free rotation leave a choice.
     """
-    arm, of_one_campaign = lasting(arm)
+    arm, of_one_campaign = calibrated.lasting(arm)
     tool = CalibratedTool(arm, point)
     chain, limits = tool.chain, joint_limits(tool.cell, tool.chain)
     T, place, turn = tool.frames(tool.rows(targets.table))
@@ -588,7 +575,7 @@ def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: BoolArray) -> Arr
     the arm's pose alone leaves unknown."""
     found = np.full(int(rows.sum()), np.inf)
     for name in list(arm.model.cell.tool.markers)[:MARKERS_ASKED]:
-        tool = CalibratedTool(arm, tool_point(arm.model.cell, name))
+        tool = CalibratedTool(arm, calibrated.tool_point(arm.model.cell, name))
         values = tool.rows(c.targets.moved(c.q, c.force))
         found = np.minimum(found, uncertainty_at(tool, [v[rows] for v in values], c.q[rows]).std)
     return found
@@ -652,7 +639,7 @@ def commands_csv(result: Compensation) -> str:
         blocks.append((["force_x_N", "force_y_N", "force_z_N"], result.force, ".9g"))
     for name in ("time", "approach", "temperature", "torque"):
         if (values := getattr(table, name)) is not None:
-            units = families(kinds)[name].units
+            units = measurements.families(kinds)[name].units
             heads = [column(stem, of[0]) for stem, of in units.items()]
             blocks.append((heads, values.reshape(len(table), -1), ".12g"))
     change = held * in_file_units(result.q - result.nominal, kinds)

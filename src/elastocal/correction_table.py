@@ -14,15 +14,8 @@ from elastocal import compensation as single
 from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import listed, option, require, rounded
-from elastocal.model.calibrated import (
-    CalibratedArm,
-    CalibratedTool,
-    Conditions,
-    ToolPoint,
-    lasting,
-    numbers,
-    unstated_needs,
-)
+from elastocal.model import calibrated
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, Conditions, ToolPoint, numbers
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.base import COLUMNS
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -113,7 +106,7 @@ def correction_table(
     from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
-    kept, points = lasting(arm)[0], grid.points()
+    kept, points = calibrated.lasting(arm)[0], grid.points()
     sided, tool = _sided(kept), CalibratedTool(kept, point)
     if force is not None and frame == "tracker":
         (T, *_), _, _ = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
@@ -152,7 +145,7 @@ def _sided(arm: CalibratedArm) -> tuple[str, ...]:
     """That the direction of the last motion is left out, where it counts.  Raises InputError where
     an effect of the arm follows what else a table of corrections cannot know."""
     sided: tuple[str, ...] = ()
-    for name, needs in unstated_needs(arm, Conditions()).items():
+    for name, needs in calibrated.unstated_needs(arm, Conditions()).items():
         columns = listed(COLUMNS[need] for need in needs)
         told = f"{option('table')}: corrections hold at any time, and {name} follows {columns}"
         remedy = "give a table of targets with that column, or identify without the effect"

@@ -18,7 +18,13 @@ import numpy as np
 
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
-from elastocal.importing.mapping_file import ColumnKey, NumberCells, SourceTable, UnitsTable
+from elastocal.importing.mapping_file import (
+    ColumnKey,
+    NumberCells,
+    SourceTable,
+    UnitsTable,
+    compiled,
+)
 from elastocal.messages import (
     ElastocalError,
     InputError,
@@ -164,11 +170,7 @@ def _sorted_lines(
     source: str, lines: list[str], settings: mapping_file.TextSourceKeys
 ) -> tuple[Numbered, Numbered, Numbered]:
     marks = tuple(settings.comments)
-    skip = (
-        None
-        if settings.ignore is None
-        else mapping_file.compiled(source, "ignore", settings.ignore)
-    )
+    skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
     content, comments, ignored = Numbered(), Numbered(), Numbered()
     for number, line in enumerate(lines, start=1):
         bare = line.strip()
@@ -616,7 +618,7 @@ def with_labels(where: str, records: Records, names: mapping_file.NamesTable) ->
 def _with_names_read(where: str, records: Records, names: mapping_file.NamesTable) -> Records:
     named = records.texts["name"]
     patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
-    expressions = [mapping_file.compiled(where, "pattern", text) for text in patterns]
+    expressions = [compiled(where, "pattern", text) for text in patterns]
     for expression in expressions:
         require(
             set(expression.groupindex) & set(GROUPS),

@@ -40,7 +40,7 @@ from elastocal.model.chain import (
     near_the_arm,
 )
 from elastocal.model.rigid import nominal_flanges
-from elastocal.tables import NO_UNIT, Family, RawTable
+from elastocal.tables import NO_UNIT, Column, Columns, Family, RawTable
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -152,7 +152,7 @@ def dh_number(table: RawTable, i: int, family: str, stem: str) -> float:
 def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str) -> RawTable:
     named = {family.name: family for family in known}
 
-    def choose(header: Sequence[str]) -> tables.Columns:
+    def choose(header: Sequence[str]) -> Columns:
         every = listed(way for f in known for stem in f.units for way in f.columns(stem))
         found = tables.match_columns(
             str(path), header, named, explain=partial(_no_table, what), called=CALLED,
@@ -191,9 +191,7 @@ def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
     return value
 
 
-def _too_much(
-    table: RawTable, i: int, column: tables.Column, value: float, wrong: str
-) -> InputError:
+def _too_much(table: RawTable, i: int, column: Column, value: float, wrong: str) -> InputError:
     meant = {"rad": ("degrees", "deg"), "m": ("millimetres", "mm")}.get(column.unit)
     remedy = "correct it"
     if meant:

@@ -21,16 +21,9 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from elastocal import messages
 from elastocal.files import DEEPEST, read_bytes
-from elastocal.messages import (
-    SHOWN,
-    InputError,
-    check_known,
-    did_you_mean,
-    listed,
-    printable,
-    require,
-)
+from elastocal.messages import InputError, check_known, did_you_mean, listed, printable, require
 from elastocal.model import rigid
 from elastocal.model.chain import (
     FINGERS,
@@ -208,7 +201,8 @@ def _unlike_xml(data: bytes) -> str:
     """Of a text that is no XML why, where that is plainer than what the parser says."""
 
     def first_line(text: bytes) -> str:
-        return printable(text.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        first = text.strip().decode("utf-8", "replace").partition("\n")[0]
+        return printable(first[: messages.SHOWN])
 
     head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
     before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
