@@ -12,22 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from elastocal import measurements
+from elastocal import measurements, messages
 from elastocal.above import Result
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
 from elastocal.measurements import Measurements, in_file_units, joint_columns, with_moves
-from elastocal.messages import (
-    InputError,
-    InsufficientDataError,
-    length,
-    listed,
-    option,
-    plain,
-    require,
-    rounded,
-    some,
-)
+from elastocal.messages import InputError, length, listed, option, plain, require, rounded, some
 from elastocal.model import calibrated, rigid
 from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_index, joint_limits
@@ -623,7 +613,7 @@ def check_status(
     same = len(kinds) == 1
     named = some((row if same else f"{row} ({s})" for row, s in lost), NAMED)
     why = "; ".join(remedies[k] if same else f"{k}: {remedies[k]}" for k in kinds)
-    raise InsufficientDataError(
+    raise messages.InsufficientDataError(
         f"{what % (len(lost), len(status))} are not reached: {named}{': ' if same else '. '}{why}. "
         f"Nothing was written; {option('partial', True)} writes the others"
     )

@@ -45,22 +45,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from elastocal import __version__
+from elastocal import __version__, messages
 from elastocal.config import Table, checked, read_toml
 from elastocal.files import atomic_write, read_bytes, read_json, read_text
-from elastocal.messages import (
-    ElastocalError,
-    InputError,
-    check_known,
-    did_you_mean,
-    json_text,
-    listed,
-    option,
-    printable,
-    quoted,
-    raised_at,
-    require,
-)
+from elastocal.messages import ElastocalError, InputError, listed, option, quoted, require
 from elastocal.screen import StudyStop, shown
 
 if TYPE_CHECKING:
@@ -166,7 +154,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
         key, equals, written = (part.strip() for part in text.partition("="))
         here = option("options", text)
         require(equals, f"{option('options')} takes KEY=VALUE; found {quoted(text)}")
-        check_known(key, options, f"{here}: {path} has no option {quoted(key)}", "it has")
+        messages.check_known(key, options, f"{here}: {path} has no option {quoted(key)}", "it has")
         default, value = defaults[key], None
         with suppress(tomllib.TOMLDecodeError):
             value = tomllib.loads(f"value = {written}")["value"]
@@ -260,7 +248,7 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
         raise
     except (Exception, SystemExit) as error:
         own, nowhere = folder.resolve(), (folder.resolve() / "study.py", 1)
-        file, line = raised_at(error, lambda f: Path(f).is_relative_to(own)) or nowhere
+        file, line = messages.raised_at(error, lambda f: Path(f).is_relative_to(own)) or nowhere
         raise InputError(
             f"{file}, line {line}: {what} raised {type(error).__name__}: {error}; correct it there"
         ) from error
@@ -301,7 +289,8 @@ def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row
             raise ValueError(f"run() returned {name!r}, which is a value of the task itself")
         if name not in columns:
             told = f"which [columns] of study.toml does not list (there are {listed(columns)})"
-            raise ValueError(f"run() returned {name!r}{did_you_mean(str(name), columns)}, {told}")
+            hint = messages.did_you_mean(str(name), columns)
+            raise ValueError(f"run() returned {name!r}{hint}, {told}")
     return [{n: _plain(n, row.get(n), unit) for n, unit in columns.items()} for row in rows]
 
 
@@ -383,9 +372,9 @@ def result_lines(folder: Path) -> list[Row]:
         except (ValueError, KeyError, TypeError) as error:
             told = f"{here}: is damaged ({error}); delete it, and its task runs again"
             raise InputError(told) from None
-        told = f"{here}: task {index} has more than one result; results of two runs were put"
-        remedy = f"together: remove one, or run with {option('restart', True)}"
-        require(index not in found, f"{told} {remedy}")
+        if index in found:
+            told = f"{here}: task {index} has more than one result; results of two runs were put"
+            raise InputError(f"{told} together: remove one, or run with {option('restart', True)}")
         found[index] = line
     return [found[index] for index in sorted(found)]
 
@@ -615,7 +604,7 @@ def run_study(
             "options": stated.options, "tasks": len(study.tasks), "columns": stated.columns,
             "sources": study.sources.digests, "elastocal": __version__,
         }  # fmt: skip
-        atomic_write(folder / STATEMENT, json_text(statement) + "\n")
+        atomic_write(folder / STATEMENT, messages.json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
         progress(total, ended, failed)
@@ -672,6 +661,6 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     if not isinstance(text, str):
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
-    lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    atomic_write(page, "\n".join(lines) + "\n")
+    lines = map(messages.printable, text.rstrip("\n").split("\n"))
+    atomic_write(page, "\n".join(lines).replace("\\t", "\t") + "\n")
     return text

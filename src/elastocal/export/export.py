@@ -10,12 +10,14 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from elastocal import messages
 from elastocal.above import checked_arguments
 from elastocal.cell_tables import Convention, Robot
 from elastocal.export import exportable, robot_files
@@ -23,17 +25,7 @@ from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
 from elastocal.measurements import Measurements
-from elastocal.messages import (
-    ElastocalError,
-    did_you_mean,
-    json_text,
-    length,
-    listed,
-    option,
-    plain,
-    require,
-    rounded,
-)
+from elastocal.messages import ElastocalError, listed, option, plain, require, rounded
 from elastocal.model import dh
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain, Joint, joint_index
@@ -90,18 +82,13 @@ class Wish:
     @property
     def kind(self) -> str:
         """The format: as asked for, or by the file's ending."""
-        ending = ENDINGS.get(self.path.suffix.lower(), "")
+        ending, known = ENDINGS.get(self.path.suffix.lower(), ""), ", ".join(FORMATS)
         found = ending if self.format is None else self.format.lower()
-        require(
-            self.format is not None or ending,
-            f"{self.path}: the ending '{self.path.suffix}' names no known format; use one of "
-            f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}",
-        )
-        require(
-            found in FORMATS,
-            f"{option('format')} takes one of {', '.join(FORMATS)}; found '{self.format}'"
-            f"{did_you_mean(found, FORMATS)}",
-        )
+        told = f"the ending '{self.path.suffix}' names no known format; use one of"
+        ways = f"{', '.join(ENDINGS)}, or name it by {option('format')}: {known}"
+        require(self.format is not None or ending, f"{self.path}: {told} {ways}")
+        told = f"takes one of {known}; found '{self.format}'{messages.did_you_mean(found, FORMATS)}"
+        require(found in FORMATS, f"{option('format')} {told}")
         return found
 
 
@@ -177,11 +164,9 @@ def export(
         require(not given or wish.kind in formats, said)
     # The visits measured, where they are known, count under the load that was asked for.
     visits, force = calibrated.visits, given_force(wish.load)
-    require(
-        visits is not None or not wish.correct_joints,
-        f"{calibrated.source} does not say where the arm was measured, which "
-        f"{option('joint_correction')} needs; identify anew",
-    )
+    known = visits is not None or not wish.correct_joints
+    lack = f"does not say where the arm was measured, which {option('joint_correction')} needs;"
+    require(known, f"{calibrated.source} {lack} identify anew")
     if visits is not None and force is not None:
         visits = replace(visits, force=np.broadcast_to(force, visits.force.shape))
     force = np.zeros(3) if force is None else force
@@ -295,7 +280,7 @@ class _Writing:
             "geometry_alone": self.done.cost.to_json(),
         }  # fmt: skip
         if self.wish.kind == "json":
-            return self.done.written(json_text(document) + "\n")
+            return self.done.written(messages.json_text(document) + "\n")
         import yaml
 
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
@@ -330,11 +315,8 @@ class _Writing:
                         *((angle, "") if group.lasting else ("", time)),
                         str(number + 1), MICRO.get(unit, unit), *micro,
                     ))  # fmt: skip
-        require(
-            rows,
-            f"{self.calibrated.source}: this arm has no smooth function to be written as "
-            "corrections; elastocal diagnose finds those that the readings show",
-        )
+        told = "this arm has no smooth function to be written as corrections; elastocal diagnose"
+        require(rows, f"{arm.source}: {told} finds those that the readings show")
         return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
 
     @property
@@ -411,9 +393,7 @@ class _Writing:
                 "identify anew for an arm with weights"
             )
         warnings += self.rigid_joints(f" (gain {robot_files.RIGID:g})")
-        try:
-            import mujoco  # noqa: F401
-        except ImportError:
+        if find_spec("mujoco") is None:
             lack = "not read back: MuJoCo is not installed (pip install elastocal[mujoco])"
             return self.done.written(text, *warnings, lack)
         placed = pieces.T_tracker_base if self.wish.base_frame else np.eye(4)
@@ -501,10 +481,8 @@ def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
 
 def _accepted(distance: float, largest: float) -> float:
     if not distance <= largest:
-        raise ElastocalError(
-            f"the written file, read back, is {length(distance)} from the model and was "
-            "not kept; please report this robot description"
-        )
+        told = f"read back, is {messages.length(distance)} from the model and was not kept"
+        raise ElastocalError(f"the written file, {told}; please report this robot description")
     return distance
 
 

@@ -54,28 +54,23 @@ def with_joints(
     units = [records.units[stems[j]] for j in taken[0]]
     n, here = len(units), f"{where}: [joints]"
     for key in ("sign", "offset_deg", "offset_mm"):
-        given = getattr(joints, key) or []
-        told = (
-            f"{here} {key} has {len(given)} numbers, but there are {n} joints; give one per joint"
-        )
-        require(not given or len(given) == n, told)
-        for j, (value, unit) in enumerate(zip(given, units, strict=False), 1):
+        given = getattr(joints, key)
+        size = n if given is None else len(given)
+        told = f"{key} has {size} numbers, but there are {n} joints; give one per joint"
+        require(size == n, f"{here} {told}")
+        for j, (value, unit) in enumerate(zip(given or (), units, strict=False), 1):
             told = f"{here} sign takes 1 or -1 per joint; found {value:g}"
             require(key != "sign" or abs(value) == 1, told)
-            told = (
-                f"{here} {key} is {value:g} for joint {j}, which is in {unit}; give offset_{unit}"
-            )
-            require(key == "sign" or not value or key.endswith(unit), told)
+            told = f"{key} is {value:g} for joint {j}, which is in {unit}; give offset_{unit}"
+            require(key == "sign" or not value or key.endswith(unit), f"{here} {told}")
     none = [0.0] * n
     offset = np.where(np.array(units) == "deg", joints.offset_deg or none, joints.offset_mm or none)
     before = np.take_along_axis(records.q, taken, axis=1) * (joints.sign or [1.0] * n) + offset
     q = before.copy()
     for k, coupling in enumerate(joints.coupling, 1):
         for name, number in (("joint", coupling.joint), ("of", coupling.of)):
-            told = (
-                f"{where}: {name} = {number} of [joints] coupling no. {k}: the file has {n} joints"
-            )
-            require(number <= n, told)
+            told = f"{name} = {number} of [joints] coupling no. {k}: the file has {n} joints"
+            require(number <= n, f"{where}: {told}")
         j, i = coupling.joint - 1, coupling.of - 1
         require(
             units[j] == units[i],
@@ -85,9 +80,8 @@ def with_joints(
         q[:, j] += coupling.factor * before[:, i]
     numbers = {s: v for s, v in records.numbers.items() if s not in stems}
     numbers |= dict(zip(stems, q.T, strict=False))  # q1 … without those that the order leaves out
-    return replace(
-        records, numbers=numbers, units=records.units | dict(zip(stems, units, strict=False))
-    )
+    of = records.units | dict(zip(stems, units, strict=False))
+    return replace(records, numbers=numbers, units=of)
 
 
 def _order(
@@ -122,12 +116,10 @@ def _order(
 
 def pooled(records: Sequence[Records]) -> Records:
     if any(r.load is not None for r in records):
+        told = "says no load, other files do; give load in its [[source]], or a group (?P<load>…)"
         for r in records:
-            require(
-                "load" in r.texts or r.load is not None,
-                f"{r.source}: says no load, other files do; give load in its [[source]], or a "
-                "group (?P<load>…) in its pattern",
-            )
+            stated = "load" in r.texts or r.load is not None
+            require(stated, f"{r.source}: {told} in its pattern")
         records = [replace(r, texts={"load": [str(r.load)] * len(r)} | r.texts) for r in records]
     first = records[0]
     for other in records[1:]:
@@ -243,9 +235,8 @@ def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str)
     if how not in ("time", "standstill"):
         return ""
     at, clock, q, _ = _clocks(points, log, settings, how)
-    first, last, _ = dwells(
-        clock, q, log.spread(settings.still_deg, settings.still_mm), settings.still_s
-    )
+    still = log.spread(settings.still_deg, settings.still_mm)
+    first, last, _ = dwells(clock, q, still, settings.still_s)
     if not len(first) or len(at) * len(first) > MOST_PAIRS:
         return ""
     ends = np.array([clock[first], clock[last]])
@@ -362,11 +353,11 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
         known: dict[str, int] = {}
         for r in rows:
             first = known.setdefault(key(names[r]), int(r))
-            require(
-                first == r or np.array_equal(q[first], q[r]),
-                f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
-                f"{log.line[first]}; name visits apart, or say which load each belongs to",
-            )
+            if first != r and not np.array_equal(q[first], q[r]):
+                raise InputError(
+                    f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
+                    f"{log.line[first]}; name visits apart, or say which load each belongs to"
+                )
         row[chosen] = [known.get(key(own[i]), -1) for i in chosen]
         used = {key(own[i]) for i in chosen}
         unused -= {int(r) for r in rows if key(names[r]) in used}
@@ -524,16 +515,16 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
         number = defaultdict[tuple, Iterator[int]](count)
         return np.array([next(number[key]) for key in keys], dtype=np.int64)
     for k, (text, key) in enumerate(zip(stated, keys, strict=True)):
-        here = f"{points.where(k)}: repeat {quoted(text)}"
-        told = f"{here} is no whole number; correct the pattern or the column"
-        require(WHOLE.fullmatch(text), told)
+        if not WHOLE.fullmatch(text):
+            told = f"repeat {quoted(text)} is no whole number; correct the pattern or the column"
+            raise InputError(f"{points.where(k)}: {told}")
         first = known.setdefault((*key, int(text)), k)
-        require(
-            first == k,
-            f"{points.where(k)}: repeat {text} of configuration {key[0]}"
-            f"{f', marker {key[1]}' if key[1] else ''} stands in line {points.line[first]} too; "
-            "leave the repeat out of the pattern to have shots numbered in order",
-        )
+        if first != k:
+            raise InputError(
+                f"{points.where(k)}: repeat {text} of configuration {key[0]}"
+                f"{f', marker {key[1]}' if key[1] else ''} stands in line {points.line[first]} "
+                "too; leave the repeat out of the pattern to have shots numbered in order"
+            )
     return np.array([int(text) for text in stated], dtype=np.int64)
 
 

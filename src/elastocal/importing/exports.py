@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from elastocal import messages
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
 from elastocal.importing.mapping_file import (
@@ -25,15 +26,7 @@ from elastocal.importing.mapping_file import (
     UnitsTable,
     compiled,
 )
-from elastocal.messages import (
-    ElastocalError,
-    InputError,
-    did_you_mean,
-    is_label,
-    listed,
-    quoted,
-    require,
-)
+from elastocal.messages import ElastocalError, InputError, did_you_mean, listed, quoted, require
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.tables import MAX_LINE, NUMBER, column
 from elastocal.units import FACTORS, Array, IntArray, convert, quantities
@@ -61,16 +54,16 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
     told = "is a workbook, bag, archive or other binary file; export its table as text (CSV)"
     require(not data.startswith(_BINARY), f"{source}: {told}")
     text, name = _decode(source, data, encoding)
+    if "\0" in text:
+        line = text.count("\n", 0, text.index("\0")) + 1
+        told = "NUL characters, so this is no text, or UTF-16 without its mark; export it as text"
+        raise InputError(f"{source}, line {line}: {told} (CSV), or set encoding")
     # Not splitlines: a form feed or U+2028 in a comment ends no line for an editor.
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     for number, content in enumerate(lines, start=1):
-        require(
-            "\0" not in content,
-            f"{source}, line {number}: NUL characters, so this is no text, or UTF-16 without its "
-            "mark; export it as text (CSV), or set encoding",
-        )
-        told = f"longer than {MAX_LINE // 1024} KiB; this is no table of readings"
-        require(len(content) <= MAX_LINE, f"{source}, line {number}: {told}")
+        if len(content) > MAX_LINE:
+            told = f"longer than {MAX_LINE // 1024} KiB; this is no table of readings"
+            raise InputError(f"{source}, line {number}: {told}")
     return lines, name
 
 
@@ -609,7 +602,7 @@ def with_labels(where: str, records: Records, names: mapping_file.NamesTable) ->
         )
     for stem, texts in labels.items():
         for i, text in enumerate(texts):
-            if not is_label(text):
+            if not messages.is_label(text):
                 told = f"cannot stand in a table; correct the name, or {NAMED}"
                 raise InputError(f"{records.where(i)}: {stem} {quoted(text)} {told}")
     return replace(records, texts=records.texts | labels)

@@ -20,29 +20,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from elastocal.config import (
-    NonNegative,
-    Positive,
-    Table,
-    Text,
-    Vector3,
-    checked,
-    key,
-    place,
-    read_toml,
-)
+from elastocal import config, messages
+from elastocal.config import NonNegative, Positive, Table, Text, Vector3, checked, key, place
 from elastocal.measurements import families
-from elastocal.messages import (
-    InputError,
-    check_known,
-    did_you_mean,
-    listed,
-    option,
-    plain_minus,
-    quoted,
-    require,
-    said_of,
-)
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require
 from elastocal.tables import NUMBER, THOUSANDS, column, first_bad_cell
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
@@ -166,7 +147,7 @@ _UNIT = re.compile(r"_[A-Za-z]+$")
 
 
 def preset_text(name: str) -> str:
-    check_known(name, PRESETS, f"no preset {quoted(name)}")
+    messages.check_known(name, PRESETS, f"no preset {quoted(name)}")
     folder = resources.files("elastocal.importing") / "presets"
     return (folder / f"{name}.toml").read_text(encoding="utf-8")
 
@@ -181,7 +162,7 @@ def read_mapping(
     given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
     checked(MappingTable, {"units": given}, f"{option('length_unit')}, {option('angle_unit')}")
     where = option("presets") if path is None else str(path)
-    data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file")
+    data: dict[str, Any] = {} if path is None else config.read_toml(path, "mapping file")
     if presets:
         told = f"has [[source]] tables, so {option('presets', presets[0])} has no place; write"
         remedy = f"into the [[source]] it is for, or leave {option('presets')} out"
@@ -202,7 +183,7 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
     name = source.get("preset")
     if name is None:
         return source
-    with said_of(where):
+    with messages.said_of(where):
         base = tomllib.loads(preset_text(name))
     # x_mm of the user replaces the preset's x_auto, whichever table either stands in.
     own = source.get("columns", {}) | source.get("optional", {})
@@ -529,7 +510,7 @@ class NumberCells:
 
     def _bare(self, cell: str) -> str:
         text = cell.strip()
-        text = text if text.isascii() else plain_minus(text).translate(_PLAIN)
+        text = text if text.isascii() else messages.plain_minus(text).translate(_PLAIN)
         return text.replace(self.thousands, "") if self.thousands else text
 
     def looks_numeric(self, cell: str) -> bool:

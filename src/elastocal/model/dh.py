@@ -12,19 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from elastocal import tables
+from elastocal import messages, tables
 from elastocal.cell_tables import Convention
 from elastocal.files import read_text
-from elastocal.messages import (
-    InputError,
-    check_known,
-    did_you_mean,
-    listed,
-    option,
-    quoted,
-    require,
-    rounded,
-)
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, rounded
 from elastocal.model import rigid
 from elastocal.model.chain import (
     MAX_ANGLE,
@@ -107,10 +98,8 @@ def read_dh(
     table = read_dh_table(path)
     kinds = [_kind(table, i) for i in range(len(table.row))]
     moving = [i for i, kind in enumerate(kinds) if kind is not None]
-    told = (
-        f"{len(moving)} rows below the header, one per joint; {MIN_JOINTS} to {MAX_JOINTS} joints"
-    )
-    require(MIN_JOINTS <= len(moving) <= MAX_JOINTS, f"{path}: {told} are supported")
+    told = f"{len(moving)} rows below the header, one per joint; {MIN_JOINTS} to {MAX_JOINTS}"
+    require(MIN_JOINTS <= len(moving) <= MAX_JOINTS, f"{path}: {told} joints are supported")
     names = [table.text(i, "joint") or f"joint{k}" for k, i in enumerate(moving, start=1)]
     for i, name in zip(moving, names, strict=True):
         told = f"{table.where(i, 'joint')}: '{name}' appears twice; rename one"
@@ -372,7 +361,8 @@ def _nominal(
     if model is not None:
         by_name = {name.lower(): name for name in NOMINAL}
         known = by_name.get(model.lower().replace(" ", ""), model)
-        check_known(known, NOMINAL, f"{path}: the robot '{model}' is not known", "known are")
+        told = f"{path}: the robot '{model}' is not known"
+        messages.check_known(known, NOMINAL, told, "known are")
         return _published(known)
     beside = path.with_name(CONTROLLER)
     if "DH" not in sections and beside.is_file():
