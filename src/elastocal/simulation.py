@@ -20,14 +20,8 @@ from elastocal.files import atomic_write
 from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
 from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, wish
 from elastocal.model.calibrated import Conditions, random_table
+from elastocal.model.effects import statics
 from elastocal.model.effects.base import Parameter, index
-from elastocal.model.effects.statics import (
-    RATED_WIND_UP,
-    JointCompliance,
-    rated_torque,
-    usual_over_stated_mass,
-    weight_torque,
-)
 from elastocal.model.manipulator import NOMINAL, Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
@@ -68,7 +62,7 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
     """
     drawn, shown = {}, None
     for k, p in enumerate(model.parameters):
-        compliance = p.effect == JointCompliance.name
+        compliance = p.effect == statics.JointCompliance.name
         size = 0.2 * abs(p.nominal) if compliance or p.typical is None else p.typical
         step = scale * float(rng.normal())
         if compliance and size == 0.0 and (usual := _usual(model, p)):
@@ -84,10 +78,10 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
 def _usual(model: Model, p: Parameter) -> float:
     """The compliance that arms have where `identify` expects one (`load_ratio`); 0 elsewhere."""
     i = index(p.where)
-    if model.chain.kinds[i] != "revolute" or not weight_torque(model.chain, i) > 0:
+    if model.chain.kinds[i] != "revolute" or not statics.weight_torque(model.chain, i) > 0:
         return 0.0
-    torque = usual_over_stated_mass(model.chain) * (rated_torque(model.chain, model.cell, i) or 0.0)
-    return RATED_WIND_UP / torque
+    rated = statics.rated_torque(model.chain, model.cell, i) or 0.0
+    return statics.RATED_WIND_UP / (statics.usual_over_stated_mass(model.chain) * rated)
 
 
 def _sizes_shown(model: Model) -> Array:

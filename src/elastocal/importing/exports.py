@@ -19,13 +19,7 @@ import numpy as np
 from elastocal import messages
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
-from elastocal.importing.mapping_file import (
-    ColumnKey,
-    NumberCells,
-    SourceTable,
-    UnitsTable,
-    compiled,
-)
+from elastocal.importing.mapping_file import ColumnKey, SourceTable, UnitsTable, compiled
 from elastocal.messages import ElastocalError, InputError, did_you_mean, listed, quoted, require
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.tables import MAX_LINE, NUMBER, column
@@ -98,7 +92,7 @@ def table_rows(
     begins at the first line with numbers where they are asked for, and the line before it is its
     header if it has as many cells.  Lines above the table, repeated headers and lines that match
     `ignore` are passed over and listed."""
-    guess = NumberCells("auto", settings.thousands, settings.missing, ())
+    guess = mapping_file.NumberCells("auto", settings.thousands, settings.missing, ())
     numbers = (c.at[0] for c in asked if c.required and c.quantities)
     places = [at for at in numbers if isinstance(at, int)]
     named = any(isinstance(part, str) for c in asked if c.required for part in c.at)
@@ -424,7 +418,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     no_unit = {c.header: c for own in columns.values() for c in own if c.unit == mapping_file.AUTO}
     columns = {m: tuple(c for c in own if c.header not in no_unit) for m, own in columns.items()}
     every = [c for own in columns.values() for c in own]
-    cells = NumberCells(
+    cells = mapping_file.NumberCells(
         settings.decimal, settings.thousands, settings.missing,
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in every if c.quantities and c.index[0] < len(row)),
@@ -465,8 +459,8 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
 
 
 def _rows(
-    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]], cells: NumberCells,
-    coverage: float,
+    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]],
+    cells: mapping_file.NumberCells, coverage: float,
 ) -> tuple[list[tuple[int, list[str], str]], dict[str, Array], dict[str, str],
            list[tuple[int, str]]]:  # fmt: skip
     """Complete rows (line, cells, marker), their numbers by column and the units of the measurement

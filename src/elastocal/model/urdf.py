@@ -24,17 +24,8 @@ import numpy as np
 from elastocal import messages
 from elastocal.files import DEEPEST, read_bytes
 from elastocal.messages import InputError, check_known, did_you_mean, listed, printable, require
-from elastocal.model import rigid
-from elastocal.model.chain import (
-    FINGERS,
-    MAX_JOINTS,
-    MIN_JOINTS,
-    Chain,
-    Joint,
-    JointKind,
-    LinkMass,
-    check_angles,
-)
+from elastocal.model import chain, rigid
+from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 # An XML file, edited so that all else stays to the byte.
@@ -417,7 +408,7 @@ class Tree:
             own = ([self.parent_joint[k] for k in self._below(joint.child)] for joint in self.joints
                    if joint.parent == link and joint.child not in common)  # fmt: skip
             beside = [joints for joints in own if any(joint.moves for joint in joints)]
-            fingers = (j.follows is not None or FINGERS.search(j.name + j.child)
+            fingers = (j.follows is not None or chain.FINGERS.search(j.name + j.child)
                        for joints in beside for j in joints)  # fmt: skip
             if len(beside) > 1 or any(fingers):
                 return link
@@ -599,7 +590,7 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
         )
         limit = None if kind == "continuous" else (lower, upper)
     mimic, rpy = tag.first("mimic"), _vector(where, tag, "origin", "rpy")
-    check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
+    chain.check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
     return FileJoint(
         name,
         kind,
