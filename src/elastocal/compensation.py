@@ -12,49 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from elastocal import measurements, messages
 from elastocal.above import Result
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
-from elastocal.measurements import (
-    Measurements,
-    families,
-    in_file_units,
-    joint_columns,
-    read_measurements,
-    with_moves,
-)
-from elastocal.messages import (
-    InputError,
-    InsufficientDataError,
-    length,
-    listed,
-    option,
-    plain,
-    require,
-    rounded,
-    some,
-)
-from elastocal.model.calibrated import (
-    CalibratedArm,
-    CalibratedTool,
-    ToolPoint,
-    lasting,
-    numbers,
-    tool_point,
-)
+from elastocal.measurements import Measurements, in_file_units, joint_columns, with_moves
+from elastocal.messages import InputError, length, listed, option, plain, require, rounded, some
+from elastocal.model import calibrated, rigid
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_index, joint_limits
 from elastocal.model.manipulator import smooth_groups
-from elastocal.model.rigid import (
-    ARM_LENGTH,
-    BoundedSearch,
-    Postures,
-    Reaching,
-    inverse_kinematics,
-    nominal_flanges,
-    reach_of,
-    unwound,
-)
-from elastocal.model.rigid import TOLERANCE as NOMINAL_TOLERANCE
+from elastocal.model.rigid import BoundedSearch, Postures, Reaching, inverse_kinematics
 from elastocal.tables import column, csv_text
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -95,9 +63,6 @@ class Targets:
             table = replace(table, direction=side)
         return table
 
-    def place(self, i: int) -> str:
-        return f"{self.table.source}, line {self.table.row[i]}"
-
 
 def read_targets(
     path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
@@ -109,33 +74,25 @@ def read_targets(
     (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
     (3,) N acts where the table states none.
     """
-    table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
+    table = measurements.read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None
-    if table.position is None:
-        extra = (
-            "; a rotation alone is no target" if table.rotation is not None and q is None else ""
-        )
-        require(
-            q is not None and table.rotation is None,
-            f"{path}: the columns x_mm,y_mm,z_mm are missing; a target needs its position, or the "
-            f"nominal command q1_deg … alone{extra}",
-        )
-        require(
-            frame == "base",
-            f"{path}: targets by q1_deg … alone are where the nominal arm has the tool, which "
-            f"stands in the base frame; leave {option('frame', 'tracker')} away, or give "
-            "x_mm,y_mm,z_mm",
-        )
-    require(
-        len(table.marker_names) == 1,
-        f"{path}: targets of the markers {', '.join(table.marker_names[:4])} … in one table; the "
-        f"point of the tool is chosen by {option('point')}: split the table by marker",
-    )
+    placed, turned = table.position is not None, table.rotation is not None
+    extra = "; a rotation alone is no target" * (turned and q is None)
+    for wrong, told in (
+        (not placed and (turned or q is None),
+         "the columns x_mm,y_mm,z_mm are missing; a target needs its position, or the nominal "
+         f"command q1_deg … alone{extra}"),
+        (not placed and frame != "base",
+         "targets by q1_deg … alone are where the nominal arm has the tool, which stands in the "
+         f"base frame; leave {option('frame', 'tracker')} away, or give x_mm,y_mm,z_mm"),
+        (len(table.marker_names) > 1,
+         f"targets of the markers {', '.join(table.marker_names[:4])} … in one table; the point of "
+         f"the tool is chosen by {option('point')}: split the table by marker"),
+        (force is not None and table.force.any(),
+         f"the table has forces of its own; leave {option('load')} away or drop them"),
+    ):  # fmt: skip
+        require(not wrong, f"{path}: {told}")
     if force is not None:
-        require(
-            not table.force.any(),
-            f"{path}: the table has forces of its own; leave {option('load')} away or drop them",
-        )
         table = replace(table, force=np.tile(force, (len(table), 1)))
     rotation = table.rotation
     matrices = None if rotation is None else Rotation.from_rotvec(rotation).as_matrix()
@@ -145,7 +102,7 @@ def read_targets(
 def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
     """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
     what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
-    values = numbers(option("target"), text, (3, 6), what)
+    values = calibrated.numbers(option("target"), text, (3, 6), what)
     position = values[None, :3] / 1e3
     rotation = None
     if len(values) == 6:
@@ -192,7 +149,7 @@ def nominal_path(
             found = task.solve(np.tile(last, (len(rows), 1)), rows)[0]
             errors = np.column_stack(task.errors(found, rows))
             steps = np.abs(np.diff(np.vstack([last, found]), axis=0)).max(axis=1)
-            fits = (errors <= NOMINAL_TOLERANCE).all(axis=1)
+            fits = (errors <= rigid.TOLERANCE).all(axis=1)
             fits &= steps <= np.where(rows == first, LARGE, STEP)
             good = len(rows) if fits.all() else int(np.argmin(fits))
             q[first : first + good], reached[first : first + good] = found[:good], True
@@ -219,7 +176,7 @@ def _nearest(
     q, good = found.q[k], found.reached[k]
     if near is None or not good.any():
         return q[0], bool(good[0])
-    q = unwound(chain, q[good], near, task.lower, task.upper)
+    q = rigid.unwound(chain, q[good], near, task.lower, task.upper)
     q = q[np.argmin(np.linalg.norm(q - near, axis=1))][None]
     if chain.n_joints > (6 if task.oriented else 3):  # joints leave a choice
         q = task.nearest(q, np.array([place]), near)
@@ -284,7 +241,7 @@ class Commanding(BoundedSearch):
     def misses(self, q: Array, target: IntArray) -> Array:
         """Distance in m and angle in rad (R, 2) from the goals; NaN without an equilibrium."""
         r = self.residual(q, target)[0]
-        turn = np.linalg.norm(r[:, 3:], axis=1) / ARM_LENGTH
+        turn = np.linalg.norm(r[:, 3:], axis=1) / rigid.ARM_LENGTH
         return np.column_stack([np.linalg.norm(r[:, :3], axis=1), turn])
 
     def commands(self, nominal: Array, target: IntArray) -> tuple[Array, Array]:
@@ -369,7 +326,7 @@ def compensate(
     calibrated model for the target within the joint limits, nearest to the nominal one where
     joints or a free rotation leave a choice.
     """
-    arm, of_one_campaign = lasting(arm)
+    arm, of_one_campaign = calibrated.lasting(arm)
     tool = CalibratedTool(arm, point)
     chain, limits = tool.chain, joint_limits(tool.cell, tool.chain)
     T, place, turn = tool.frames(tool.rows(targets.table))
@@ -431,7 +388,7 @@ def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) 
         assert targets.q is not None  # read_targets: positions or joints
         # Fewer than six joints cannot keep the rotation too.
         goals = Goals(place, turn if chain.n_joints >= 6 else None)
-        goals = goals.through(nominal_flanges(chain, targets.q))
+        goals = goals.through(rigid.nominal_flanges(chain, targets.q))
     return goals.through(T) if targets.frame == "base" else goals
 
 
@@ -441,7 +398,7 @@ NOWHERE = 100.0  # of the reach nearer to the origin, or as many reaches away: n
 def _check_unit(targets: Targets, position: Array, chain: Chain, T: Array) -> None:
     """Raise InputError where all targets lie at the origin of their frame or far beyond the arm,
     and 1000 times as far, or as near, within its reach (twice, for tool and a rail)."""
-    reach, far = reach_of(chain), np.linalg.norm(position, axis=1)
+    reach, far = rigid.reach_of(chain), np.linalg.norm(position, axis=1)
     for out, factor, told in (
         (far < reach / NOWHERE, 1e3, "small; are they in m where mm are asked for?"),
         (far > reach * NOWHERE, 1e-3, "large; are they in mm where m are asked for?"),
@@ -493,15 +450,11 @@ def _status(search: Commanding, missed: Array, nominal: Array) -> tuple[str, ...
 def _uncertainty(
     tool: CalibratedTool, rows: list[NDArray], q: Array, reached: BoolArray
 ) -> Uncertainty:
-    def of_all(values: Array) -> Array:
-        found = np.full((len(q), *values.shape[1:]), np.nan)
-        found[reached] = values
-        return found
-
     some = uncertainty_at(tool, [values[reached] for values in rows], q[reached])
-    return Uncertainty(
-        of_all(some.covariance), of_all(some.total), of_all(some.unknown), some.blamed
-    )
+    at = np.where(reached, np.cumsum(reached) - 1, -1)  # -1: the row of NaN behind them
+    known = some.covariance, some.total, some.unknown
+    of_all = [np.concatenate([v, np.full((1, *v.shape[1:]), np.nan)])[at] for v in known]
+    return Uncertainty(of_all[0], of_all[1], of_all[2], some.blamed)
 
 
 # Sentences about commands that are right but that somebody should look at.
@@ -520,13 +473,10 @@ def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) ->
     solution branch changes."""
     targets, q, kinds = c.targets, c.q, c.chain.kinds
     held = ((q <= limits[0] + AT_LIMIT) | (q >= limits[1] - AT_LIMIT)) & c.reached[:, None]
-    for limited in np.flatnonzero(held.any(axis=0)):
-        yield (
-            f"{_rows(targets, held[:, limited])}: joint {limited + 1} stands at its limit; the "
-            "target is reached by the other joints"
-        )
-    if len(jumps):
-        i = int(jumps[0])
+    for joint, at in enumerate(held.T, start=1):
+        told = f"joint {joint} stands at its limit; the target is reached by the other joints"
+        yield from _told(targets, at, told)
+    for i in jumps[:1]:
         j = int(np.abs(q[i] - q[i - 1]).argmax())
         size = np.abs(q[i, j] - q[i - 1, j])
         by = f"{np.degrees(size):.0f}°" if kinds[j] == "revolute" else f"{size * 1e3:.0f} mm"
@@ -536,21 +486,17 @@ def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) ->
             "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
             "the posture wanted"
         )
-    change = np.where([kind == "revolute" for kind in kinds], np.abs(q - c.nominal), 0.0)
-    large = c.reached & (change.max(axis=1) > LARGE_CORRECTION)
-    if large.any():
-        yield (
-            f"{_rows(targets, large)}: a joint is corrected by up to "
-            f"{np.degrees(change[large].max()):.1f}°, as beside a singular posture; check that the "
-            "path may be moved there"
-        )
-    far = c.before > FAR
-    if targets.q is not None and targets.position is not None and far.any():
-        yield (
-            f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
-            f"{c.before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
-            f"{option('point')} and units"
-        )
+    change = np.abs(q - c.nominal)[:, np.array(kinds) == "revolute"].max(axis=1, initial=0.0)
+    large = c.reached & (change > LARGE_CORRECTION)
+    most = np.degrees(change[large].max(initial=0.0))
+    told = f"a joint is corrected by up to {most:.1f}°, as beside a singular posture; check that"
+    yield from _told(targets, large, f"{told} the path may be moved there")
+    if targets.q is not None and targets.position is not None:
+        far = c.before > FAR
+        most = c.before[far].max(initial=0.0) * 1e3
+        told = f"the nominal command q1_deg … puts the tool up to {most:.0f} mm from its target;"
+        remedy = f"check {option('frame')}, {option('point')} and units"
+        yield from _told(targets, far, f"{told} {remedy}")
 
 
 def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
@@ -561,14 +507,11 @@ def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
             f"{targets.table.source}: no load is stated, so no compliance is compensated; where "
             f"the tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
         )
+    where = "[model.compliance_levels], where the compliance of the nearest level is assumed"
     for name, values in spec.compliance_levels.items():
         angle = c.q[:, joint_index(name)]
         off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
-        if (off & c.reached).any():
-            yield (
-                f"{_rows(targets, off & c.reached)}: {name} stands beyond its levels in "
-                "[model.compliance_levels], where the compliance of the nearest level is assumed"
-            )
+        yield from _told(targets, off & c.reached, f"{name} stands beyond its levels in {where}")
 
 
 def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
@@ -588,13 +531,13 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
             continue
         angle = c.q[:, group.joint]
         out = reached & ((angle < group.low) | (angle > group.high))
-        if out.any():
-            low, high = np.degrees([group.low, group.high])
-            yield (
-                f"{_rows(c.targets, out)}: {group.follows} stands outside {low:.1f}° to "
-                f"{high:.1f}°, where the {group.name} was measured; there it ends, the arm is "
-                "that of the model without it, and the uncertainty grows to its whole size"
-            )
+        low, high = np.degrees([group.low, group.high])
+        yield from _told(
+            c.targets, out,
+            f"{group.follows} stands outside {low:.1f}° to {high:.1f}°, where the {group.name} was "
+            "measured; there it ends, the arm is that of the model without it, and the uncertainty "
+            "grows to its whole size",
+        )  # fmt: skip
     if (shown := arm.shown) is None or arm.model.observe == "distance":
         return
     far = reached & (sure.std > shown.most)
@@ -602,20 +545,16 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         return
     outside = far.copy()
     outside[far] = _std_of_markers(arm, c, far) > shown.most
-    said = f" at most, at measured poses {length(shown.most)})"
-    if (some := far & ~outside).any():
-        yield (
-            f"{_rows(c.targets, some)}: where the {c.point.told} lies on the tool is hardly known "
-            f"(standard deviation {length(sure.std[some].max())}{said}; measure a marker there, "
-            f"or choose a marker that was fitted ({option('point')})"
-        )
-    if outside.any():
-        several = outside.sum() > 1
-        yield (
-            f"{_rows(c.targets, outside)}: {'these targets are' if several else 'this target is'} "
-            f"outside the measured poses (standard deviation "
-            f"{length(sure.std[outside].max())}{said}; measure poses there"
-        )
+    several = outside.sum() > 1
+    for which, told, remedy in (
+        (far & ~outside, f"where the {c.point.told} lies on the tool is hardly known",
+         f"measure a marker there, or choose a marker that was fitted ({option('point')})"),
+        (outside, f"{'these targets are' if several else 'this target is'} outside the measured "
+         "poses", "measure poses there"),
+    ):  # fmt: skip
+        most, at_poses = length(sure.std[which].max(initial=0.0)), length(shown.most)
+        sizes = f"(standard deviation {most} at most, at measured poses {at_poses})"
+        yield from _told(c.targets, which, f"{told} {sizes}; {remedy}")
 
 
 MARKERS_ASKED = 3  # of those on one tool one is as good as another
@@ -626,16 +565,21 @@ def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: BoolArray) -> Arr
     the arm's pose alone leaves unknown."""
     found = np.full(int(rows.sum()), np.inf)
     for name in list(arm.model.cell.tool.markers)[:MARKERS_ASKED]:
-        tool = CalibratedTool(arm, tool_point(arm.model.cell, name))
+        tool = CalibratedTool(arm, calibrated.tool_point(arm.model.cell, name))
         values = tool.rows(c.targets.moved(c.q, c.force))
         found = np.minimum(found, uncertainty_at(tool, [v[rows] for v in values], c.q[rows]).std)
     return found
 
 
-def _rows(targets: Targets, which: NDArray) -> str:
-    """ "targets.csv, line 7 and 3 more" of a mask or of row indices."""
-    rows = np.flatnonzero(which) if which.dtype == bool else which
-    return some((targets.place(int(row)) for row in rows), 1)
+def _told(targets: Targets, which: BoolArray, told: str) -> Iterator[str]:
+    if which.any():
+        yield f"{_rows(targets, np.flatnonzero(which))}: {told}"
+
+
+def _rows(targets: Targets, rows: IntArray) -> str:
+    """ "targets.csv, line 7 and 3 more"."""
+    table = targets.table
+    return some((f"{table.source}, line {table.row[row]}" for row in rows), 1)
 
 
 SCHEMA = "elastocal/compensation/1"
@@ -664,14 +608,14 @@ def check_status(
     lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
     if not lost:
         return
-    kinds = dict.fromkeys(s for _, s in lost)
     # That they are not reached has been said; why is told of each where the reasons differ.
+    kinds = dict.fromkeys(s for _, s in lost)
     same = len(kinds) == 1
     named = some((row if same else f"{row} ({s})" for row, s in lost), NAMED)
-    raise InsufficientDataError(
-        f"{what % (len(lost), len(status))} are not reached: {named}{': ' if same else '. '}"
-        + (remedies[lost[0][1]] if same else "; ".join(f"{k}: {remedies[k]}" for k in kinds))
-        + f". Nothing was written; {option('partial', True)} writes the others"
+    why = "; ".join(remedies[k] if same else f"{k}: {remedies[k]}" for k in kinds)
+    raise messages.InsufficientDataError(
+        f"{what % (len(lost), len(status))} are not reached: {named}{': ' if same else '. '}{why}. "
+        f"Nothing was written; {option('partial', True)} writes the others"
     )
 
 
@@ -685,7 +629,7 @@ def commands_csv(result: Compensation) -> str:
         blocks.append((["force_x_N", "force_y_N", "force_z_N"], result.force, ".9g"))
     for name in ("time", "approach", "temperature", "torque"):
         if (values := getattr(table, name)) is not None:
-            units = families(kinds)[name].units
+            units = measurements.families(kinds)[name].units
             heads = [column(stem, of[0]) for stem, of in units.items()]
             blocks.append((heads, values.reshape(len(table), -1), ".12g"))
     change = held * in_file_units(result.q - result.nominal, kinds)

@@ -14,15 +14,8 @@ from elastocal import compensation as single
 from elastocal.identification.prediction import Uncertainty
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import listed, option, require, rounded
-from elastocal.model.calibrated import (
-    CalibratedArm,
-    CalibratedTool,
-    Conditions,
-    ToolPoint,
-    lasting,
-    numbers,
-    unstated_needs,
-)
+from elastocal.model import calibrated
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, Conditions, ToolPoint, numbers
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.base import COLUMNS
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -113,7 +106,7 @@ def correction_table(
     from scipy.interpolate import RegularGridInterpolator
     from scipy.stats import qmc
 
-    kept, points = lasting(arm)[0], grid.points()
+    kept, points = calibrated.lasting(arm)[0], grid.points()
     sided, tool = _sided(kept), CalibratedTool(kept, point)
     if force is not None and frame == "tracker":
         (T, *_), _, _ = tool.frames(tool.rows(_targets(arm, grid, points[:1], None).table))
@@ -152,7 +145,7 @@ def _sided(arm: CalibratedArm) -> tuple[str, ...]:
     """That the direction of the last motion is left out, where it counts.  Raises InputError where
     an effect of the arm follows what else a table of corrections cannot know."""
     sided: tuple[str, ...] = ()
-    for name, needs in unstated_needs(arm, Conditions()).items():
+    for name, needs in calibrated.unstated_needs(arm, Conditions()).items():
         columns = listed(COLUMNS[need] for need in needs)
         told = f"{option('table')}: corrections hold at any time, and {name} follows {columns}"
         remedy = "give a table of targets with that column, or identify without the effect"
@@ -206,12 +199,11 @@ def _mostly_inexact(
 def _targets(
     arm: CalibratedArm, grid: CorrectionGrid, points: Array, force: Array | None
 ) -> single.Targets:
-    turned = None if grid.rotation is None else np.tile(grid.rotation, (len(points), 1, 1))
+    n = len(points)
+    turned = None if grid.rotation is None else np.tile(grid.rotation, (n, 1, 1))
     place, q = (None, points) if grid.joints else (points, None)
     targets = single.targets_at(option("table"), place, turned, "base", force, q)
-    n = len(points)
-    line = np.empty(n, dtype=np.int64)  # of each in the file, below its header
-    line[np.lexsort(points.T[::-1])] = np.arange(2, n + 2)
+    line = np.argsort(np.lexsort(points.T[::-1])) + 2  # of each in the file, below its header
     # By columns of the time the base alone may move, and the targets with it.
     time = np.zeros(n) if arm.model.cell.model.clock == "column" else None
     side = np.zeros((n, arm.model.chain.n_joints))
@@ -235,11 +227,8 @@ def _corrections(
     usable = np.isfinite(achieved.position).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
     correction = np.where(close[:, None], exact, first_order)
     correction[~(close | usable)] = np.nan
-    status = tuple(
-        EXACT if close[i] else FIRST_ORDER if usable[i] else result.status[i]
-        for i in range(len(close))
-    )
-    return correction, status
+    status = np.where(close, EXACT, np.where(usable, FIRST_ORDER, result.status))
+    return correction, tuple(status.tolist())
 
 
 def _achieved(tool: CalibratedTool, result: single.Compensation, q: Array) -> single.Goals:
@@ -269,15 +258,13 @@ def _with_table(
     if aimed.rotation is not None:
         turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix()
         flange = (turned @ aimed.rotation @ check.turned.transpose(0, 2, 1))[known]
-    limits = np.full(tool.chain.n_joints, -np.inf), np.full(tool.chain.n_joints, np.inf)
-    controller = Reaching(tool.chain, moved[known], flange, check.place[0], None, *limits)
+    wide = np.full(tool.chain.n_joints, np.inf)
+    controller = Reaching(tool.chain, moved[known], flange, check.place[0], None, -wide, wide)
     q = check.nominal.copy()
     q[known] = controller.solve(q[known], np.arange(len(known)))[0]
-    errors = []
-    for joints in (check.nominal, q):
-        off = _between(_achieved(tool, check, joints), aimed)[known]
-        errors.append(np.column_stack([np.linalg.norm(off[:, k : k + 3], axis=1) for k in (0, 3)]))
-    return errors[0], errors[1]
+    off = (_between(_achieved(tool, check, joints), aimed)[known] for joints in (check.nominal, q))
+    before, after = (np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in off)
+    return before, after
 
 
 def posture_of(arm: CalibratedArm, text: str | None) -> Array | None:
@@ -330,12 +317,10 @@ def summary_and_csv(
     """Summary of the correction table, and the table as CSV; refused where points are not
     reached and `partial` does not allow for that."""
     kinds = arm.model.chain.kinds
+    heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
     if found.grid.joints:
         heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
-    else:
-        heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
-    known = np.all(np.isfinite(found.correction), axis=1).tolist()
-    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
+    known = np.isfinite(found.correction).all(axis=1)
     # A grid point has no line in any file of the user's: it is named by where it lies.
     named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
     what = f"{option('table')}: %d of %d grid points ({', '.join(heads)})"
@@ -348,7 +333,8 @@ def summary_and_csv(
         "no equilibrium": f"no static equilibrium under this load: check {option('load')}",
     }
     if not partial:
-        single.check_status(what, named, plain, EXACT, remedies)
+        status = np.where(known, EXACT, found.status).tolist()
+        single.check_status(what, named, status, EXACT, remedies)
     order = np.lexsort(found.points.T[::-1])
     moved, turned = found.correction[order, :3] * 1e3, np.degrees(found.correction[order, 3:])
     blocks = [(heads, points[order], ".9g"), (["dx_mm", "dy_mm", "dz_mm"], moved, ".7f")]

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,14 +20,8 @@ from elastocal.files import atomic_write
 from elastocal.measurements import Measurements, load_states, numbered, visits, with_moves
 from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, wish
 from elastocal.model.calibrated import Conditions, random_table
+from elastocal.model.effects import statics
 from elastocal.model.effects.base import Parameter, index
-from elastocal.model.effects.statics import (
-    RATED_WIND_UP,
-    JointCompliance,
-    rated_torque,
-    usual_over_stated_mass,
-    weight_torque,
-)
 from elastocal.model.manipulator import NOMINAL, Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
@@ -68,11 +62,10 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
     """
     drawn, shown = {}, None
     for k, p in enumerate(model.parameters):
-        size = p.typical if p.typical is not None else 0.2 * abs(p.nominal)
-        if p.effect == JointCompliance.name:
-            size = 0.2 * abs(p.nominal)
+        compliance = p.effect == statics.JointCompliance.name
+        size = 0.2 * abs(p.nominal) if compliance or p.typical is None else p.typical
         step = scale * float(rng.normal())
-        if p.effect == JointCompliance.name and size == 0.0 and (usual := _usual(model, p)):
+        if compliance and size == 0.0 and (usual := _usual(model, p)):
             drawn[p.name] = scale * usual * math.exp(0.2 * step / scale) if scale else 0.0
             continue
         if size == 0.0 and p.typical is None and scale:
@@ -85,10 +78,10 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
 def _usual(model: Model, p: Parameter) -> float:
     """The compliance that arms have where `identify` expects one (`load_ratio`); 0 elsewhere."""
     i = index(p.where)
-    if model.chain.kinds[i] != "revolute" or not weight_torque(model.chain, i) > 0:
+    if model.chain.kinds[i] != "revolute" or not statics.weight_torque(model.chain, i) > 0:
         return 0.0
-    torque = usual_over_stated_mass(model.chain) * (rated_torque(model.chain, model.cell, i) or 0.0)
-    return RATED_WIND_UP / torque
+    rated = statics.rated_torque(model.chain, model.cell, i) or 0.0
+    return statics.RATED_WIND_UP / (statics.usual_over_stated_mass(model.chain) * rated)
 
 
 def _sizes_shown(model: Model) -> Array:
@@ -128,21 +121,13 @@ def expand_plan(
         require(not plan.force.any(), f"{plan.source}: {told}")
         forces = [plan.force, plan.force + load]
     stated = plan.marker_names == marker_names and plan.marker.any()
-    parts = [
-        (i, r, f, m)
-        for i in range(len(plan))
-        for r in range(repeats)
-        for f in range(len(forces))
-        for m in ([plan.marker[i]] if stated else range(len(marker_names)))
-    ]
-    index, repeat, state, marker = (np.array(v) for v in zip(*parts, strict=True))
+    shape = len(plan), repeats, len(forces), 1 if stated else len(marker_names)
+    index, repeat, state, marker = (part.ravel() for part in np.indices(shape))
     rows = replace(
-        plan.take(index),
-        repeat=plan.repeat[index] * repeats + repeat,
-        marker=marker,
-        marker_names=marker_names,
+        plan.take(index), repeat=plan.repeat[index] * repeats + repeat,
+        marker=plan.marker[index] if stated else marker, marker_names=marker_names,
         force=np.stack(forces)[state, index],
-    )
+    )  # fmt: skip
     return with_moves(rows)
 
 
@@ -263,22 +248,11 @@ SEED = 2013
 UNSEEN_COMPLIANCE = 0.35e-6  # rad/(N m); joint 1, which a vertical load cannot show
 
 
-@dataclass(frozen=True)
-class Demo:
-    """What the demo did: its files, the true values, and what was found."""
-
-    cell: Path
-    plan: Path
-    data: Path
-    truth: dict[str, float]
-    published: dict[str, tuple[float, float]]
-    result: Calibration
-
-
 def run_demo(
     folder: Path, seed: int = SEED, progress: Callable[[str], None] = lambda message: None
-) -> Demo:
-    """Table 2's poses, Table 1's noise and Table 3's WLS compliances, measured and identified.
+) -> tuple[Calibration, dict[str, float], dict[str, tuple[float, float]]]:
+    """Table 2's poses, Table 1's noise and Table 3's WLS compliances, measured and identified: the
+    result, the true values, and those published.
 
     Writes cell, robot, plan and data into `folder`, so that every step can be repeated by hand.
     Table 1 states the spread of deflections, the difference of two readings, so each reading
@@ -288,21 +262,20 @@ def run_demo(
     from elastocal.identification.identify import identify
 
     progress("copying the example")
-    cell_path, plan_path = _copy_example(folder)
-    model = Model(cell_path)
-    plan = model.read_plan(plan_path)
+    _copy_example(folder)
+    model = Model(folder / "cell.toml")
+    plan = model.read_plan(folder / "plan.csv")
     rows = expand_plan(plan, tuple(model.cell.tool.markers), REPEATS, np.array(LOAD_N))
     rows = replace(rows, sigma=reading_sigma(folder)[rows.configuration])
     truth, published = published_compliances(folder)
     progress(f"measuring {len(rows)} simulated readings")
     table = simulate(model, rows, values_from(model, truth), seed)
-    data_path = folder / "data.csv"
-    table.save(data_path)
-    result = identify(model, replace(table, source=str(data_path)), progress=progress)
-    return Demo(cell_path, plan_path, data_path, truth, published, result)
+    table.save(data := folder / "data.csv")
+    result = identify(model, replace(table, source=str(data)), progress=progress)
+    return result, truth, published
 
 
-def _copy_example(folder: Path) -> tuple[Path, Path]:
+def _copy_example(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
@@ -318,18 +291,12 @@ def _copy_example(folder: Path) -> tuple[Path, Path]:
         raise InputError(f"{path} is not the demo's and would be written over; name another folder")
     for path in own:
         atomic_write(folder / path.name, path.read_text(encoding="utf-8"))
-    return folder / "cell.toml", folder / "plan.csv"
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="", encoding="utf-8") as handle:
-        return list(csv.DictReader(handle))
 
 
 def reading_sigma(folder: Path) -> np.ndarray:
     """Standard deviation (configurations, 3) in m of one reading, from Table 1."""
-    table = _rows(folder / "table1_noise.csv")
-    deflection = np.array([[float(row[f"sigma_{a}_um"]) for a in "xyz"] for row in table])
+    table = np.genfromtxt(folder / "table1_noise.csv", delimiter=",", names=True)
+    deflection = np.column_stack([table[f"sigma_{a}_um"] for a in "xyz"])
     return deflection * 1e-6 / np.sqrt(2)
 
 
@@ -337,13 +304,12 @@ def published_compliances(folder: Path) -> tuple[dict[str, float], dict[str, tup
     """True values in rad/(N m), and the published OLS value with its ±3σ, by parameter name."""
     truth = {"joint1.compliance": UNSEEN_COMPLIANCE}
     published = {}
-    for row in _rows(folder / MARK):
-        key = row["parameter"]
-        joint, level = key[1], key[2:]
-        name = f"joint{joint}.compliance" + (f"_level{level}" if level else "")
-        truth[name] = float(row["wls_urad_per_Nm"]) * 1e-6
-        published[name] = (
-            float(row["ols_urad_per_Nm"]) * 1e-6,
-            float(row["ols_ci3sigma_urad_per_Nm"]) * 1e-6,
-        )
+    with open(folder / MARK, newline="", encoding="utf-8") as handle:
+        for row in csv.DictReader(handle):
+            joint, level = row["parameter"][1], row["parameter"][2:]
+            name = f"joint{joint}.compliance" + (f"_level{level}" if level else "")
+            wls, *ols = (
+                float(row[f"{key}_urad_per_Nm"]) * 1e-6 for key in ("wls", "ols", "ols_ci3sigma")
+            )
+            truth[name], published[name] = wls, (ols[0], ols[1])
     return truth, published

@@ -45,22 +45,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from elastocal import __version__
+from elastocal import __version__, messages
 from elastocal.config import Table, checked, read_toml
 from elastocal.files import atomic_write, read_bytes, read_json, read_text
-from elastocal.messages import (
-    ElastocalError,
-    InputError,
-    check_known,
-    did_you_mean,
-    json_text,
-    listed,
-    option,
-    printable,
-    quoted,
-    raised_at,
-    require,
-)
+from elastocal.messages import ElastocalError, InputError, listed, option, quoted, require
 from elastocal.screen import StudyStop, shown
 
 if TYPE_CHECKING:
@@ -166,7 +154,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
         key, equals, written = (part.strip() for part in text.partition("="))
         here = option("options", text)
         require(equals, f"{option('options')} takes KEY=VALUE; found {quoted(text)}")
-        check_known(key, options, f"{here}: {path} has no option {quoted(key)}", "it has")
+        messages.check_known(key, options, f"{here}: {path} has no option {quoted(key)}", "it has")
         default, value = defaults[key], None
         with suppress(tomllib.TOMLDecodeError):
             value = tomllib.loads(f"value = {written}")["value"]
@@ -191,15 +179,12 @@ def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
     told = f"tasks() gives more than {MAX_TASKS} tasks with these options; let each do more"
     require(len(found) <= MAX_TASKS, f"{script}: {told}")
     for index, task in enumerate(found):
-        where = f"{script}, task {index}"
-        if not isinstance(task, Mapping):
-            kind = type(task).__name__
-            raise InputError(f"{where}: is a {kind}; tasks() gives a dict for each task")
+        where, kind = f"{script}, task {index}", type(task).__name__
+        told = f"{where}: is a {kind}; tasks() gives a dict for each task"
+        require(isinstance(task, Mapping), told)
         for key in task:
-            require(
-                isinstance(key, str) and key not in RESERVED,
-                f"{where}: {quoted(key)} cannot be a key; keys are text, and {TAKEN}",
-            )
+            told = f"{where}: {quoted(key)} cannot be a key; keys are text, and {TAKEN}"
+            require(isinstance(key, str) and key not in RESERVED, told)
             told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
             require(key not in stated.columns, told)
         values = json.loads(_json(where, dict(task)))
@@ -263,7 +248,7 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
         raise
     except (Exception, SystemExit) as error:
         own, nowhere = folder.resolve(), (folder.resolve() / "study.py", 1)
-        file, line = raised_at(error, lambda f: Path(f).is_relative_to(own)) or nowhere
+        file, line = messages.raised_at(error, lambda f: Path(f).is_relative_to(own)) or nowhere
         raise InputError(
             f"{file}, line {line}: {what} raised {type(error).__name__}: {error}; correct it there"
         ) from error
@@ -285,10 +270,8 @@ def execute(sources: Sources, task: Row) -> Row:
     draws = np.random.SeedSequence(sources.stated.seed, spawn_key=(task["task"],))
     try:
         if sources.version != __version__:
-            raise RuntimeError(
-                f"this worker has elastocal {__version__}, the study was started with "
-                f"{sources.version}; install the same there"
-            )
+            told = f"this worker has elastocal {__version__}, the study was started with"
+            raise RuntimeError(f"{told} {sources.version}; install the same there")
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
         rows = _checked_rows(found, sources.stated.columns, task["values"])
     except (Exception, SystemExit) as caught:
@@ -305,10 +288,9 @@ def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row
         if name in task:
             raise ValueError(f"run() returned {name!r}, which is a value of the task itself")
         if name not in columns:
-            raise ValueError(
-                f"run() returned {name!r}{did_you_mean(str(name), columns)}, which [columns] "
-                f"of study.toml does not list (there are {listed(columns)})"
-            )
+            told = f"which [columns] of study.toml does not list (there are {listed(columns)})"
+            hint = messages.did_you_mean(str(name), columns)
+            raise ValueError(f"run() returned {name!r}{hint}, {told}")
     return [{n: _plain(n, row.get(n), unit) for n, unit in columns.items()} for row in rows]
 
 
@@ -390,11 +372,9 @@ def result_lines(folder: Path) -> list[Row]:
         except (ValueError, KeyError, TypeError) as error:
             told = f"{here}: is damaged ({error}); delete it, and its task runs again"
             raise InputError(told) from None
-        require(
-            index not in found,
-            f"{here}: task {index} has more than one result; results of two runs were put "
-            f"together: remove one, or run with {option('restart', True)}",
-        )
+        if index in found:
+            told = f"{here}: task {index} has more than one result; results of two runs were put"
+            raise InputError(f"{told} together: remove one, or run with {option('restart', True)}")
         found[index] = line
     return [found[index] for index in sorted(found)]
 
@@ -526,9 +506,12 @@ def _security(
     Dask's configuration.  Whoever stands between could run code of their own here and there: tasks
     and results are pickles.  So another host is reached by TLS only, unless `unencrypted` allows
     it."""
-    given = {name: path for name, path in files.items() if path is not None}
-    for name, path in given.items():
-        read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
+    keys = {"tls_ca": "tls_ca_file", "tls_cert": "tls_client_cert", "tls_key": "tls_client_key"}
+    given = {}
+    for name, path in files.items():
+        if path is not None:
+            read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
+            given[keys[name]] = str(path)
     scheme, _, rest = address.rpartition("://")
     host = rest.rsplit(":", 1)[0].strip("[]")
     here = scheme == "inproc" or host == "localhost"
@@ -541,8 +524,7 @@ def _security(
         f"{option('tls_ca')}, {option('tls_cert')} and {option('tls_key')}, a tunnel to this "
         f"host, or allow it with {option('unencrypted', True)}",
     )
-    keys = {"tls_ca": "tls_ca_file", "tls_cert": "tls_client_cert", "tls_key": "tls_client_key"}
-    return distributed.Security(**{keys[name]: str(path) for name, path in given.items()})
+    return distributed.Security(**given)
 
 
 def connect(address: str, **way: Any) -> Any:
@@ -550,10 +532,8 @@ def connect(address: str, **way: Any) -> Any:
         import dask
         import distributed
     except ImportError:
-        here = option("cluster", "ADDRESS")
-        raise InputError(
-            f"{here} needs dask.distributed; run: pip install 'elastocal[cluster]'"
-        ) from None
+        told = f"{option('cluster', 'ADDRESS')} needs dask.distributed; run: pip install"
+        raise InputError(f"{told} 'elastocal[cluster]'") from None
     where = dask.config.get("scheduler-address", None) if address == "config" else address
     require(
         where is not None,
@@ -561,17 +541,15 @@ def connect(address: str, **way: Any) -> Any:
         "DASK_SCHEDULER_ADDRESS or scheduler-address, or give "
         f"{option('cluster', 'tcp://HOST:8786')}",
     )
-    here, security = option("cluster", where), _security(distributed, str(where), **way)
+    security = _security(distributed, str(where), **way)
     # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         return distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        raise InputError(
-            f"{here}: no scheduler answers ({error}); check the address, or "
-            "start one for this host alone: dask scheduler"
-        ) from None
+        told = f"no scheduler answers ({error}); check the address, or start one for this host"
+        raise InputError(f"{option('cluster', where)}: {told} alone: dask scheduler") from None
 
 
 @dataclass(frozen=True)
@@ -626,7 +604,7 @@ def run_study(
             "options": stated.options, "tasks": len(study.tasks), "columns": stated.columns,
             "sources": study.sources.digests, "elastocal": __version__,
         }  # fmt: skip
-        atomic_write(folder / STATEMENT, json_text(statement) + "\n")
+        atomic_write(folder / STATEMENT, messages.json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)
         progress(total, ended, failed)
@@ -647,10 +625,8 @@ def run_study(
 def _known(study: Study, folder: Path) -> list[Row]:
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
     before, columns = statement_of(folder), study.sources.stated.columns
-    require(
-        before.get("columns", columns) == columns,
-        f"{folder}: has other columns, types or units than the study now. {here}",
-    )
+    told = f"{folder}: has other columns, types or units than the study now. {here}"
+    require(before.get("columns", columns) == columns, told)
     lines = result_lines(folder)
     for line in lines:
         at = line["task"]
@@ -662,18 +638,15 @@ def _known(study: Study, folder: Path) -> list[Row]:
 
 
 def _changes(now: Study, before: dict[str, Any]) -> list[str]:
-    told, stated = [], now.sources.stated
-    sources, digests = before.get("sources", {}), now.sources.digests
+    stated, digests = now.sources.stated, now.sources.digests
+    sources, options = before.get("sources", {}), before.get("options", {})
     changed = [n for n in sorted({*sources, *digests}) if sources.get(n) != digests.get(n)]
-    if sources and changed:
-        told.append(f"{', '.join(changed)} changed since")
-    if before.get("seed", stated.seed) != stated.seed:
-        told.append(f"the seed was {before['seed']}, now it is {stated.seed}")
-    options = before.get("options", {})
-    for name, value in stated.options.items():
-        if options.get(name, value) != value:
-            told.append(f"option {name} was {quoted(options[name])}, now it is {quoted(value)}")
-    return told
+    told = [f"{', '.join(changed)} changed since"] if sources and changed else []
+    both = {"the seed": (before.get("seed", stated.seed), stated.seed)}
+    both |= {f"option {n}": (options.get(n, v), v) for n, v in stated.options.items()}
+    was = (f"{name} was {quoted(old)}, now it is {quoted(new)}" for name, (old, new) in both.items()
+           if old != new)  # fmt: skip
+    return [*told, *was]
 
 
 def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
@@ -688,6 +661,6 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     if not isinstance(text, str):
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
-    lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    atomic_write(page, "\n".join(lines) + "\n")
+    lines = map(messages.printable, text.rstrip("\n").split("\n"))
+    atomic_write(page, "\n".join(lines).replace("\\t", "\t") + "\n")
     return text

@@ -116,8 +116,8 @@ def test_an_origin_is_changed_where_it_stands(tmp_path: Path) -> None:
     text.set_in(joints["q2"], "origin", {"xyz": "1 1 1", "rpy": "2 2 2"})
     text.set_in(joints["q>1"], "child", {"link": "d"})
     text.insert(text.end, '<link name="d"/>')
-    expected = ODD.replace("rpy='0 0 0'\n       xyz=\"1 2 3\"", 'rpy="7 8 9"\n       xyz="4 5 6"')
-    expected = expected.replace('<child\n     link="b"/>', '<child\n     link="d"/>')
+    expected = ODD.replace("rpy='0 0 0'\n       xyz=\"1 2 3\" />", 'rpy="7 8 9" xyz="4 5 6"/>')
+    expected = expected.replace('<child\n     link="b"/>', '<child link="d"/>')
     expected = expected.replace(
         'type="fixed">', 'type="fixed"><origin xyz="1 1 1" rpy="2 2 2"/>'
     ).replace("</robot>", '<link name="d"/></robot>')

@@ -537,17 +537,16 @@ def demo(folder: Output = Path("demo_out"), seed: Seed = 2013, *, run: Run) -> N
 
     result, report = folder / "result.json", folder / "report.html"
     with run.progress() as progress:
-        done = run_demo(folder, seed, progress)
-        inputs = [done.cell, done.plan, done.data]
+        found, truth, published = run_demo(folder, seed, progress)
+        inputs = [folder / name for name in ("cell.toml", "plan.csv", "data.csv")]
         with together():
-            done.result.save(result)
-            write_page(done.result, report, inputs, repeated(), seed, truth=done.truth,
-                       published=done.published)  # fmt: skip
+            found.save(result)
+            write_page(found, report, inputs, repeated(), seed, truth=truth, published=published)
     if run.answer(
-        lambda: done.result.to_json() | {"truth": done.truth},
-        lambda screen: print_report(screen, done.result, details=False, truth=done.truth),
+        lambda: found.to_json() | {"truth": truth},
+        lambda screen: print_report(screen, found, details=False, truth=truth),
     ):
         say(
-            f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
+            f"\nTo repeat it by hand: elastocal identify {inputs[0]} {inputs[2]} -o result.json\n"
             f"Report to open: {report.absolute()}"
         )

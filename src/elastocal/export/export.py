@@ -10,12 +10,14 @@ import math
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from elastocal import messages
 from elastocal.above import checked_arguments
 from elastocal.cell_tables import Convention, Robot
 from elastocal.export import exportable, robot_files
@@ -23,17 +25,7 @@ from elastocal.export.robot_files import MujocoRest, NotInPlace
 from elastocal.files import atomic_write, together
 from elastocal.identification.least_squares import t_quantile
 from elastocal.measurements import Measurements
-from elastocal.messages import (
-    ElastocalError,
-    did_you_mean,
-    json_text,
-    length,
-    listed,
-    option,
-    plain,
-    require,
-    rounded,
-)
+from elastocal.messages import ElastocalError, listed, option, plain, require, rounded
 from elastocal.model import dh
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain, Joint, joint_index
@@ -84,26 +76,19 @@ class Wish:
                 told = f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
                 require(low <= value <= high, told)
         given_force(self.load)
-        require(
-            2 <= self.poses <= MOST_POSES,
-            f"{option('poses')} takes a whole number from 2 to {MOST_POSES:,}; found {self.poses}",
-        )
+        told = f"takes a whole number from 2 to {MOST_POSES:,}; found {self.poses}"
+        require(2 <= self.poses <= MOST_POSES, f"{option('poses')} {told}")
 
     @property
     def kind(self) -> str:
         """The format: as asked for, or by the file's ending."""
-        ending = ENDINGS.get(self.path.suffix.lower(), "")
+        ending, known = ENDINGS.get(self.path.suffix.lower(), ""), ", ".join(FORMATS)
         found = ending if self.format is None else self.format.lower()
-        require(
-            self.format is not None or ending,
-            f"{self.path}: the ending '{self.path.suffix}' names no known format; use one of "
-            f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}",
-        )
-        require(
-            found in FORMATS,
-            f"{option('format')} takes one of {', '.join(FORMATS)}; found '{self.format}'"
-            f"{did_you_mean(found, FORMATS)}",
-        )
+        told = f"the ending '{self.path.suffix}' names no known format; use one of"
+        ways = f"{', '.join(ENDINGS)}, or name it by {option('format')}: {known}"
+        require(self.format is not None or ending, f"{self.path}: {told} {ways}")
+        told = f"takes one of {known}; found '{self.format}'{messages.did_you_mean(found, FORMATS)}"
+        require(found in FORMATS, f"{option('format')} {told}")
         return found
 
 
@@ -179,11 +164,9 @@ def export(
         require(not given or wish.kind in formats, said)
     # The visits measured, where they are known, count under the load that was asked for.
     visits, force = calibrated.visits, given_force(wish.load)
-    require(
-        visits is not None or not wish.correct_joints,
-        f"{calibrated.source} does not say where the arm was measured, which "
-        f"{option('joint_correction')} needs; identify anew",
-    )
+    known = visits is not None or not wish.correct_joints
+    lack = f"does not say where the arm was measured, which {option('joint_correction')} needs;"
+    require(known, f"{calibrated.source} {lack} identify anew")
     if visits is not None and force is not None:
         visits = replace(visits, force=np.broadcast_to(force, visits.force.shape))
     force = np.zeros(3) if force is None else force
@@ -297,7 +280,7 @@ class _Writing:
             "geometry_alone": self.done.cost.to_json(),
         }  # fmt: skip
         if self.wish.kind == "json":
-            return self.done.written(json_text(document) + "\n")
+            return self.done.written(messages.json_text(document) + "\n")
         import yaml
 
         text = yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=np.inf)
@@ -332,11 +315,8 @@ class _Writing:
                         *((angle, "") if group.lasting else ("", time)),
                         str(number + 1), MICRO.get(unit, unit), *micro,
                     ))  # fmt: skip
-        require(
-            rows,
-            f"{self.calibrated.source}: this arm has no smooth function to be written as "
-            "corrections; elastocal diagnose finds those that the readings show",
-        )
+        told = "this arm has no smooth function to be written as corrections; elastocal diagnose"
+        require(rows, f"{arm.source}: {told} finds those that the readings show")
         return self.done.written(csv_text(CORRECTIONS_HEADER, rows, [self.note]))
 
     @property
@@ -368,11 +348,11 @@ class _Writing:
             ends = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
         else:
             text, ends = robot_files.new_urdf(*how), robot_files.NEW_ENDS
+            kept = ", or export as .xml, which keeps those of the model" * (robot.mjcf is not None)
             told = [
                 "inertia tensors are zero in this file: of the links masses and their centres "
                 "alone are known. Its kinematics and weights are right; before simulating motion "
-                "put in tensors"
-                + (", or export as .xml, which keeps those of the model" * (robot.mjcf is not None))
+                f"put in tensors{kept}"
                 if self.pieces.masses or self.pieces.chain.masses
                 else "the links have no <inertial> in this file, as their masses are not known"
             ]
@@ -413,9 +393,7 @@ class _Writing:
                 "identify anew for an arm with weights"
             )
         warnings += self.rigid_joints(f" (gain {robot_files.RIGID:g})")
-        try:
-            import mujoco  # noqa: F401
-        except ImportError:
+        if find_spec("mujoco") is None:
             lack = "not read back: MuJoCo is not installed (pip install elastocal[mujoco])"
             return self.done.written(text, *warnings, lack)
         placed = pieces.T_tracker_base if self.wish.base_frame else np.eye(4)
@@ -489,8 +467,7 @@ class _Writing:
             four = [(name, joint, row * [1, 1, 1, 1, 0]) for name, joint, row in lines]
             beta = checked(dh_csv(four), largest=np.inf)
             comments.append(f"without the column beta_rad: {rounded(beta * 1e6)} um")
-        text = dh_csv(lines, comments)
-        checked(text)
+        checked(text := dh_csv(lines, comments))
         done = replace(self.done, without_beta=beta)
         return done.written(text, read=(apart, "elastocal's own reader of DH tables"))
 
@@ -504,10 +481,8 @@ def _apart(found: Array, expected: Array, largest: float = LARGEST) -> float:
 
 def _accepted(distance: float, largest: float) -> float:
     if not distance <= largest:
-        raise ElastocalError(
-            f"the written file, read back, is {length(distance)} from the model and was "
-            "not kept; please report this robot description"
-        )
+        told = f"read back, is {messages.length(distance)} from the model and was not kept"
+        raise ElastocalError(f"the written file, {told}; please report this robot description")
     return distance
 
 
@@ -558,9 +533,8 @@ def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Arr
     with the smaller θ.  Turns of `like` beyond π are kept.  Of nearly parallel axes d is that of
     `like`, else `height`.
     """
-    skew = math.hypot(T[0, 2], T[1, 2]) > NEARLY_PARALLEL
     alike, height = (0.0, height) if like is None else like[:2].tolist()
-    ways = [_skew(T, s) if skew else _parallel(T, s, height, alike) for s in (1.0, -1.0)]
+    ways = [_row(T, sign, height, alike) for sign in (1.0, -1.0)]
 
     def away(row: Array) -> float:
         if like is None:
@@ -573,18 +547,15 @@ def split(T: Array, like: Array | None = None, height: float = 0.0) -> tuple[Arr
     return row, np.asarray(np.linalg.solve(transform(row), T), dtype=np.float64)
 
 
-def _skew(T: Array, sign: float) -> Array:
+def _row(T: Array, sign: float, d: float, alike: float) -> Array:
+    """With its d, and `alike` as θ where any will do, where the axes are nearly parallel."""
     z, p = T[:3, 2], T[:3, 3]
-    theta = math.atan2(sign * z[0], -sign * z[1])
-    x = np.array([math.cos(theta), math.sin(theta), 0.0])
-    alpha = math.atan2(sign * math.hypot(z[0], z[1]), z[2])
-    # p = d·z₀ + a·x + h·z: the common normal meets both axes.
-    d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
-    return np.array([theta, d, a, alpha, 0.0])
-
-
-def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
-    z, p = T[:3, 2], T[:3, 3]
+    if (across := math.hypot(z[0], z[1])) > NEARLY_PARALLEL:
+        theta = math.atan2(sign * z[0], -sign * z[1])
+        x = np.array([math.cos(theta), math.sin(theta), 0.0])
+        # p = d·z₀ + a·x + h·z: the common normal meets both axes.
+        d, a, _ = np.linalg.solve(np.column_stack([[0.0, 0.0, 1.0], x, z]), p)
+        return np.array([theta, d, a, math.atan2(sign * across, z[2]), 0.0])
     foot = p - (p[2] - d) / z[2] * z  # where the second axis passes through the height d
     a = sign * math.hypot(foot[0], foot[1])
     theta = math.atan2(sign * foot[1], sign * foot[0])
@@ -592,10 +563,8 @@ def _parallel(T: Array, sign: float, d: float, alike: float) -> Array:
         theta, a = alike, 0.0
     # z = Rz(θ) Rx(α) Ry(β) e_z = Rz(θ) (sin β, −sin α cos β, cos α cos β)
     c, s = math.cos(theta), math.sin(theta)
-    u = (c * z[0] + s * z[1], -s * z[0] + c * z[1], z[2])
-    alpha = math.atan2(-u[1], u[2])
-    beta = math.atan2(u[0], math.hypot(u[1], u[2]))
-    return np.array([theta, d, a, alpha, beta])
+    x, y = c * z[0] + s * z[1], c * z[1] - s * z[0]
+    return np.array([theta, d, a, math.atan2(-y, z[2]), math.atan2(x, math.hypot(y, z[2]))])
 
 
 # The calibrated arm as a Denavit–Hartenberg table, standard or modified.
@@ -646,15 +615,14 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     beta_rad stands there only where a row needs it; limits are those of commanded values; comments
     begin with #.
     """
-    found = []
+    found = list[dict[str, str]]()
     for name, joint, row in lines:
-        numbers = zip(HEADER[2:], row.tolist(), strict=True)
-        cells = {header: repr(value + 0.0) for header, value in numbers}
+        stated = dict(zip(HEADER[2:], row.tolist(), strict=True))
         if joint is not None:
-            ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
-            cells |= {end: repr(value + 0.0) for end, value in ends if math.isfinite(value)}
+            stated |= zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
         kind = dh.FIXED if joint is None else joint.kind
-        found.append(cells | dict(zip(HEADER[:2], (name, kind), strict=True)))
+        numbers = {k: repr(value + 0.0) for k, value in stated.items() if math.isfinite(value)}
+        found.append({"joint": name, "type": kind} | numbers)
     bounded = {name for cells in found for name in cells}
     limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
     with_beta = any(row[4] for _, _, row in lines)

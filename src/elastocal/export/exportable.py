@@ -28,7 +28,7 @@ from elastocal.model.calibrated import (
     table_at,
     unstated_needs,
 )
-from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_limits
+from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.base import Format, Spring, row_inputs
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.effects.geometry import JointOffset, LinkGeometry
@@ -101,22 +101,20 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     instrument = tuple(name for name in calibrated.effects if CATALOGUE[name].of_the_measurement)
     unstated = unstated_needs(calibrated, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
-    full = arm_with(calibrated, stated)
+    full, omissions = arm_with(calibrated, stated), list[Omission]()
     format: Format = "elastic" if elastic else "rigid"
-    kept, omissions = [], []
-    for name in stated:
-        # Values that no physical spring or body has stay out, with the reason.
-        args = full.values, full.model.chain, full.model.cell
-        reason = CATALOGUE[name].unphysical(*args) if elastic else ""
-        if format in CATALOGUE[name].formats and not reason:
-            kept.append(name)
-        else:
-            omissions.append(Omission(name, reason, arm_with(calibrated, set(stated) - {name})))
     for name, needs in unstated.items():
         if needs:
             missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
             omissions.append(Omission(name, f"no cost without {missing}", None))
-    exported = full if len(kept) == len(stated) else arm_with(calibrated, kept)
+            continue
+        # Values that no physical spring or body has stay out, with the reason.
+        args = full.values, full.model.chain, full.model.cell
+        reason = CATALOGUE[name].unphysical(*args) if elastic else ""
+        if reason or format not in CATALOGUE[name].formats:
+            omissions.append(Omission(name, reason, arm_with(calibrated, set(stated) - {name})))
+    lost = {omission.effect for omission in omissions}
+    exported = arm_with(calibrated, set(stated) - lost) if lost & set(stated) else full
     if elastic:
         exported, changed = _as_springs(exported)
         omissions += [Omission(e, told, _as_springs(full, e)[0]) for e, told in changed]
@@ -192,10 +190,9 @@ class ExportNumbers:
 
     def error(self, i: int) -> Array:
         """E (4, 4) of link i (0-based): calibrated = nominal distal frame · E."""
-        nominal = self.chain.link_ends[i]
-        if np.array_equal(nominal, self.links[i]):
-            return np.eye(4)
-        return np.asarray(np.linalg.solve(nominal, self.links[i]))
+        nominal, own = self.chain.link_ends[i], self.links[i]
+        same = np.array_equal(nominal, own)
+        return np.eye(4) if same else np.asarray(np.linalg.solve(nominal, own))
 
     def correction(self, i: int) -> Array:
         """E_{i−1} J_i(a_i) (4, 4) of joint i (0-based)."""
@@ -251,8 +248,7 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
 
 def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple[LinkMass, ...]:
     """With what `link_mass_error` found missing: mass and first moment add up."""
-    errors = [name for name in values if name.endswith(".mass_error")]
-    if not link_gravity and not errors:
+    if not link_gravity and not any(name.endswith(".mass_error") for name in values):
         return ()
     bodies = []
     for i, body in enumerate(chain.masses, start=1):
@@ -327,11 +323,9 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     exported = points_of(kept.exported, table, markers)
     settled = np.isfinite(full).all(axis=(1, 2)) & np.isfinite(exported).all(axis=(1, 2))
     if not settled.any():
-        raise InsufficientDataError(
-            f"none of {poses} random poses has a static equilibrium under the load "
-            f"{table.force[0].tolist()} N; check {option('load')} and the "
-            "compliances of the result"
-        )
+        told = f"none of {poses} random poses has a static equilibrium under the load"
+        remedy = f"check {option('load')} and the compliances of the result"
+        raise InsufficientDataError(f"{told} {table.force[0].tolist()} N; {remedy}")
 
     def apart(other: Array) -> Difference:
         distance = np.linalg.norm(full[settled] - other[settled], axis=2)
@@ -343,14 +337,9 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
         for o in kept.omissions
     ]
     effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
-    return Cost(
-        total=apart(exported),
-        effects=tuple(effects),
-        poses=poses,
-        unsettled=int((~settled).sum()),
-        forces=np.unique(table.force, axis=0),
-        measured=kept.conditions.visits is not None,
-    )
+    forces, measured = np.unique(table.force, axis=0), kept.conditions.visits is not None
+    unsettled = int((~settled).sum())
+    return Cost(apart(exported), tuple(effects), poses, unsettled, forces, measured)
 
 
 def points_of(part: Valued, table: Measurements, points: Array) -> Array:
@@ -404,8 +393,7 @@ class JointCorrection:
         sides = np.zeros_like(given) if approach is None else np.asarray(approach, dtype=float)
         found = given.copy()
         for (joint, follows), curve in self.curves.items():
-            kind = SIDE if follows.startswith(SIDE) else JOINT
-            at = (sides if kind == SIDE else given)[..., int(follows[len(kind) :]) - 1]
+            at = (sides if follows.startswith(SIDE) else given)[..., joint_index(follows)]
             found[..., joint] += np.interp(at, *curve)
         return found
 
@@ -436,22 +424,17 @@ def read_joint_correction(path: str | Path) -> JointCorrection:
     """The correction that `export --joint-correction` wrote."""
     text = read_text(path, "joint correction", MOST_BYTES)
     lines = [line for line in text.splitlines() if line[:1] != "#"]
-    require(
-        lines and lines[0] == ",".join(HEADER),
-        f"{path}: its columns are not {', '.join(HEADER)}; give the file that export wrote",
-    )
+    told = f"its columns are not {', '.join(HEADER)}; give the file that export wrote"
+    require(lines and lines[0] == ",".join(HEADER), f"{path}: {told}")
     rows: dict[tuple[int, str], list[tuple[float, float]]] = {}
     for number, line in enumerate(lines[1:], start=2):
         try:
             name, follows, position, delta = line.split(",")
-            int(follows.removeprefix(JOINT).removeprefix(SIDE))
-            key = int(name.removeprefix(JOINT)) - 1, follows
+            _, key = joint_index(follows), (joint_index(name), follows)
             rows.setdefault(key, []).append((float(position), float(delta)))
         except ValueError:
-            raise InputError(
-                f"{path}, row {number}: '{line}' is no joint, what it follows and two numbers; "
-                "export it anew"
-            ) from None
+            told = "is no joint, what it follows and two numbers; export it anew"
+            raise InputError(f"{path}, row {number}: '{line}' {told}") from None
     return JointCorrection({key: tuple(np.array(pairs).T) for key, pairs in rows.items()})
 
 
@@ -542,9 +525,9 @@ def _commanded(table: Measurements, correction: JointCorrection) -> Measurements
 
 def _rms(kept: Kept, part: Valued, table: Measurements, commanded: Measurements) -> float:
     """Distance in m, rms over markers and poses, from those of the arm."""
-    markers = (evaluate_pieces(arm, kept.conditions).points[1:] for arm in (kept.exported, part))
-    expected = points_of(kept.full, table, next(markers))
-    apart = np.linalg.norm(points_of(part, commanded, next(markers)) - expected, axis=2)
+    own, its = (evaluate_pieces(a, kept.conditions).points[1:] for a in (kept.exported, part))
+    off = points_of(part, commanded, its) - points_of(kept.full, table, own)
+    apart = np.linalg.norm(off, axis=2)
     return float(np.sqrt(np.mean(apart[np.isfinite(apart).all(axis=1)] ** 2)))
 
 
@@ -607,20 +590,18 @@ def _fitted(
     basis = _basis(kept.conditions.visits.q) if correct else []
     bent = [JointCorrection({(j, of): (at, by)})(rows.q, rows.approach)[:, j] - rows.q[:, j]
             for j, of, at, by in basis]  # fmt: skip
-    asked, size = np.array(sorted({*fit, *turns}), dtype=np.int64), len(basis)
-    least = np.array([*(model.parameters[k].lower for k in fit), *[-np.inf] * size])
-    u = np.concatenate([x[fit], np.zeros(size)])
+    least = np.array([*(model.parameters[k].lower for k in fit), *[-np.inf] * len(basis)])
+    u = np.concatenate([x[fit], np.zeros(len(basis))])
     first, sizes, correction = u.copy(), np.zeros(0), start
     for _ in range(STEPS):
-        regression = model.regressor(_commanded(rows, correction), x, asked)
-        B, r = regression.B[:, np.searchsorted(asked, fit)], target[settled].ravel()
-        r = r - regression.prediction
+        regression = model.regressor(_commanded(rows, correction), x)
+        B, r = regression.B[:, fit], target[settled].ravel() - regression.prediction
         if not sizes.size:
             whole = np.zeros((len(r), len(x)))
             whole[:, fit] = B
-            sizes = np.concatenate([model.sizes(whole)[fit], np.full(size, SLOPPY)])
+            sizes = np.concatenate([model.sizes(whole)[fit], np.full(len(basis), SLOPPY)])
         if basis:
-            turned = regression.B[:, np.searchsorted(asked, turns)][:, [j for j, *_ in basis]]
+            turned = regression.B[:, turns][:, [j for j, *_ in basis]]
             B = np.hstack([B, turned * np.repeat(np.transpose(bent), 3, axis=0)])
         sigma = max(float(np.sqrt(np.mean(r**2))), SMALLEST)
         # The step d that minimises |B d − r|²/σ² + Σ ((d + u − first) / size)², with u + d no less

@@ -20,18 +20,11 @@ from elastocal.cell_tables import Robot
 from elastocal.export.exportable import ExportNumbers
 from elastocal.files import read_bytes
 from elastocal.messages import ElastocalError, InputError, listed, option, require
+from elastocal.model import mjcf
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
-from elastocal.model.mjcf import (
-    SPRING,
-    MjcfArm,
-    before,
-    import_mujoco,
-    joints_of,
-    parsed,
-    transform,
-)
+from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, transform
 from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element, tree_of, urdf_file
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
@@ -92,13 +85,13 @@ def calibrated_urdf(
         old = next((joint for joint in tree.joints if joint.name == name), None)
         if old is not None and (old.kind, old.parent, old.child) == ("fixed", parent, child):
             return place(name, T)
-        if old is not None or new in tree.links:
-            what = f"joint '{name}'" if old is not None else f"link '{new}'"
-            raise InputError(
-                f"{tree.path}: {what} stands where export would add its own; rename it, "
-                f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
-            )
-        lines.extend(fixed_link(new, parent, child, T))
+        what = f"joint '{name}'" if old is not None else f"link '{new}'"
+        require(
+            old is None and new not in tree.links,
+            f"{tree.path}: {what} stands where export would add its own; rename it, or leave the "
+            f"frame out ({option('frames', False)}, or no {option('base_frame')})",
+        )
+        lines.extend(map(as_text, fixed_link(new, parent, child, T)))
 
     for i, joint in enumerate(tree.serial_chain(base, flange)):
         if not nothing(correction := pieces.correction(i)):
@@ -138,13 +131,20 @@ def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
     return frames | {LOAD_POINT: pose_at(pieces.load_point)}
 
 
-def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
-    ends = element("parent", {"link": parent}), element("child", {"link": child})
-    joint = {"name": f"{new}_joint", "type": "fixed"}
-    return [
-        element("link", {"name": new}),
-        element("joint", joint, *ends, element("origin", origin_attributes(T))),
-    ]
+def fixed_link(new: str, parent: str, child: str, T: Array) -> tuple[ET.Element, ET.Element]:
+    return ET.Element("link", name=new), _joint(f"{new}_joint", "fixed", parent, child, T)
+
+
+def _joint(name: str, kind: str, parent: str, child: str, T: Array) -> ET.Element:
+    joint = ET.Element("joint", name=name, type=kind)
+    ET.SubElement(joint, "parent", link=parent)
+    ET.SubElement(joint, "child", link=child)
+    ET.SubElement(joint, "origin", origin_attributes(T))
+    return joint
+
+
+def as_text(made: ET.Element) -> str:
+    return ET.tostring(made, "unicode").replace(" />", "/>")  # a > in quotes is written as &gt;
 
 
 NEW_ENDS = NEW_BASE, NEW_FLANGE = "base_link", "flange"
@@ -155,54 +155,36 @@ def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> 
     """Links base_link, link_1 … link_n, flange with the calibrated placements.  Joints bear the
     table's names and limits (continuous where one has none); masses that are known stand with a
     zero inertia tensor."""
+    chain, root = pieces.calibrated_chain(), ET.Element("robot", name=pieces.chain.name)
     # Masses of the robot's description where no weights act in the model.
-    chain, masses = pieces.calibrated_chain(), pieces.masses or pieces.chain.masses
-    lines = []
+    masses = pieces.masses or pieces.chain.masses
     if base_frame:
-        lines += fixed_link(TRACKER, TRACKER, NEW_BASE, pieces.T_tracker_base)
-    lines += [element("link", {"name": NEW_BASE})]
+        root.extend(fixed_link(TRACKER, TRACKER, NEW_BASE, pieces.T_tracker_base))
+    ET.SubElement(root, "link", name=NEW_BASE)
     parent = NEW_BASE
     for i, joint in enumerate(chain.joints, start=1):
-        lines += _link(f"link_{i}", masses[i - 1] if masses else None)
-        lines += _joint(joint, parent, f"link_{i}")
+        link = ET.SubElement(root, "link", name=f"link_{i}")
+        for body in masses[i - 1 : i]:
+            inertial, keys = ET.SubElement(link, "inertial"), "ixx ixy ixz iyy iyz izz"
+            ET.SubElement(inertial, "origin", xyz=numbers(body.com), rpy="0 0 0")
+            ET.SubElement(inertial, "mass", value=repr(float(body.mass)))
+            ET.SubElement(inertial, "inertia", dict.fromkeys(keys.split(), "0"))
+        bounded = math.isfinite(joint.lower) and math.isfinite(joint.upper)
+        kind = joint.kind if bounded or joint.kind == "prismatic" else "continuous"
+        moving = _joint(joint.name, kind, parent, link.get("name", ""), joint.placement)
+        ET.SubElement(moving, "axis", xyz=numbers(joint.axis))
+        if kind != "continuous":
+            lower, upper = max(joint.lower, -NO_LIMIT), min(joint.upper, NO_LIMIT)
+            ends = {"lower": repr(float(lower)), "upper": repr(float(upper))}
+            ET.SubElement(moving, "limit", ends, effort="0", velocity="0")
+        root.append(moving)
         parent = f"link_{i}"
-    lines += fixed_link(NEW_FLANGE, parent, NEW_FLANGE, chain.flange_placement)
-    if tool:
-        for name, T in tool_frames(pieces).items():
-            lines += fixed_link(name, NEW_FLANGE, name, T)
-    head = ['<?xml version="1.0" encoding="UTF-8"?>', comment(note)]
-    return "\n".join([*head, *_nested("robot", {"name": chain.name}, lines)]) + "\n"
-
-
-def _link(name: str, body: LinkMass | None) -> list[str]:
-    if body is None:
-        return [element("link", {"name": name})]
-    return _nested("link", {"name": name}, _nested("inertial", {}, [
-        element("origin", {"xyz": numbers(body.com), "rpy": "0 0 0"}),
-        element("mass", {"value": repr(float(body.mass))}),
-        element("inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")),
-    ]))  # fmt: skip
-
-
-def _joint(joint: Joint, parent: str, child: str) -> list[str]:
-    bounded = math.isfinite(joint.lower) and math.isfinite(joint.upper)
-    kind = joint.kind if bounded or joint.kind == "prismatic" else "continuous"
-    lines = [
-        element("parent", {"link": parent}),
-        element("child", {"link": child}),
-        element("origin", origin_attributes(joint.placement)),
-        element("axis", {"xyz": numbers(joint.axis)}),
-    ]
-    if kind != "continuous":
-        ends = {"lower": max(joint.lower, -NO_LIMIT), "upper": min(joint.upper, NO_LIMIT)}
-        limit = {name: repr(float(end)) for name, end in ends.items()}
-        lines.append(element("limit", limit | {"effort": "0", "velocity": "0"}))
-    return _nested("joint", {"name": joint.name, "type": kind}, lines)
-
-
-def _nested(tag: str, stated: dict[str, str], lines: Sequence[str]) -> list[str]:
-    head = element(tag, stated).removesuffix("/>")
-    return [f"{head}>", *(f"  {line}" for line in lines), f"</{tag}>"]
+    root.extend(fixed_link(NEW_FLANGE, parent, NEW_FLANGE, chain.flange_placement))
+    for name, T in tool_frames(pieces).items() if tool else ():
+        root.extend(fixed_link(name, NEW_FLANGE, name, T))
+    ET.indent(root)
+    head = f'<?xml version="1.0" encoding="UTF-8"?>\n{comment(note)}\n'
+    return f"{head}{as_text(root)}\n"
 
 
 # The user's own file, of either kind, written into another folder: its meshes are found from there.
@@ -223,7 +205,7 @@ def moved(path: Path, text: str, folder: Path) -> tuple[str, list[str]]:
         if any(tag.name in BESIDE for tag in named):
             return text, [f"copy it beside {path.name}: the files that it includes are there"]
         if xml.root.name == "mujoco":
-            stated = parsed(path).compiler
+            stated = mjcf.parsed(path).compiler
             places = {key: _from(there, home / (getattr(stated, key) or ""))
                       for key in ("meshdir", "texturedir")}  # fmt: skip
             if compilers := [tag for tag in xml.tags if tag.name == "compiler"]:
@@ -565,12 +547,12 @@ def corrected_mjcf(
     for i, j in enumerate(text.arm.joints):
         if not nothing(correction := pieces.correction(i)):
             body = int(text.model.jnt_bodyid[j])
-            if joints_of(text.model, body)[0] != j:
+            if mjcf.joints_of(text.model, body)[0] != j:
                 name = pieces.chain.joints[i].name
                 raise NotInPlace(
                     f"joint '{name}' shares its body with another; give it a body of its own"
                 )
-            X = before(text.model, j)
+            X = mjcf.before(text.model, j)
             text.move(body, X @ correction @ np.linalg.inv(X))
         sprung[j] = text.add_springs(i, j)
     text.lengthen_keys(sprung)
@@ -630,22 +612,21 @@ class _MjcfText(XmlFile):
     def add_springs(self, i: int, j: int) -> int:
         """Between link i and joint i, before the joint; returns how many."""
         pieces, model = self.pieces, self.model
-        proximal = pieces.springs_at(f"link{i}" if i else "base")
-        springs = proximal | pieces.springs_at(f"joint{i + 1}")
+        springs = pieces.springs_at(f"link{i}" if i else "base")
+        springs |= pieces.springs_at(f"joint{i + 1}")
         body = int(model.jnt_bodyid[j])
-        first = int(model.body_jntadr[body])
-        tags = self.joints(body)
+        first, tags = int(model.body_jntadr[body]), self.joints(body)
         old = [k for k in range(first, j) if model.joint(k).name.startswith(SPRING)]
         for k in old:  # of an earlier export
             self.remove(tags[k - first])
+        count = len(mjcf.joints_of(model, body)) + len(springs)
         if old and not springs:
             raise NotInPlace("springs of an earlier export would be lost")
-        count = len(joints_of(model, body)) + len(springs)
         if springs and count > MOST_JOINTS:
             told = f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}"
             raise NotInPlace(told)
         # The springs' frame in that of the moved body: before the joint turns by its offset.
-        F = before(model, j) @ np.linalg.inv(pieces.offset_motion(i))
+        F = mjcf.before(model, j) @ np.linalg.inv(pieces.offset_motion(i))
         base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame there
         placed = ((s, k, base if s.site == "base" else F) for s, k in springs.items())
         joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)
@@ -694,23 +675,22 @@ class _MjcfText(XmlFile):
         error = pieces.error(pieces.chain.n_joints - 1)
         body, told, T = arm.flange_body, [], np.eye(4)
         sites = {tag.get("name"): tag for tag in self.bodies[body].all("site")}
-        extra: dict[str, Array] = {}
+        placed: dict[str, Array] = {}
         if arm.flange in arm.tree.frames:  # a site
             T = arm.flange_in_body @ error
-            if not nothing(error):
-                if arm.flange not in sites:
-                    raise NotInPlace(f"site '{arm.flange}' stands in a <frame>")
-                self.place(sites[arm.flange], T)
+            placed = {} if nothing(error) else {arm.flange: T}
+            if placed and arm.flange not in sites:
+                raise NotInPlace(f"site '{arm.flange}' stands in a <frame>")
         elif not nothing(error) and arm.model.body_jntnum[body] == 0:
             self.move(body, error)
         elif not nothing(error):
-            T, extra = error, {FLANGE: error}
+            T, placed = error, {FLANGE: error}
             told.append(
                 f"the flange is the body that the last joint moves: the calibrated one is site "
                 f"'{FLANGE}', and what hangs on '{arm.flange}' stays where it was"
             )
-        tool = tool_frames(pieces) if frames else {}
-        for name, place in (extra | {n: T @ P for n, P in tool.items()}).items():
+        placed |= {name: T @ P for name, P in tool_frames(pieces).items() if frames}
+        for name, place in placed.items():
             if name in sites:
                 self.place(sites[name], place)
             else:

@@ -22,21 +22,11 @@ from numpy.typing import NDArray
 
 from elastocal.cell import Cell
 from elastocal.identification.mistakes import NominalFit, nominal_fit
-from elastocal.importing.exports import (
-    FORCES,
-    GROUPS,
-    SPHERICAL,
-    Records,
-    forces_of,
-    joint_stems,
-    read_records,
-    with_labels,
-    with_loads_of_names,
-    with_positions,
-)
+from elastocal.importing import exports
+from elastocal.importing.exports import FORCES, Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
-from elastocal.messages import InputError, length, listed, quoted, rounded
+from elastocal.messages import InputError, length, listed, quoted, require, rounded
 from elastocal.model.chain import beyond_limits
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
@@ -62,46 +52,36 @@ def with_joints(
         )
     taken = _order(where, records, joints, model_names, len(stems))
     units = [records.units[stems[j]] for j in taken[0]]
-    n = len(units)
+    n, here = len(units), f"{where}: [joints]"
     for key in ("sign", "offset_deg", "offset_mm"):
         given = getattr(joints, key)
-        if given is not None and len(given) != n:
-            raise InputError(
-                f"{where}: [joints] {key} has {len(given)} numbers, but there are {n} joints; give "
-                "one per joint"
-            )
+        size = n if given is None else len(given)
+        told = f"{key} has {size} numbers, but there are {n} joints; give one per joint"
+        require(size == n, f"{here} {told}")
         for j, (value, unit) in enumerate(zip(given or (), units, strict=False), 1):
-            if key == "sign" and abs(value) != 1:
-                raise InputError(f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
-            if key != "sign" and value and not key.endswith(unit):
-                raise InputError(
-                    f"{where}: [joints] {key} is {value:g} for joint {j}, which is in {unit}; give "
-                    f"offset_{unit}"
-                )
+            told = f"{here} sign takes 1 or -1 per joint; found {value:g}"
+            require(key != "sign" or abs(value) == 1, told)
+            told = f"{key} is {value:g} for joint {j}, which is in {unit}; give offset_{unit}"
+            require(key == "sign" or not value or key.endswith(unit), f"{here} {told}")
     none = [0.0] * n
     offset = np.where(np.array(units) == "deg", joints.offset_deg or none, joints.offset_mm or none)
     before = np.take_along_axis(records.q, taken, axis=1) * (joints.sign or [1.0] * n) + offset
     q = before.copy()
-    for k, coupling in enumerate(joints.coupling):
-        for name in ("joint", "of"):
-            number = getattr(coupling, name)
-            if number > n:
-                raise InputError(
-                    f"{where}: {name} = {number} of [joints] coupling no. {k + 1}: the file has "
-                    f"{n} joints"
-                )
+    for k, coupling in enumerate(joints.coupling, 1):
+        for name, number in (("joint", coupling.joint), ("of", coupling.of)):
+            told = f"{name} = {number} of [joints] coupling no. {k}: the file has {n} joints"
+            require(number <= n, f"{where}: {told}")
         j, i = coupling.joint - 1, coupling.of - 1
-        if units[j] != units[i]:
-            raise InputError(
-                f"{where}: [joints] coupling no. {k + 1} joins a revolute and a prismatic joint; "
-                "give the factor in other units outside the mapping"
-            )
+        require(
+            units[j] == units[i],
+            f"{here} coupling no. {k} joins a revolute and a prismatic joint; give the factor in "
+            "other units outside the mapping",
+        )
         q[:, j] += coupling.factor * before[:, i]
     numbers = {s: v for s, v in records.numbers.items() if s not in stems}
-    own = {s: u for s, u in records.units.items() if s not in stems}
-    made = [f"q{j + 1}" for j in range(n)]
-    numbers |= dict(zip(made, q.T, strict=True))
-    return replace(records, numbers=numbers, units=own | dict(zip(made, units, strict=True)))
+    numbers |= dict(zip(stems, q.T, strict=False))  # q1 … without those that the order leaves out
+    of = records.units | dict(zip(stems, units, strict=False))
+    return replace(records, numbers=numbers, units=of)
 
 
 def _order(
@@ -109,60 +89,50 @@ def _order(
 ) -> IntArray:
     """(rows, joints): the file's joint, from 0, for each joint of the robot."""
     order = joints.order or list(range(1, n + 1))
-    if max(order) > n or len(set(order)) != len(order):
-        raise InputError(
-            f"{where}: [joints] order = {order} takes each of the file's {n} joints at most once"
-        )
-    as_stated = np.tile(np.array(order) - 1, (len(records), 1))
+    told = f"{where}: [joints] order = {order} takes each of the file's {n} joints at most once"
+    require(max(order) <= n and len(set(order)) == len(order), told)
     columns = [records.texts[f"joint{i}"] for i in range(1, n + 1) if f"joint{i}" in records.texts]
-    if joints.order is not None or len(columns) != n:
-        if joints.order is None and joints.names is not None:
-            raise InputError(
-                f"{where}: [joints] names needs the joint names of the file: add "
-                'joint# = "name_#0" to [source.columns], or use order'
-            )
-        return as_stated
-    found = list(zip(*columns, strict=True))
+    named = joints.order is None and len(columns) == n
+    require(
+        named or joints.order is not None or joints.names is None,
+        f'{where}: [joints] names needs the joint names of the file: add joint# = "name_#0" to '
+        "[source.columns], or use order",
+    )
+    found = list(zip(*columns, strict=True)) if named else [()]
     wanted = joints.names or (model_names if set(model_names) <= set(found[0]) else None)
-    if not wanted:
-        return as_stated
+    if not named or not wanted:
+        return np.tile(np.array(order) - 1, (len(records), 1))
     orders: dict[tuple[str, ...], list[int]] = {}
-    rows = []
     for i, names in enumerate(found):
         if names not in orders:
-            absent = [name for name in wanted if name not in names]
-            if absent:
+            if absent := [name for name in wanted if name not in names]:
                 raise InputError(
                     f"{records.where(i)}: no joint {listed(absent)}; the row has {listed(names)}: "
                     "correct [joints] names, or leave out messages of other joints"
                 )
             orders[names] = [names.index(name) for name in wanted]
-        rows.append(orders[names])
-    return np.array(rows)
+    return np.array([orders[names] for names in found])
 
 
 def pooled(records: Sequence[Records]) -> Records:
     if any(r.load is not None for r in records):
+        told = "says no load, other files do; give load in its [[source]], or a group (?P<load>…)"
         for r in records:
-            if "load" not in r.texts and r.load is None:
-                raise InputError(
-                    f"{r.source}: says no load, other files do; give load in its [[source]], or a "
-                    "group (?P<load>…) in its pattern"
-                )
+            stated = "load" in r.texts or r.load is not None
+            require(stated, f"{r.source}: {told} in its pattern")
         records = [replace(r, texts={"load": [str(r.load)] * len(r)} | r.texts) for r in records]
-    first, *others = records
-    for other in others:
+    first = records[0]
+    for other in records[1:]:
         for what, one, two in (
-            ("columns", set(first.numbers), set(other.numbers)),
-            ("labels", {*GROUPS} & {*first.texts}, {*GROUPS} & {*other.texts}),
+            ("columns", {*first.numbers}, {*other.numbers}),
+            ("labels", {*exports.GROUPS} & {*first.texts}, {*exports.GROUPS} & {*other.texts}),
         ):
-            if one != two:
-                has, lacks = (first, other) if one - two else (other, first)
-                raise InputError(
-                    f"{lacks.source}: has no {listed(sorted(one ^ two))}, but {has.source} has; "
-                    f"files of one kind need the same {what}: correct [[source]], or import them "
-                    "one by one"
-                )
+            has, lacks = (first, other) if one - two else (other, first)
+            require(
+                one == two,
+                f"{lacks.source}: has no {listed(sorted(one ^ two))}, but {has.source} has; files "
+                f"of one kind need the same {what}: correct [[source]], or import them one by one",
+            )
     return Records.stacked(records)
 
 
@@ -251,15 +221,22 @@ MOST_PAIRS = 1_000_000  # of points and standstills
 MOST_POINTS_JOINED = 0.8  # a share from which an offset is worth telling
 
 
+def _clocks(
+    points: Records, log: Records, settings: JoinTable, how: str
+) -> tuple[Array, Array, Array, IntArray]:
+    """Times of the points, times of the log in order, its joints then, and its rows."""
+    order = np.argsort(log.clock(how), kind="stable")
+    return points.clock(how), log.clock(how)[order] + settings.offset_s, log.q[order], order
+
+
 def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str) -> str:
     """The offset of the log's clock at which most points fall into standstills, as a hint; "" where
     the join is not by clocks, few points would, or two offsets would do as well."""
     if how not in ("time", "standstill"):
         return ""
-    at, order = points.clock(how), np.argsort(log.clock(how), kind="stable")
-    clock = log.clock(how)[order] + settings.offset_s
+    at, clock, q, _ = _clocks(points, log, settings, how)
     still = log.spread(settings.still_deg, settings.still_mm)
-    first, last, _ = dwells(clock, log.q[order], still, settings.still_s)
+    first, last, _ = dwells(clock, q, still, settings.still_s)
     if not len(first) or len(at) * len(first) > MOST_PAIRS:
         return ""
     ends = np.array([clock[first], clock[last]])
@@ -342,18 +319,16 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
     row, per = np.full(len(points), -1), settings.points_per_pose
     for load, chosen, rows in _loads_apart(points, log):
         visits = _visits(points, chosen, per)
-        count = int(visits.max()) + 1
-        if count != len(rows) or (per is not None and len(chosen) % per):
-            of, hint = f" under load {load}" if load else "", ""
-            sizes = np.bincount(visits)
-            most = np.bincount(sizes).argmax()
+        sizes = np.bincount(visits)
+        if len(sizes) != len(rows) or (per is not None and len(chosen) % per):
+            of, hint, most = f" under load {load}" * bool(load), "", np.bincount(sizes).argmax()
             for odd in np.flatnonzero(sizes != most)[:1]:
                 start = points.shown(int(chosen[np.argmax(visits == odd)]))
                 hint = (
                     f"; the visit that begins at {start} has {sizes[odd]} points, most have {most}"
                 )
             raise InputError(
-                f"{points.files[0]}: {len(chosen)} points{of} in {count} visits, but "
+                f"{points.files[0]}: {len(chosen)} points{of} in {len(sizes)} visits, but "
                 f"{listed(log.files, 3)} has {len(rows)} poses, and they are joined by "
                 f"order{hint}; {_ADVICE['order']}"
             )
@@ -364,14 +339,15 @@ def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
 
 def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     names = _names_of(log)
-    for pool, has in ((log, bool(names)), (points, "configuration" in points.texts)):
-        if not has:
-            raise InputError(
-                f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
-                "configuration in [source.columns], and a pattern in [source.names]"
-            )
+    own = points.texts.get("configuration", [])
+    for pool, has in ((log, names), (points, own)):
+        require(
+            has,
+            f"{pool.files[0]}: no names of poses, by which [join] is to join; map name or "
+            "configuration in [source.columns], and a pattern in [source.names]",
+        )
     q, row = log.q, np.full(len(points), -1)
-    key = _keys(points.texts["configuration"], names) or _key
+    key = _keys(own, names) or _key
     unused: set[int] = set(range(len(log)))
     for _, chosen, rows in _loads_apart(points, log):
         known: dict[str, int] = {}
@@ -382,16 +358,15 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
                     f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
                     f"{log.line[first]}; name visits apart, or say which load each belongs to"
                 )
-        for i in chosen:
-            row[i] = known.get(key(points.texts["configuration"][i]), -1)
-        used = {key(names[r]) for r in row[chosen] if r >= 0}
+        row[chosen] = [known.get(key(own[i]), -1) for i in chosen]
+        used = {key(own[i]) for i in chosen}
         unused -= {int(r) for r in rows if key(names[r]) in used}
     left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))
     spare = tuple(dict.fromkeys(log.shown(r) for r in sorted(unused)))
-    remarks: tuple[str, ...] = ()
-    for i in np.flatnonzero(row >= 0)[:1] if key is _number else ():
-        told = f"{points.texts['configuration'][i]} is {names[row[i]]}"
-        remarks = (f"by the numbers at the ends of the names ({told})",)
+    remarks = tuple(
+        f"by the numbers at the ends of the names ({own[i]} is {names[row[i]]})"
+        for i in np.flatnonzero(row >= 0)[:1] if key is _number
+    )  # fmt: skip
     return Joined("name", row, q[row], None, left_out, spare, remarks)
 
 
@@ -409,18 +384,16 @@ def _nearest(at: Array, first: Array, last: Array) -> tuple[IntArray, Array]:
 
 
 def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> Joined:
-    at, order = points.clock(how), np.argsort(log.clock(how), kind="stable")
-    clock = log.clock(how)[order] + settings.offset_s
+    at, clock, q, order = _clocks(points, log, settings, how)
     still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
-    q = log.q[order]
     first, last, standing = np.arange(len(q)), np.arange(len(q)), q
     if how == "standstill":
         first, last, standing = dwells(clock, q, still, shortest)
-        if not len(first):
-            raise InputError(
-                f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s "
-                "and still_deg in [join], or join by time"
-            )
+        require(
+            len(first),
+            f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
+            "still_deg in [join], or join by time",
+        )
     stop, apart = _nearest(at, clock[first], clock[last])
     good = apart <= settings.tolerance_s
     unused, remarks, warnings = tuple[str, ...](), list[str](), list[str]()
@@ -474,7 +447,7 @@ def assemble(
             'role = "joints"'
         )
     kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
-    forces = forces_of(where, points, mapping.loads)
+    forces = exports.forces_of(where, points, mapping.loads)
     if forces is not None:
         for k, stem in enumerate(FORCES):
             numbers[stem], units[stem] = forces[:, k], "N"
@@ -543,15 +516,14 @@ def _repeats(points: Records, keys: Iterable[tuple]) -> IntArray:
         return np.array([next(number[key]) for key in keys], dtype=np.int64)
     for k, (text, key) in enumerate(zip(stated, keys, strict=True)):
         if not WHOLE.fullmatch(text):
-            raise InputError(f"{points.where(k)}: repeat {quoted(text)} is no whole number; "
-                             "correct the pattern or the column")  # fmt: skip
+            told = f"repeat {quoted(text)} is no whole number; correct the pattern or the column"
+            raise InputError(f"{points.where(k)}: {told}")
         first = known.setdefault((*key, int(text)), k)
         if first != k:
             raise InputError(
                 f"{points.where(k)}: repeat {text} of configuration {key[0]}"
-                f"{f', marker {key[1]}' if key[1] else ''} stands in line "
-                f"{points.line[first]} too; leave the repeat out of the pattern to have "
-                "shots numbered in order"
+                f"{f', marker {key[1]}' if key[1] else ''} stands in line {points.line[first]} "
+                "too; leave the repeat out of the pattern to have shots numbered in order"
             )
     return np.array([int(text) for text in stated], dtype=np.int64)
 
@@ -637,15 +609,13 @@ def import_files(
     names = () if chain is None else tuple(joint.name for joint in chain.joints)
     by_role, understood, spherical = _by_role(where, files, table, names)
     told = [doubt for own in by_role.values() for records in own for doubt in records.doubts]
-    by_role, warnings = with_loads_of_names(by_role, table.loads)
+    by_role, warnings = exports.with_loads_of_names(by_role, table.loads)
     points = pooled(by_role["points"])
     log = pooled(by_role["joints"]) if by_role["joints"] else None
     joined = None
     if log is not None:
-        if not log.q.shape[1]:
-            raise InputError(
-                f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
-            )
+        lack = f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
+        require(log.q.shape[1], lack)
         joined = join(points, log, table.join)
         points = _with_joint_values(points, log, joined)
     columns, kinds, doubts = assemble(where, points, table)
@@ -690,9 +660,10 @@ def _by_role(
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood, spherical = [], False
     for path, source in _assigned(where, files, table.source or ()):
-        found = with_labels(where, read_records(where, path, source, table.units), source.names)
-        spherical = spherical or not found.numbers.keys().isdisjoint(SPHERICAL)
-        found = with_positions(found, clockwise=source.azimuth == "clockwise")
+        found = exports.read_records(where, path, source, table.units)
+        found = exports.with_labels(where, found, source.names)
+        spherical = spherical or not found.numbers.keys().isdisjoint(exports.SPHERICAL)
+        found = exports.with_positions(found, clockwise=source.azimuth == "clockwise")
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip
         if role in ("joints", "both") and joint_stems(found.numbers):
@@ -736,31 +707,26 @@ def _assigned(
 ) -> list[tuple[Path, SourceTable]]:
     """A file goes to the first source whose `files` pattern fits its name; sources without a
     pattern share the rest: one takes them all, several take one file each, in order."""
-    chosen: dict[int, SourceTable] = {}
+    chosen: dict[Path, SourceTable] = {}
     for i, path in enumerate(files):
-        if path in files[:i]:
-            raise InputError(f"{path}: named twice; name each file once")
-        names = path.name, str(path)
+        require(path not in files[:i], f"{path}: named twice; name each file once")
         for source in reversed(sources):
-            if any(fnmatchcase(name, p) for p in source.files or () for name in names):
-                chosen[i] = source
-    rest = [i for i in range(len(files)) if i not in chosen]
+            if any(fnmatchcase(n, p) for p in source.files or () for n in (path.name, str(path))):
+                chosen[path] = source
+    rest = [path for path in files if path not in chosen]
     for source in sources:
-        if source.files and source not in chosen.values():
-            raise InputError(
-                f"{where}: no file fits files = {listed(map(quoted, source.files))}; the files are "
-                f"{listed((p.name for p in files), 8)}"
-            )
-    free = [source for source in sources if not source.files]
-    if len(free) == 1 and rest:
-        chosen |= dict.fromkeys(rest, free[0])
-    elif len(free) == len(rest):
-        chosen |= dict(zip(rest, free, strict=True))
-    else:
-        left = listed((str(files[i]) for i in rest), 8)
-        raise InputError(
-            f"{where}: {len(free)} sources without a files pattern for {len(rest)} files "
-            f'({left or "none left"}); give files = ["pattern"] in each [[source]], or one preset '
-            "per file"
+        require(
+            not source.files or source in chosen.values(),
+            f"{where}: no file fits files = {listed(map(quoted, source.files or ()))}; the files "
+            f"are {listed((p.name for p in files), 8)}",
         )
-    return [(path, chosen[i]) for i, path in enumerate(files)]
+    free = [source for source in sources if not source.files]
+    free = free * len(rest) if len(free) == 1 and rest else free
+    require(
+        len(free) == len(rest),
+        f"{where}: {len(free)} sources without a files pattern for {len(rest)} files "
+        f'({listed(map(str, rest), 8) or "none left"}); give files = ["pattern"] in each '
+        "[[source]], or one preset per file",
+    )
+    chosen |= dict(zip(rest, free, strict=True))
+    return [(path, chosen[path]) for path in files]

@@ -16,21 +16,11 @@ from typing import Any
 
 import numpy as np
 
+from elastocal import messages
 from elastocal.files import decoded, read_bytes
 from elastocal.importing import mapping_file
-from elastocal.importing.mapping_file import (
-    ColumnKey,
-    LoadStatesTable,
-    NamesTable,
-    NumberCells,
-    SourceTable,
-    TextSourceKeys,
-    UnitsTable,
-    compiled,
-    seconds_of,
-    unit_in_comments,
-)
-from elastocal.messages import ElastocalError, InputError, did_you_mean, is_label, listed, quoted
+from elastocal.importing.mapping_file import ColumnKey, SourceTable, UnitsTable, compiled
+from elastocal.messages import ElastocalError, InputError, did_you_mean, listed, quoted, require
 from elastocal.model.effects.statics import STANDARD_GRAVITY
 from elastocal.tables import MAX_LINE, NUMBER, column
 from elastocal.units import FACTORS, Array, IntArray, convert, quantities
@@ -54,24 +44,20 @@ def read_lines(path: str | Path, encoding: str = "auto") -> tuple[list[str], str
     character)."""
     source = str(path)
     data = read_bytes(path, "export", MAX_BYTES)
-    if not data.strip():
-        raise InputError(f"{source}: empty file; export it again")
-    if data.startswith(_BINARY):
-        raise InputError(
-            f"{source}: is a workbook, bag, archive or other binary file; export its table as text "
-            "(CSV)"
-        )
+    require(data.strip(), f"{source}: empty file; export it again")
+    told = "is a workbook, bag, archive or other binary file; export its table as text (CSV)"
+    require(not data.startswith(_BINARY), f"{source}: {told}")
     text, name = _decode(source, data, encoding)
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise InputError(f"{source}, line {line}: NUL characters, so this is no text, or UTF-16 "
-                         "without its mark; export it as text (CSV), or set encoding")  # fmt: skip
+        told = "NUL characters, so this is no text, or UTF-16 without its mark; export it as text"
+        raise InputError(f"{source}, line {line}: {told} (CSV), or set encoding")
     # Not splitlines: a form feed or U+2028 in a comment ends no line for an editor.
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     for number, content in enumerate(lines, start=1):
         if len(content) > MAX_LINE:
-            raise InputError(f"{source}, line {number}: longer than {MAX_LINE // 1024} KiB; this "
-                             "is no table of readings")  # fmt: skip
+            told = f"longer than {MAX_LINE // 1024} KiB; this is no table of readings"
+            raise InputError(f"{source}, line {number}: {told}")
     return lines, name
 
 
@@ -100,13 +86,13 @@ class Rows:
 
 
 def table_rows(
-    source: str, lines: list[str], settings: TextSourceKeys, asked: Sequence[ColumnKey]
+    source: str, lines: list[str], settings: mapping_file.TextSourceKeys, asked: Sequence[ColumnKey]
 ) -> Rows:
     """Where columns are asked for by name the header is the line that has them; else the table
     begins at the first line with numbers where they are asked for, and the line before it is its
     header if it has as many cells.  Lines above the table, repeated headers and lines that match
     `ignore` are passed over and listed."""
-    guess = NumberCells("auto", settings.thousands, settings.missing, ())
+    guess = mapping_file.NumberCells("auto", settings.thousands, settings.missing, ())
     numbers = (c.at[0] for c in asked if c.required and c.quantities)
     places = [at for at in numbers if isinstance(at, int)]
     named = any(isinstance(part, str) for c in asked if c.required for part in c.at)
@@ -168,7 +154,7 @@ Numbered = list[tuple[int, str]]  # lines with their numbers
 
 
 def _sorted_lines(
-    source: str, lines: list[str], settings: TextSourceKeys
+    source: str, lines: list[str], settings: mapping_file.TextSourceKeys
 ) -> tuple[Numbered, Numbered, Numbered]:
     marks = tuple(settings.comments)
     skip = None if settings.ignore is None else compiled(source, "ignore", settings.ignore)
@@ -421,7 +407,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         table = table_rows(name, lines, settings, asked)
     if len(table.rows) > MAX_ROWS:
         raise InputError(f"{name}: more than {MAX_ROWS:,} rows; thin the export out")
-    hint = unit_in_comments(where, settings.unit_comment, table.comments)
+    hint = mapping_file.unit_in_comments(where, settings.unit_comment, table.comments)
     width = len(table.rows[0][1])
     columns = {
         marker: mapping_file.resolve(
@@ -432,7 +418,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     no_unit = {c.header: c for own in columns.values() for c in own if c.unit == mapping_file.AUTO}
     columns = {m: tuple(c for c in own if c.header not in no_unit) for m, own in columns.items()}
     every = [c for own in columns.values() for c in own]
-    cells = NumberCells(
+    cells = mapping_file.NumberCells(
         settings.decimal, settings.thousands, settings.missing,
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in every if c.quantities and c.index[0] < len(row)),
@@ -453,7 +439,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     if written is not None and "time" not in numbers:
         form = source.time_format or ()
         formats = [form] if isinstance(form, str) else form
-        seconds = seconds_of(name, line.tolist(), written, formats)
+        seconds = mapping_file.seconds_of(name, line.tolist(), written, formats)
         numbers["time"], of["time"] = np.array(seconds), "s"
     used = {i for c in every for i in c.index}
     understood = {
@@ -473,8 +459,8 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
 
 
 def _rows(
-    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]], cells: NumberCells,
-    coverage: float,
+    name: str, table: Rows, columns: Mapping[str, Sequence[ColumnKey]],
+    cells: mapping_file.NumberCells, coverage: float,
 ) -> tuple[list[tuple[int, list[str], str]], dict[str, Array], dict[str, str],
            list[tuple[int, str]]]:  # fmt: skip
     """Complete rows (line, cells, marker), their numbers by column and the units of the measurement
@@ -554,34 +540,26 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     missing += [] if heights else ["zenith or elevation"]
     if not found:
         return records
-    if both:
-        raise InputError(
-            f"{records.source}: positions are mapped twice, as {listed(both)} and as "
-            f"{listed(found)}; keep one of the two in [source.columns]"
-        )
-    if len(heights) > 1:
-        raise InputError(
-            f"{records.source}: both zenith and elevation are mapped; keep the one that the file "
-            "gives (a level line has zenith 90° and elevation 0°)"
-        )
-    if missing:
-        raise InputError(
-            f"{records.source}: {listed(found)} without {listed(missing)}; map range_mm, "
-            "azimuth_deg, and zenith_deg or elevation_deg in [source.columns]"
-        )
+    for wrong, told in (
+        (both, f"positions are mapped twice, as {listed(both)} and as {listed(found)}; keep one of "
+         "the two in [source.columns]"),
+        (len(heights) > 1, "both zenith and elevation are mapped; keep the one that the file gives "
+         "(a level line has zenith 90° and elevation 0°)"),
+        (missing, f"{listed(found)} without {listed(missing)}; map range_mm, azimuth_deg, and "
+         "zenith_deg or elevation_deg in [source.columns]"),
+    ):  # fmt: skip
+        require(not wrong, f"{records.source}: {told}")
     height, numbers = heights[0], dict(records.numbers)
     d = numbers.pop("range")
     alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
-    if not (d > 0).all():
-        i = int(np.argmin(d > 0))
-        raise InputError(
-            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
-            "positive: correct the line, or the column of range in [source.columns]"
-        )
     low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
-    off = (angle < low) | (angle > high)
-    if off.any():
-        i = int(np.argmax(off))
+    # Of each the first row, if any.
+    for i in np.flatnonzero(~(d > 0))[:1]:
+        raise InputError(
+            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is positive: correct the "
+            "line, or the column of range in [source.columns]"
+        )
+    for i in np.flatnonzero((angle < low) | (angle > high))[:1]:
         raise InputError(
             f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
             f"{high:g}°; is it an angle of another unit, or {other}_deg?"
@@ -598,7 +576,7 @@ GROUPS = ("configuration", "marker", "repeat", "load")
 NAMED = "write pattern in [source.names]"
 
 
-def with_labels(where: str, records: Records, names: NamesTable) -> Records:
+def with_labels(where: str, records: Records, names: mapping_file.NamesTable) -> Records:
     """With the texts of GROUPS, from columns and, where a pattern is given, from names, if no
     column gives them.  A name that no pattern matches is an error, or with unmatched = "ignore"
     passed over and listed."""
@@ -607,35 +585,33 @@ def with_labels(where: str, records: Records, names: NamesTable) -> Records:
     labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
     if "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
-    if names.in_order and "marker" not in labels:
+    elif names.in_order:
         n = len(names.in_order)
         labels["marker"] = [names.in_order[i % n] for i in range(len(records))]
-        if len(records) % n:
-            raise InputError(
-                f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
-                f"{listed(names.in_order)} of in_order; a point is missing or one too many: name "
-                "the points"
-            )
+        require(
+            len(records) % n == 0,
+            f"{records.source}: {len(records)} points, which is no multiple of the {n} markers "
+            f"{listed(names.in_order)} of in_order; a point is missing or one too many: name the "
+            "points",
+        )
     for stem, texts in labels.items():
         for i, text in enumerate(texts):
-            if not is_label(text):
-                raise InputError(
-                    f"{records.where(i)}: {stem} {quoted(text)} cannot stand in a table; correct "
-                    f"the name, or {NAMED}"
-                )
+            if not messages.is_label(text):
+                told = f"cannot stand in a table; correct the name, or {NAMED}"
+                raise InputError(f"{records.where(i)}: {stem} {quoted(text)} {told}")
     return replace(records, texts=records.texts | labels)
 
 
-def _with_names_read(where: str, records: Records, names: NamesTable) -> Records:
+def _with_names_read(where: str, records: Records, names: mapping_file.NamesTable) -> Records:
     named = records.texts["name"]
     patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
     expressions = [compiled(where, "pattern", text) for text in patterns]
     for expression in expressions:
-        if not set(expression.groupindex) & set(GROUPS):
-            raise InputError(
-                f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
-                f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so"
-            )
+        require(
+            set(expression.groupindex) & set(GROUPS),
+            f"{where}: pattern = {quoted(expression.pattern)} has none of the groups "
+            f"{listed(f'(?P<{g}>…)' for g in GROUPS)}; name the parts of the name so",
+        )
     matches = [next((m for e in expressions if (m := e.search(n))), None) for n in named]
     groups = [match.groupdict() if match else {} for match in matches]
     bad = [i for i, match in enumerate(matches) if match is None]
@@ -648,16 +624,15 @@ def _with_names_read(where: str, records: Records, names: NamesTable) -> Records
         )
     found = {stem: [(own.get(stem) or "").strip() for own in groups] for stem in GROUPS}
     present = {stem: texts for stem, texts in found.items() if any(texts)}
+    unsaid = {"repeat": "0", "load": "none"}
     for stem, texts in present.items():
-        empty = [i for i, text in enumerate(texts) if not text and matches[i]]
-        if empty and stem in ("configuration", "marker"):
-            raise InputError(
-                f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "
-                f"others do; {NAMED} that finds it in every name"
-            )
-        if empty:
-            default = "0" if stem == "repeat" else "none"
-            present[stem] = [text or default for text in texts]
+        for i, text in enumerate(texts):
+            if not text and matches[i] and stem not in unsaid:
+                raise InputError(
+                    f"{records.where(i)}: the name {quoted(named[i])} says no {stem}, others do; "
+                    f"{NAMED} that finds it in every name"
+                )
+        present[stem] = [text or unsaid.get(stem, "") for text in texts]
     reasons = [(int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad]
     good = np.setdiff1d(np.arange(len(records)), bad)
     kept = replace(records, texts=present | records.texts).take(good)
@@ -669,38 +644,33 @@ UNLOADED = ("none", "unloaded", "0")
 
 
 def forces_of(
-    where: str, points: Records, loads: Mapping[str, Array | LoadStatesTable]
+    where: str, points: Records, loads: Mapping[str, Array | mapping_file.LoadStatesTable]
 ) -> Array | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.  A mass m
     hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as "2600 N"
     or "2.5 kg", unless [loads] has it."""
     named = points.texts.get("load")
     if named is None:
-        if loads and not points.forces:
-            raise InputError(
-                f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
-                "to; give load in [[source]], or a group (?P<load>…) in a pattern"
-            )
-        return None
-    if points.forces:
-        raise InputError(
-            f"{points.source}: the load is stated by name and in columns {listed(points.forces)}; "
-            "keep one"
+        require(
+            not loads or points.forces,
+            f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs to; "
+            "give load in [[source]], or a group (?P<load>…) in a pattern",
         )
+        return None
+    told = f"the load is stated by name and in columns {listed(points.forces)}; keep one"
+    require(not points.forces, f"{points.source}: {told}")
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in loads.items():
-        if isinstance(stated, LoadStatesTable):
+        if isinstance(stated, mapping_file.LoadStatesTable):
             stated = np.array([0.0, 0.0, -stated.mass_kg * STANDARD_GRAVITY])
         known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):
         if name not in known and (size := load_in(name)):
             known[name] = np.array([0.0, 0.0, 0.0 - size[1]])
         if name not in known:
-            raise InputError(
-                f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
-                f"{did_you_mean(name, known)}; there are {listed(known)}: add "
-                f"{name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
-            )
+            told = f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
+            add = f"add {name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
+            raise InputError(f"{told}{did_you_mean(name, known)}; there are {listed(known)}: {add}")
     return np.array([known[name] for name in named])
 
 

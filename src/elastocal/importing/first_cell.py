@@ -77,10 +77,8 @@ def init(
         6
     """
     target = None if output is None else Path(output)
-    if target is not None and not force and target.exists():
-        raise InputError(
-            f"{target} is there already; name another file, or give {option('force', True)}"
-        )
+    told = f"{target} is there already; name another file, or give {option('force', True)}"
+    require(target is None or force or not target.exists(), told)
     found = robot
     if not isinstance(found, Robot):
         found = robot_of(Path(found), base, flange, convention, ur_model)
@@ -92,9 +90,9 @@ def init(
             try:  # before it appears: a cell that cannot be read is not left behind
                 load_chain(read_cell(handle.name))
             except InputError as error:
-                told = str(error).replace(handle.name, "the cell made of it")
+                why = str(error).replace(handle.name, "the cell made of it")
                 file = found.urdf or found.mjcf or found.dh
-                raise InputError(f"{file}: is no robot to begin with: {told}") from None
+                raise InputError(f"{file}: is no robot to begin with: {why}") from None
     return text
 
 
@@ -103,23 +101,22 @@ def robot_of(
 ) -> Robot:
     """The robot of a file; base and flange are those that are found where none are named, so that a
     cell states them."""
-    kind = ENDINGS.get(path.suffix.lower())
-    if path.suffix.lower() == ".xacro":
-        raise InputError(xacro_left(path, f"the ending '{path.suffix}'"))
-    if kind is None:
-        raise InputError(
-            f"{path}: the ending '{printable(path.suffix)}' names no robot file; give a URDF "
-            "(.urdf), a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration "
-            "of a UR (.conf, .yaml)"
-        )
-    if ur_model is not None and path.suffix.lower() != ".conf":
-        raise InputError(f"{option('ur_model')} is for a calibration.conf; leave it out for {path}")
+    ending, is_for = path.suffix.lower(), f"leave it out for {path}"
+    kind = ENDINGS.get(ending)
+    require(ending != ".xacro", xacro_left(path, f"the ending '{path.suffix}'"))
+    require(
+        kind is not None,
+        f"{path}: the ending '{printable(path.suffix)}' names no robot file; give a URDF (.urdf), "
+        "a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration of a UR "
+        "(.conf, .yaml)",
+    )
+    told = f"{option('ur_model')} is for a calibration.conf; {is_for}"
+    require(ur_model is None or ending == ".conf", told)
     if kind == "dh":
         for name, given in (("base", base), ("flange", flange)):
             require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
         return replace(Robot.from_dh(path, convention), ur_model=ur_model)
-    if convention != "standard":
-        raise InputError(f"{option('convention')} is for DH tables; leave it out for {path}")
+    require(convention == "standard", f"{option('convention')} is for DH tables; {is_for}")
     if kind == "urdf":
         return Robot.from_urdf(path, *check_urdf(path).ends(base, flange or None))
     arm = MjcfArm.read(path, base, flange)

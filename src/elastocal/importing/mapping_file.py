@@ -20,28 +20,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from elastocal.config import (
-    NonNegative,
-    Positive,
-    Table,
-    Text,
-    Vector3,
-    checked,
-    key,
-    place,
-    read_toml,
-)
+from elastocal import config, messages
+from elastocal.config import NonNegative, Positive, Table, Text, Vector3, checked, key, place
 from elastocal.measurements import families
-from elastocal.messages import (
-    InputError,
-    check_known,
-    did_you_mean,
-    listed,
-    option,
-    plain_minus,
-    quoted,
-    said_of,
-)
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require
 from elastocal.tables import NUMBER, THOUSANDS, column, first_bad_cell
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
@@ -165,7 +147,7 @@ _UNIT = re.compile(r"_[A-Za-z]+$")
 
 
 def preset_text(name: str) -> str:
-    check_known(name, PRESETS, f"no preset {quoted(name)}")
+    messages.check_known(name, PRESETS, f"no preset {quoted(name)}")
     folder = resources.files("elastocal.importing") / "presets"
     return (folder / f"{name}.toml").read_text(encoding="utf-8")
 
@@ -180,29 +162,20 @@ def read_mapping(
     given = {k: v for k, v in (("length", length_unit), ("angle", angle_unit)) if v is not None}
     checked(MappingTable, {"units": given}, f"{option('length_unit')}, {option('angle_unit')}")
     where = option("presets") if path is None else str(path)
-    data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file")
-    if presets and data.get("source"):
-        raise InputError(
-            f"{where}: has [[source]] tables, so {option('presets', presets[0])} has no place; "
-            f'write preset = "{presets[0]}" into the [[source]] it is for, or leave '
-            f"{option('presets')} out"
-        )
+    data: dict[str, Any] = {} if path is None else config.read_toml(path, "mapping file")
     if presets:
+        told = f"has [[source]] tables, so {option('presets', presets[0])} has no place; write"
+        remedy = f"into the [[source]] it is for, or leave {option('presets')} out"
+        require(not data.get("source"), f'{where}: {told} preset = "{presets[0]}" {remedy}')
         data = {**data, "source": [{"preset": name} for name in presets]}
     checked(MappingTable, data, where)
-    if not data.get("source"):
-        raise InputError(
-            f'{where}: no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or '
-            f"give {option('presets')}"
-        )
+    told = f'no [[source]] table; add one with preset = "{PRESETS[0]}" or columns, or give'
+    require(data.get("source"), f"{where}: {told} {option('presets')}")
     merged = {"source": [_with_preset(where, s) for s in data["source"]]}
     table = checked(MappingTable, data | merged | {"units": data.get("units", {}) | given}, where)
+    told = 'has neither preset nor columns; say where the numbers stand, as in x_mm = "X"'
     for k, source in enumerate(table.source or ()):
-        if not source.columns:
-            raise InputError(
-                f"{where}: {place('source', k)} has neither preset nor columns; say where the "
-                'numbers stand, as in x_mm = "X"'
-            )
+        require(source.columns, f"{where}: {place('source', k)} {told}")
     return where, table
 
 
@@ -210,7 +183,7 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
     name = source.get("preset")
     if name is None:
         return source
-    with said_of(where):
+    with messages.said_of(where):
         base = tomllib.loads(preset_text(name))
     # x_mm of the user replaces the preset's x_auto, whichever table either stands in.
     own = source.get("columns", {}) | source.get("optional", {})
@@ -313,23 +286,19 @@ def wanted(
     for name, at, needed in (*((*own, True) for own in required.items()),
                             *((*own, False) for own in optional.items())):  # fmt: skip
         target, places = column_key(where, name), at if isinstance(at, list) else [at]
-        joints = range(1, MOST_JOINTS + 1) if "#" in name else ()  # q#: one column for each
-        if joints and any(isinstance(part, int) for part in places):
-            raise InputError(
-                f'{where}: {name} takes a name with # or #0 in it, as in "position_#0"; write '
-                f"{name.replace('#', '1')} = {at}, … for columns by number"
-            )
-        if target.quantities and isinstance(at, list):
-            raise InputError(
-                f"{where}: {name} takes one column; only texts such as name are joined from several"
-            )
-        if EACH in str(at) and not target.quantities:
-            raise InputError(
-                f"{where}: {name} = {quoted(str(at))}: {EACH} stands for the markers of a row in "
-                'places of numbers, as in x_mm = "*_x"'
-            )
+        for wrong, told in (
+            ("#" in name and any(isinstance(part, int) for part in places),
+             ' takes a name with # or #0 in it, as in "position_#0"; write '
+             f"{name.replace('#', '1')} = {at}, … for columns by number"),
+            (target.quantities and isinstance(at, list),
+             " takes one column; only texts such as name are joined from several"),
+            (EACH in str(at) and not target.quantities,
+             f" = {quoted(str(at))}: {EACH} stands for the markers of a row in places of numbers, "
+             'as in x_mm = "*_x"'),
+        ):  # fmt: skip
+            require(not wrong, f"{where}: {name}{told}")
         every = [replace(target, at=tuple(places), required=needed)]
-        if joints:
+        if "#" in name:  # one column for each joint
             every = [
                 replace(
                     target, key=name.replace("#", str(i)), stem=target.stem.replace("#", str(i)),
@@ -337,13 +306,14 @@ def wanted(
                              for part in places),
                     required=needed and i == 1,
                 )
-                for i in joints if target.stem.replace("#", str(i)) not in single
+                for i in range(1, MOST_JOINTS + 1)
+                if target.stem.replace("#", str(i)) not in single
             ]  # fmt: skip
         for one in every:
             # Seconds and nanoseconds of one clock stand in two columns, and are added.
             before = filled.setdefault(name if one.stem == "time" else one.stem, one)
-            if before is not one:
-                raise InputError(f"{where}: {before.key} and {name} fill the same column; keep one")
+            told = f"{where}: {before.key} and {name} fill the same column; keep one"
+            require(before is one, told)
     return tuple(filled.values())
 
 
@@ -444,11 +414,9 @@ def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -
                 f"{source}: no column {' or '.join(map(quoted, sought))} for {target.key}"
                 f"{did_you_mean(sought[0], header)}; the file has {listed(map(quoted, header))}"
             )
-        if len(hits) > 1:
-            raise InputError(
-                f"{source}: {target.key} = {quoted(part)} could be column "
-                f"{' or '.join(f'{i + 1} ({header[i]})' for i in hits)}; give its number"
-            )
+        could = " or ".join(f"{i + 1} ({header[i]})" for i in hits if len(hits) > 1)
+        told = f"{target.key} = {quoted(part)} could be column {could}; give its number"
+        require(not could, f"{source}: {told}")
         index.append(hits[0])
     names = (header[i] if i < len(header) else f"column {i + 1}" for i in index)
     return replace(target, index=tuple(index), header=" + ".join(names))
@@ -484,11 +452,11 @@ def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | No
     if stated is not None and not set(quantities(stated)) & set(target.quantities):
         stated = None  # "Roll m" of a header is no unit of an angle
     if target.unit != AUTO:
-        if stated is not None and stated != target.unit:
-            raise InputError(
-                f"{source}: column {quoted(target.header)} says {stated}, but the mapping has "
-                f"{target.key}; write {target.stem}_{stated}, or correct the header"
-            )
+        require(
+            stated in (None, target.unit),
+            f"{source}: column {quoted(target.header)} says {stated}, but the mapping has "
+            f"{target.key}; write {target.stem}_{stated}, or correct the header",
+        )
         return target
     told = known_unit(hint) if hint else None
     general = {"length": units.length, "angle": units.angle}.get(target.quantities[0])
@@ -504,11 +472,8 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
     if pattern is None:
         return None
     expression = compiled(where, "unit_comment", pattern)
-    if "unit" not in expression.groupindex:
-        raise InputError(
-            f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
-            "that is the unit so"
-        )
+    told = "has no group (?P<unit>…); name the part that is the unit so"
+    require("unit" in expression.groupindex, f"{where}: unit_comment = {quoted(pattern)} {told}")
     found = (match["unit"] for text in comments if (match := expression.search(text)))
     return next((unit for unit in found if unit and known_unit(unit)), None)
 
@@ -545,7 +510,7 @@ class NumberCells:
 
     def _bare(self, cell: str) -> str:
         text = cell.strip()
-        text = text if text.isascii() else plain_minus(text).translate(_PLAIN)
+        text = text if text.isascii() else messages.plain_minus(text).translate(_PLAIN)
         return text.replace(self.thousands, "") if self.thousands else text
 
     def looks_numeric(self, cell: str) -> bool:

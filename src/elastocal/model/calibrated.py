@@ -232,10 +232,8 @@ class CalibratedArm(Valued, Saved):
 def given_arm(name: str, given: Any) -> CalibratedArm:
     arm = getattr(given, "arm", given)
     if not isinstance(arm, CalibratedArm):
-        raise InputError(
-            f"{option(name)} takes a calibrated arm, as fit.arm or what read_calibrated gives; "
-            f"found {type(arm).__name__}"
-        )
+        told = "takes a calibrated arm, as fit.arm or what read_calibrated gives; found"
+        raise InputError(f"{option(name)} {told} {type(arm).__name__}")
     return arm
 
 
@@ -303,16 +301,11 @@ def read_calibrated(
     _check_same(model, held, stated.nominal_flange, cell_path, result_path)
     determined = tuple(stated.covariance_of)
     n, lacking = len(determined), (stated.predicted_new_poses_um or {}).get("lack_of_fit", 0.0)
-    require(
-        set(determined) <= set(held) and stated.covariance.size == n**2,
-        f"{result_path}: covariance of {stated.covariance.size} numbers for {n} names in "
-        f"covariance_of; {ANEW}",
-    )
-    scatter = stated.scatter
-    require(
-        scatter is None or (*scatter.covariance.shape, *scatter.dof.shape) == (n, n, n),
-        f"{result_path}: scatter is not of the names in covariance_of; {ANEW}",
-    )
+    size, scatter = stated.covariance.size, stated.scatter
+    told = f"{result_path}: covariance of {size} numbers for {n} names in covariance_of; {ANEW}"
+    require(set(determined) <= set(held) and size == n**2, told)
+    alike = scatter is None or (*scatter.covariance.shape, *scatter.dof.shape) == (n, n, n)
+    require(alike, f"{result_path}: scatter is not of the names in covariance_of; {ANEW}")
     entries, visits = {e["name"]: e for e in result["parameters"]}, stated.measured_visits
     shape = None if visits is None else (len(visits.force), model.chain.n_joints)
     return CalibratedArm(
@@ -401,22 +394,15 @@ def _check_same(
         for what, names in (("the result lacks", absent), ("the cell has no", surplus))
         if names
     ]
-    here = np.array(nominal_flange_rows(model.chain))
-    there = here if stated is None else stated
-    if not told:
-        require(there.shape == here.shape, f"{result}: nominal_flange takes 3 rows; {ANEW}")
-    if not told and np.abs(here - there).max() > SAME:
-        off = np.linalg.norm(here[:, 3] - there[:, 3])
-        told = [
-            "the nominal robot is another one (with every joint at 0.5 rad the flange is "
-            f"{rounded(float(off) * 1e3, 4)} mm away)"
-        ]
-    remedy = "" if absent or surplus else ", or identify anew"
-    require(
-        not told,
-        f"{result} was not identified with {cell}: {'; '.join(told)}; give the cell that identify "
-        f"was run with{remedy}",
-    )
+    here, remedy = np.array(nominal_flange_rows(model.chain)), ""
+    if not told and stated is not None:
+        require(stated.shape == here.shape, f"{result}: nominal_flange takes 3 rows; {ANEW}")
+        off = rounded(float(np.linalg.norm((here - stated)[:, 3])) * 1e3, 4)
+        away = f"with every joint at 0.5 rad the flange is {off} mm away"
+        told = [f"the nominal robot is another one ({away})"]
+        told, remedy = told * bool(np.abs(here - stated).max() > SAME), ", or identify anew"
+    why = f"{'; '.join(told)}; give the cell that identify was run with{remedy}"
+    require(not told, f"{result} was not identified with {cell}: {why}")
 
 
 RECORDED = {"torque": "recorded torques"}  # what an effect needs and only a table has
@@ -507,17 +493,13 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
         text = next(iter(markers))
     if text in markers:
         return ToolPoint(markers[text], text, f"marker {text}")
-    parts = text.split(",")
-    if len(parts) == 1:
-        raise InputError(
-            f"{option('point')}: '{text}' is no marker of the cell{did_you_mean(text, markers)}; "
-            f"its markers: {listed(markers)}; or give x,y,z in m in the flange frame"
-        )
-    place = numbers(option("point"), text, (3,), "x,y,z in m in the flange frame")
-    if np.abs(place).max() > 10:
-        raise InputError(
-            f"{option('point')}: '{text}' is more than 10 m from the flange; give x,y,z in m"
-        )
+    here, what = f"{option('point')}: '{text}'", "x,y,z in m in the flange frame"
+    if "," not in text:
+        hint = f"{did_you_mean(text, markers)}; its markers: {listed(markers)}; or give {what}"
+        raise InputError(f"{here} is no marker of the cell{hint}")
+    place = numbers(option("point"), text, (3,), what)
+    told = f"{here} is more than 10 m from the flange; give x,y,z in m"
+    require(np.abs(place).max() <= 10, told)
     return ToolPoint(place, None, f"point {text} m in the flange frame")
 
 
@@ -526,8 +508,8 @@ def numbers(option: str, text: str, counts: tuple[int, ...], what: str) -> Array
         values = np.array([float(part) for part in text.split(",")])
     except ValueError:
         values = np.full(1, np.nan)
-    if len(values) not in counts or not np.isfinite(values).all():
-        raise InputError(f"{option} takes {what}; found '{text}'")
+    good = len(values) in counts and np.isfinite(values).all()
+    require(good, f"{option} takes {what}; found '{text}'")
     return values
 
 

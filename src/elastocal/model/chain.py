@@ -6,13 +6,12 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sized
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal, TypeVar
 
 import numpy as np
 
 from elastocal.cell import Cell
-from elastocal.messages import InputError, did_you_mean, listed, printable, require, rounded, wish
+from elastocal.messages import InputError, check_known, listed, printable, require, rounded, wish
 from elastocal.units import Array, IntArray
 
 JointKind = Literal["revolute", "prismatic"]
@@ -83,10 +82,8 @@ def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
     for name, (low, high) in cell.limits.items():
         i = joint_index(name)
         lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
-        if lower[i] >= upper[i]:
-            raise InputError(
-                f"{cell.source}: [limits] {name} leaves no range inside the robot's own limits"
-            )
+        told = f"[limits] {name} leaves no range inside the robot's own limits"
+        require(lower[i] < upper[i], f"{cell.source}: {told}")
     return lower, upper
 
 
@@ -183,21 +180,17 @@ def plausible(chain: Chain, source: object) -> Chain:
     ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
     for place, T in zip(places, ends, strict=True):
         length = float(np.linalg.norm(T[:3, 3]))
-        require(
-            length <= MAX_LENGTH,
-            f"{source}: {length:g} m before {place} is too long for a link; correct it",
-        )
+        told = f"{source}: {length:g} m before {place} is too long for a link; correct it"
+        require(length <= MAX_LENGTH, told)
     whole = extent(chain)
-    require(
-        whole <= MAX_LENGTH,
-        f"{source}: the links are {whole:g} m long together, which no arm is; if its lengths are "
-        "millimetres, state them in m (DH table: d_mm, a_mm)",
-    )
-    require(
-        whole >= MIN_LENGTH,
-        f"{source}: the links are {rounded(whole * 1e3)} mm long together, which no arm is; if its "
-        "lengths are metres, state them so (DH table: d_m, a_m)",
-    )
+    for good, size, meant in (
+        (whole <= MAX_LENGTH, f"{whole:g} m",
+         "millimetres, state them in m (DH table: d_mm, a_mm)"),
+        (whole >= MIN_LENGTH, f"{rounded(whole * 1e3)} mm",
+         "metres, state them so (DH table: d_m, a_m)"),
+    ):  # fmt: skip
+        told = f"the links are {size} long together, which no arm is; if its lengths are {meant}"
+        require(good, f"{source}: {told}")
     for i, body in enumerate(chain.masses, start=1):
         for found, most, told in (
             (body.mass, MAX_MASS, "kg is too heavy"),
@@ -212,10 +205,8 @@ def plausible(chain: Chain, source: object) -> Chain:
 def check_angles(where: str, angles: tuple[float, ...], meant: str) -> None:
     """Raise InputError where an angle in rad is beyond two turns; `meant`: the file's unit."""
     worst = max(map(abs, angles), default=0.0)
-    require(
-        worst <= MAX_ANGLE,
-        f"{where}: {worst:g} rad is more than two turns; {meant}: convert degrees",
-    )
+    told = f"{where}: {worst:g} rad is more than two turns; {meant}: convert degrees"
+    require(worst <= MAX_ANGLE, told)
 
 
 def jaw_told(chain: Chain, moved: str = "") -> list[str]:
@@ -346,8 +337,8 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
     known, clash = _meanings(chain, cell.robot.joint_names)
     at = f"{cell.source}: "
 
-    def one(name: str, where: str, others: bool = False) -> str:
-        """jointN of a name that stands at `where`; with `others` what is no joint stays."""
+    def loose(name: str, where: str) -> str:
+        """jointN of a name that stands at `where`; what is no joint stays."""
         if name in clash:
             raise InputError(
                 f"{where} names {name}, which in the robot's file is joint number "
@@ -355,24 +346,19 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
                 'is meant: [robot] joint_names = "file" (names of the file) or "order" (jointN is '
                 "the Nth)"
             )
-        if name in known or others:
-            return known.get(name, name)
-        raise InputError(
-            f"{where} names {name}, but robot '{chain.name}' has {chain.n_joints} joints"
-            f"{did_you_mean(name, known)}; they are {listed(known)}"
-        )
+        return known.get(name, name)
 
-    loose = partial(one, others=True)
+    def one(name: str, where: str) -> str:
+        told = f"{where} names {name}, but robot '{chain.name}' has {chain.n_joints} joints"
+        check_known(name, known, told, "they are")
+        return loose(name, where)
 
     def keys(
         table: Mapping[str, Value], where: str, of: Callable[[str, str], str]
     ) -> dict[str, Value]:
         found = {of(name, where): value for name, value in table.items()}
-        if len(found) < len(table):
-            raise InputError(
-                f"{where} names a joint twice, by its name in the robot's file and by its number "
-                f"({names_told(chain)}); keep one"
-            )
+        told = f"{where} names a joint twice, by its name in the robot's file and by its number"
+        require(len(found) == len(table), f"{told} ({names_told(chain)}); keep one")
         return found
 
     spec, wishes = cell.model, cell.design

@@ -12,18 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from elastocal import messages, tables
 from elastocal.cell_tables import Convention
 from elastocal.files import read_text
-from elastocal.messages import (
-    InputError,
-    check_known,
-    did_you_mean,
-    listed,
-    option,
-    quoted,
-    require,
-    rounded,
-)
+from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require, rounded
 from elastocal.model import rigid
 from elastocal.model.chain import (
     MAX_ANGLE,
@@ -39,16 +31,7 @@ from elastocal.model.chain import (
     near_the_arm,
 )
 from elastocal.model.rigid import nominal_flanges
-from elastocal.tables import (
-    NO_UNIT,
-    Column,
-    Columns,
-    Family,
-    RawTable,
-    check_columns,
-    match_columns,
-    read_table,
-)
+from elastocal.tables import NO_UNIT, Column, Columns, Family, RawTable
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
@@ -115,15 +98,12 @@ def read_dh(
     table = read_dh_table(path)
     kinds = [_kind(table, i) for i in range(len(table.row))]
     moving = [i for i, kind in enumerate(kinds) if kind is not None]
-    if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
-        raise InputError(
-            f"{path}: {len(moving)} rows below the header, one per joint; "
-            f"{MIN_JOINTS} to {MAX_JOINTS} joints are supported"
-        )
+    told = f"{len(moving)} rows below the header, one per joint; {MIN_JOINTS} to {MAX_JOINTS}"
+    require(MIN_JOINTS <= len(moving) <= MAX_JOINTS, f"{path}: {told} joints are supported")
     names = [table.text(i, "joint") or f"joint{k}" for k, i in enumerate(moving, start=1)]
     for i, name in zip(moving, names, strict=True):
-        if names.count(name) > 1:
-            raise InputError(f"{table.where(i, 'joint')}: '{name}' appears twice; rename one")
+        told = f"{table.where(i, 'joint')}: '{name}' appears twice; rename one"
+        require(names.count(name) == 1, told)
     joints, after, passed = list[Joint](), list[Array](), np.eye(4)
     for i, kind in enumerate(kinds):
         theta0, alpha, beta = (
@@ -136,11 +116,10 @@ def read_dh(
             passed = passed @ T_before @ T_after
             continue
         sign = dh_number(table, i, "sign", "sign")
-        require(
-            sign in (1.0, -1.0) or math.isnan(sign),
-            f"{table.where(i, 'sign')}: {sign:g}; write 1, or -1 where the joint turns against z",
-        )
-        axis, name = np.array(Z) * (-1.0 if sign == -1.0 else 1.0), names[len(joints)]
+        sign = 1.0 if math.isnan(sign) else sign
+        told = f"{sign:g}; write 1, or -1 where the joint turns against z"
+        require(sign in (1.0, -1.0), f"{table.where(i, 'sign')}: {told}")
+        axis, name = np.array(Z) * sign, names[len(joints)]
         joints.append(Joint(name, kind, passed @ T_before, axis, *_limits(table, i, kind)))
         passed = T_after
         after.append(T_after)
@@ -164,13 +143,15 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
 
     def choose(header: Sequence[str]) -> Columns:
         every = listed(way for f in known for stem in f.units for way in f.columns(stem))
-        found = match_columns(
+        found = tables.match_columns(
             str(path), header, named, explain=partial(_no_table, what), called=CALLED,
             valid=f"; a {what} takes {every}",
         )  # fmt: skip
-        return check_columns(str(path), found, named, [(n,) for n in needed], f"a {what} needs")
+        return tables.check_columns(
+            str(path), found, named, [(n,) for n in needed], f"a {what} needs"
+        )
 
-    return read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
+    return tables.read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
 
 
 def link(
@@ -249,11 +230,9 @@ def _kind(table: RawTable, i: int) -> JointKind | None:
         return None
     if kind in ("", "revolute", "prismatic"):
         return "prismatic" if kind == "prismatic" else "revolute"
-    raise InputError(
-        f"{table.where(i, 'type')}: unknown joint type '{kind}'"
-        f"{did_you_mean(kind, ('revolute', 'prismatic', *STILL))}; valid: revolute, prismatic, "
-        "fixed"
-    )
+    hint = did_you_mean(kind, ("revolute", "prismatic", *STILL))
+    told = f"unknown joint type '{kind}'{hint}; valid: revolute, prismatic, fixed"
+    raise InputError(f"{table.where(i, 'type')}: {told}")
 
 
 def _limits(table: RawTable, i: int, kind: JointKind) -> tuple[float, float]:
@@ -280,24 +259,19 @@ def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[L
     known |= {name: i for i, name in enumerate(names)}
     found: dict[int, LinkMass] = {}
     for k in range(len(table.row)):
-        text, i = table.text(k, "link"), known.get(table.text(k, "link"))
-        if i is None:
-            raise InputError(
-                f"{table.where(k, 'link')}: unknown link '{text}'"
-                f"{did_you_mean(text, (*numbered, *names))}; valid: {listed(numbered)} or the "
-                "joints' names"
-            )
-        if i in found:
-            raise InputError(f"{table.where(k, 'link')}: '{text}' appears twice")
+        text, where = table.text(k, "link"), table.where(k, "link")
+        if (i := known.get(text)) is None:
+            hint = f"{did_you_mean(text, (*numbered, *names))}; valid: {listed(numbered)}"
+            raise InputError(f"{where}: unknown link '{text}'{hint} or the joints' names")
+        require(i not in found, f"{where}: '{text}' appears twice")
         mass = dh_number(table, k, "mass", "mass")
         com = [dh_number(table, k, "com", f"com_{axis}") for axis in "xyz"]
-        if mass < 0:
-            raise InputError(f"{table.where(k, 'mass_kg')}: {mass:g} is negative; give 0 or more")
+        told = f"{table.where(k, 'mass_kg')}: {mass:g} is negative; give 0 or more"
+        require(not mass < 0, told)
         found[i] = LinkMass(mass, (after[i] @ np.array([*com, 1.0]))[:3])
-    if missing := [link for i, link in enumerate(numbered) if i not in found]:
-        raise InputError(
-            f"{path}: no row for {listed(missing)}; give every link, with mass_kg 0 if it has none"
-        )
+    missing = [link for i, link in enumerate(numbered) if i not in found]
+    told = f"no row for {listed(missing)}; give every link, with mass_kg 0 if it has none"
+    require(not missing, f"{path}: {told}")
     return tuple(found[i] for i in range(len(names)))
 
 
@@ -336,21 +310,17 @@ FARTHEST = 0.03  # m
 
 
 def _of_deviations(path: Path, text: str, ur_model: str | None) -> Chain:
-    sections = _sections(path, text)
-    require(
-        "mounting" in sections,
-        f"{path}: has no section [mounting] with delta_theta, delta_a, delta_d, delta_alpha, as a "
-        "calibration.conf of Universal Robots has",
-    )
-    own = sections["mounting"]
-    delta = np.array([_six(path, own, f"delta_{name}") for name in ("theta", "a", "d", "alpha")])
+    sections, keys = _sections(path, text), ("delta_theta", "delta_a", "delta_d", "delta_alpha")
+    told = f"has no section [mounting] with {', '.join(keys)}, as a calibration.conf of Universal"
+    require("mounting" in sections, f"{path}: {told} Robots has")
+    delta = np.array([_six(path, sections["mounting"], key) for key in keys])
     check_angles(f"{path}: delta_theta", tuple(delta[0]), "this file is in rad")
     chain, far = _apart(path, delta, _nominal(path, sections, ur_model, delta))
-    require(
-        far <= FARTHEST,
-        f"{path}: the arm is {far * 1e3:.0f} mm away from the nominal one, and factory "
-        f"calibrations are millimetres; it fits {_fitting(path, delta) or 'no known robot'}",
-    )
+    if far > FARTHEST:
+        raise InputError(
+            f"{path}: the arm is {far * 1e3:.0f} mm away from the nominal one, and factory "
+            f"calibrations are millimetres; it fits {_fitting(path, delta) or 'no known robot'}"
+        )
     longest = float(np.abs(delta[2]).max())
     told = (
         f"d of up to {rounded(longest, 4)} m in the controller's table cancel: joint frames are "
@@ -391,7 +361,8 @@ def _nominal(
     if model is not None:
         by_name = {name.lower(): name for name in NOMINAL}
         known = by_name.get(model.lower().replace(" ", ""), model)
-        check_known(known, NOMINAL, f"{path}: the robot '{model}' is not known", "known are")
+        told = f"{path}: the robot '{model}' is not known"
+        messages.check_known(known, NOMINAL, told, "known are")
         return _published(known)
     beside = path.with_name(CONTROLLER)
     if "DH" not in sections and beside.is_file():
@@ -419,9 +390,8 @@ def _sections(path: Path, text: str) -> Mapping[str, Mapping[str, str]]:
 
 
 def _six(path: Path, section: Mapping[str, str], key: str) -> list[float]:
-    text = section.get(key)
-    require(text is not None, f"{path}: {key} is missing; it takes six numbers in [ ]")
-    words = str(text).strip().strip("[]").split(",")
+    require(key in section, f"{path}: {key} is missing; it takes six numbers in [ ]")
+    words = section[key].strip().strip("[]").split(",")
     require(len(words) == 6, f"{path}: {key} has {len(words)} numbers; a UR has six joints")
     return [_number(f"{path}: {key}", word.strip()) for word in words]
 
@@ -443,18 +413,16 @@ def _of_origins(path: Path, text: str) -> Chain:
         found = yaml.safe_load(text)
     except (yaml.YAMLError, RecursionError, ValueError):
         raise InputError(f"{path}: not YAML; save the file of ur_calibration again") from None
-    kinematics = found.get("kinematics") if isinstance(found, dict) else None
-    if not isinstance(kinematics, dict):
-        raise InputError(
-            f"{path}: has no 'kinematics' with {listed(LINKS)}, as a file of ur_calibration has"
-        )
+    kinematics: Any = found.get("kinematics") if isinstance(found, dict) else None
+    told = f"has no 'kinematics' with {listed(LINKS)}, as a file of ur_calibration has"
+    require(isinstance(kinematics, dict), f"{path}: {told}")
     joints = []
     for name, of_link in zip(JOINTS, LINKS, strict=True):
-        origin = kinematics.get(of_link)
-        if not isinstance(origin, dict) or any(key not in origin for key in ORIGIN):
-            raise InputError(f"{path}: kinematics.{of_link} needs {', '.join(ORIGIN)}")
-        numbers = [_number(f"{path}: kinematics.{of_link}.{key}", origin[key]) for key in ORIGIN]
-        check_angles(f"{path}: kinematics.{of_link}", tuple(numbers[3:]), "the file is in rad")
+        origin, where = kinematics.get(of_link), f"{path}: kinematics.{of_link}"
+        complete = isinstance(origin, dict) and all(key in origin for key in ORIGIN)
+        require(complete, f"{where} needs {', '.join(ORIGIN)}")
+        numbers = [_number(f"{where}.{key}", origin[key]) for key in ORIGIN]
+        check_angles(where, tuple(numbers[3:]), "the file is in rad")
         T = pose_at(numbers[:3], rotation_from_rpy(numbers[3:]))
         joints.append(Joint(name, "revolute", T, np.array([0.0, 0.0, 1.0])))
     return Chain(path.stem, tuple(joints), np.eye(4))

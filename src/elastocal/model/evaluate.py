@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.messages import did_you_mean, require
+from elastocal.messages import InputError, check_known
 
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
 
@@ -151,13 +151,10 @@ FEW, FEW_ONCE = 77, 1500  # rows of a block
 
 def checked(name: str, source: str) -> str:
     """`name` where it is a backend; InputError that says where it comes from otherwise."""
-    hint = f"unknown backend '{name}'{did_you_mean(name, BACKENDS)}; valid: {', '.join(BACKENDS)}"
     if name == "compiled":
-        hint = (
-            "the backend 'compiled' is gone, as numpy evaluates tables nearly as fast; take auto, "
-            "or leave it out"
-        )
-    require(name in BACKENDS, f"{source}: {hint}")
+        gone = "the backend 'compiled' is gone, as numpy evaluates tables nearly as fast"
+        raise InputError(f"{source}: {gone}; take auto, or leave it out")
+    check_known(name, BACKENDS, f"{source}: unknown backend '{name}'", "valid:")
     return name
 
 

@@ -221,11 +221,9 @@ class Model(ByValue):
             >>> model.deflection(table).shape
             (1, 6)
         """
-        found = np.shape(np.atleast_2d(q))
-        require(
-            0 < len(found) <= 2 and found[0] > 0 and found[-1] == self.chain.n_joints,
-            f"q takes {self.chain.n_joints} joints per row; found an array of shape {np.shape(q)}",
-        )
+        found, n = np.shape(np.atleast_2d(q)), self.chain.n_joints
+        told = f"q takes {n} joints per row; found an array of shape {np.shape(q)}"
+        require(0 < len(found) <= 2 and found[0] > 0 and found[-1] == n, told)
         marker = next(iter(self.cell.tool.markers), DEFAULT_MARKER)
         return table_of(q, position, force, marker, self.chain.kinds)
 
@@ -363,17 +361,10 @@ class Model(ByValue):
         """Parameter values (parameters,), the nominal ones by default; or `several` (k, …)."""
         if x is None:
             return self.nominal
-        values = np.asarray(x)
-        require(
-            (
-                values.shape[-1:] == (len(self.parameters),)
-                and 0 < values.ndim <= 1 + several
-                and values.size > 0
-            )
-            or not self.parameters,
-            f"{option('x')} takes {len(self.parameters)} numbers, one for each parameter; found "
-            f"an array of shape {values.shape}",
-        )
+        values, n = np.asarray(x), len(self.parameters)
+        fits = values.shape[-1:] == (n,) and 0 < values.ndim <= 1 + several and values.size > 0
+        told = f"takes {n} numbers, one for each parameter; found an array of shape {values.shape}"
+        require(fits or not n, f"{option('x')} {told}")
         return values
 
     @checked_arguments
@@ -475,9 +466,9 @@ NOMINAL = "check force_*_N and [model.nominal] joint_compliance, which is in rad
 
 def check_equilibrium(table: Measurements, predicted: Array, remedy: str = NOMINAL) -> None:
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
-    if len(bad):
+    for i in bad[:1]:
         raise InputError(
-            f"{table.source}, line {table.row[bad[0]]}: no static equilibrium under this load "
+            f"{table.source}, line {table.row[i]}: no static equilibrium under this load "
             f"({len(bad)} rows); the compliances are too large for the force: {remedy}"
         )
 
@@ -489,29 +480,22 @@ def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
 
 def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
     lost = [choice.name for choice in cell.model.effects if choice.name not in CATALOGUE]
-    require(
-        not lost,
-        f"{cell.source}: the effect {listed(lost)} was registered where the model was "
-        "pickled and does not travel with it; put it in a file that [plugins] of the cell names",
-    )
+    told = f"the effect {listed(lost)} was registered where the model was pickled and does not"
+    remedy = "travel with it; put it in a file that [plugins] of the cell names"
+    require(not lost, f"{cell.source}: {told} {remedy}")
     return Model.assembled(chain, cell, *more)
 
 
 def load_chain(cell: Cell) -> Chain:
+    from elastocal.model import dh, mjcf, urdf  # late: a model in memory needs no reader
+
     robot = cell.robot
-    # Each reader loads what its kind of file needs.
     if robot.mjcf is not None:
-        from elastocal.model.mjcf import read_mjcf
-
-        chain = read_mjcf(robot.mjcf, robot.base, robot.flange)
+        chain = mjcf.read_mjcf(robot.mjcf, robot.base, robot.flange)
     elif robot.urdf is not None:
-        from elastocal.model.urdf import read_urdf
-
-        chain = read_urdf(robot.urdf, robot.base, robot.flange)
+        chain = urdf.read_urdf(robot.urdf, robot.base, robot.flange)
     elif robot.dh is not None:
-        from elastocal.model.dh import read_dh
-
-        chain = read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
+        chain = dh.read_dh(robot.dh, robot.dh_convention, robot.masses, robot.ur_model)
     else:
         raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
     return plausible(chain, robot.masses or robot.mjcf or robot.urdf or robot.dh)

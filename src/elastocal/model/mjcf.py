@@ -30,9 +30,9 @@ from scipy.spatial.transform import Rotation
 from elastocal.files import check_size
 from elastocal.messages import InputError, listed, printable, quoted, require
 from elastocal.model import rigid
-from elastocal.model.chain import Chain, JointKind, LinkMass, check_angles
+from elastocal.model.chain import Chain, LinkMass, check_angles
 from elastocal.model.effects.statics import STANDARD_GRAVITY
-from elastocal.model.urdf import MAX_BYTES, FileJoint, Tag, Tree, XmlFile
+from elastocal.model.urdf import MAX_BYTES, MOVING, FileJoint, Tag, Tree, XmlFile
 from elastocal.units import Array, pose_at
 
 WORLD = 0  # MuJoCo's number of the world body
@@ -82,11 +82,9 @@ class MjcfArm:
         else:
             file = XmlFile(path, text.encode("utf-8"), "an MJCF file")
         root = file.root.name
-        hint = '; this is a URDF, give it as urdf = "…"' if root == "robot" else ""
-        require(
-            root == "mujoco",
-            f"{path}: the root element is <{printable(root)}>, an MJCF file has <mujoco>{hint}",
-        )
+        hint = '; this is a URDF, give it as urdf = "…"' * (root == "robot")
+        wrong = f"{path}: the root element is <{printable(root)}>, an MJCF file has <mujoco>{hint}"
+        require(root == "mujoco", wrong)
         check_bounds(file)
         spec = parsed(path, text)
         _check_units(path, spec)
@@ -142,19 +140,17 @@ class MjcfArm:
 
     def upright(self) -> tuple[Array, str]:
         """Rotation (3, 3) of the file's world that turns its gravity down, and who says so."""
-        gravity = np.array(self.model.opt.gravity)
-        size = float(np.linalg.norm(gravity))
-        base = f"body '{self.base}'"
+        size = float(np.linalg.norm(self.model.opt.gravity))
         if size < SMALLEST_GRAVITY:
             return np.eye(3), "guess: the file has no gravity; its z is taken as up"
-        up = -gravity / size
+        up = -np.array(self.model.opt.gravity) / size
         if np.abs(up - [0.0, 0.0, 1.0]).max() < 1e-9:
-            return np.eye(3), f"of {base} in the file, z up"
+            return np.eye(3), f"of body '{self.base}' in the file, z up"
         # The shortest turn; about x where the file stands on its head.
         turn = np.diag([1.0, -1.0, -1.0])
         if np.abs(up[:2]).max() > 1e-9:
             turn = Rotation.align_vectors([0.0, 0.0, 1.0], up)[0].as_matrix()
-        return turn, f"of {base}, up against the file's gravity"
+        return turn, f"of body '{self.base}', up against the file's gravity"
 
     def _weights_told(self) -> list[str]:
         import mujoco
@@ -269,24 +265,18 @@ def _tree(
     return Tree(path, name, links, tuple(joints), "bodies and sites", frames)
 
 
-def _joint(model: Any, j: int, parent: str, child: str, T: Array) -> FileJoint:
-    import mujoco
+KINDS = "free", "a ball joint", "prismatic", "revolute"  # of joints, as MuJoCo numbers them
 
-    kinds, name = mujoco.mjtJoint, model.joint(j).name
-    other = {int(kinds.mjJNT_FREE): "free", int(kinds.mjJNT_BALL): "a ball joint"}
-    if kind := other.get(int(model.jnt_type[j])):
+
+def _joint(model: Any, j: int, parent: str, child: str, T: Array) -> FileJoint:
+    name, kind = model.joint(j).name, KINDS[model.jnt_type[j]]
+    if kind not in MOVING:
         return FileJoint(name, kind, parent, child, T, np.zeros(3), number=j)
     lower, upper = map(float, model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf))
     return FileJoint(
-        name, motion_of(model, j), parent, child, T @ before(model, j),
-        np.array(model.jnt_axis[j]), (lower, upper),
-        rest=float(model.qpos0[model.jnt_qposadr[j]]), number=j,
+        name, kind, parent, child, T @ before(model, j), np.array(model.jnt_axis[j]),
+        (lower, upper), rest=float(model.qpos0[model.jnt_qposadr[j]]), number=j,
     )  # fmt: skip
-
-
-def motion_of(model: Any, j: int) -> JointKind:
-    slides = model.jnt_type[j] == import_mujoco().mjtJoint.mjJNT_SLIDE
-    return "prismatic" if slides else "revolute"
 
 
 def joints_of(model: Any, body: int) -> list[int]:
@@ -299,7 +289,7 @@ def joints_of(model: Any, body: int) -> list[int]:
 def before(model: Any, j: int) -> Array:
     """X (4, 4): the frame of joint j at zero in its body's, Trans(p) J(a, −r)."""
     rest = float(model.qpos0[model.jnt_qposadr[j]])
-    turned = rigid.moved(motion_of(model, j), model.jnt_axis[j], -rest)
+    turned = rigid.moved(KINDS[model.jnt_type[j]], model.jnt_axis[j], -rest)
     return pose_at(model.jnt_pos[j]) @ turned
 
 
@@ -312,9 +302,8 @@ def import_mujoco(what: str = "a MuJoCo model") -> Any:
     try:
         import mujoco
     except ImportError:
-        raise InputError(
-            f"{what} needs MuJoCo, which is not installed; run: pip install elastocal[mujoco]"
-        ) from None
+        told = "needs MuJoCo, which is not installed; run: pip install elastocal[mujoco]"
+        raise InputError(f"{what} {told}") from None
     return mujoco
 
 
@@ -440,6 +429,7 @@ LARGEST: dict[str, dict[str, float]] = {
     "composite": {"subgrid": 10},
 }  # fmt: skip
 NAMES = ("name", "class", "childclass", "model", "prefix", "file")
+NAN = re.compile(r"(?i)(?<!\S)[-+]?nan(?!\S)")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
 _UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
 
@@ -449,11 +439,9 @@ def check_bounds(file: XmlFile) -> None:
     Counted are elements as often as they are replicated, included or attached, and sizes; included
     models are regular files in its folder."""
     weight = _Model(file.path).weight_of(file)
-    require(
-        weight <= MOST_ELEMENTS,
-        f"{file.path}: makes {weight:.3g} elements of all it replicates and includes; more than "
-        f"{MOST_ELEMENTS} are no arm, so keep the arm alone",
-    )
+    told = f"makes {weight:.3g} elements of all it replicates and includes; more than"
+    remedy = f"{MOST_ELEMENTS} are no arm, so keep the arm alone"
+    require(weight <= MOST_ELEMENTS, f"{file.path}: {told} {remedy}")
 
 
 class _Model:
@@ -472,27 +460,22 @@ class _Model:
             self._text += len(file.data)
             check_size(path, "MuJoCo model with all it includes", self._text, MAX_BYTES)
             self._weights[real] = self._weight(file, file.root)
-        require(
-            not math.isnan(self._weights[real]), f"{path}: includes itself; take out the <include>"
-        )
+        told = f"{path}: includes itself; take out the <include>"
+        require(not math.isnan(self._weights[real]), told)
         return self._weights[real]
 
     def _weight(self, file: XmlFile, tag: Tag) -> float:
         for key, text in tag.stated.items():
             stated = f"{file.path}: <{printable(tag.name)} {printable(key)}={quoted(text)}>"
-            require(
-                key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
-                f"{stated} is no number; correct it",
-            )
-            largest = LARGEST.get(tag.name, {}).get(key, math.inf)
-            require(
-                max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
-                f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
-            )
-            require(
-                (tag.name, key) != ("flexcomp", "file"),
-                f"{stated} makes a body of every vertex of a file, which no arm needs; take it out",
-            )
+            most = LARGEST.get(tag.name, {}).get(key, math.inf)
+            for wrong, told in (
+                (key not in NAMES and NAN.search(text), "is no number; correct it"),
+                (most < math.inf and max(_numbers(text), default=0.0) > most,
+                 f"asks for more than {most:g}, which no arm needs; take it out"),
+                ((tag.name, key) == ("flexcomp", "file"),
+                 "makes a body of every vertex of a file, which no arm needs; take it out"),
+            ):  # fmt: skip
+                require(not wrong, f"{stated} {told}")
         inside = 1 + sum(self._weight(file, child) for child in tag.inside)
         return _count(tag) * (inside + sum(self._named(file, tag)))
 
@@ -507,11 +490,9 @@ class _Model:
         # Beside the model or beside the file itself, as versions of MuJoCo differ.
         for found in {self._folder / name, file.path.parent / name}:
             if os.path.lexists(found):
-                require(
-                    any(found.resolve().is_relative_to(root) for root in self._roots),
-                    f"{file.path}: includes {printable(name)}, which is outside its folder; "
-                    "put a copy there",
-                )
+                inside = any(found.resolve().is_relative_to(root) for root in self._roots)
+                told = f"includes {printable(name)}, which is outside its folder; put a copy there"
+                require(inside, f"{file.path}: {told}")
                 yield self.weight_of(XmlFile.read(found, "included model", "an MJCF file"))
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import codecs
 import math
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
@@ -21,19 +21,11 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from elastocal import messages
 from elastocal.files import DEEPEST, read_bytes
-from elastocal.messages import SHOWN, InputError, did_you_mean, listed, printable, require
-from elastocal.model import rigid
-from elastocal.model.chain import (
-    FINGERS,
-    MAX_JOINTS,
-    MIN_JOINTS,
-    Chain,
-    Joint,
-    JointKind,
-    LinkMass,
-    check_angles,
-)
+from elastocal.messages import InputError, check_known, did_you_mean, listed, printable, require
+from elastocal.model import chain, rigid
+from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
 from elastocal.units import Array, pose_at, rotation_from_rpy
 
 # An XML file, edited so that all else stays to the byte.
@@ -49,11 +41,11 @@ END_OF_TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a > in quotes i
 
 @dataclass(eq=False)
 class Tag:
-    """A start tag: its name without prefix, its offset in bytes, what it states, the tags that
-    stand in it and the one that it stands in."""
+    """A start tag: its name without and with its prefix, its offset in bytes, what it states, the
+    tags that stand in it and the one that it stands in."""
 
     name: str
-    prefix: str
+    whole: str
     start: int
     stated: dict[str, str]
     above: Tag | None
@@ -80,45 +72,31 @@ class XmlFile:
     more text than memory holds."""
 
     def __init__(self, path: Path, data: bytes, what: str) -> None:
-        start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+        head = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
         require(
-            not start.startswith(b"version https://git-lfs"),
+            not head.startswith(b"version https://git-lfs"),
             f"{path}: is a pointer of Git LFS, not {what}; run git lfs pull, or download the file",
         )
         require(
-            not start.startswith((b"<!doctype html", b"<html")),
+            not head.startswith((b"<!doctype html", b"<html")),
             f"{path}: is a web page, not {what}; download the file itself (on GitHub: Raw)",
         )
         self.path, self.what = path, what
         # A carriage return by itself ends a line in XML, and is a control character elsewhere.
-        self.data = re.sub(rb"\r(?!\n)", b"\n", as_utf8(path, data))
+        self.data = re.sub(rb"\r(?!\n)", b"\n", _as_utf8(path, data))
         self.tags: list[Tag] = []
         self.end = len(self.data)
-        self._inserted: list[tuple[int, int, bytes]] = []
-        self._changed: dict[int, dict[str, str | None]] = {}
-        self._parse()
-
-    @classmethod
-    def read(cls, path: Path, file: str, what: str) -> XmlFile:
-        return cls(path, read_bytes(path, file, MAX_BYTES), what)
-
-    @property
-    def root(self) -> Tag:
-        return self.tags[0]
-
-    def _parse(self) -> None:
-        parser = expat.ParserCreate("utf-8")
+        self._edits: dict[tuple[int, int], str] = {}  # what stands from byte to byte
         open_: list[Tag] = []
 
         def start(name: str, stated: dict[str, str]) -> None:
             require(
                 len(open_) < DEEPEST,
-                f"{self.path}: <{printable(name)}> is nested more than {DEEPEST} deep, which no "
-                "robot needs",
+                f"{path}: <{printable(name)}> is nested more than {DEEPEST} deep, which no robot "
+                "needs",
             )
-            prefix, _, bare = name.rpartition(":")
             above = open_[-1] if open_ else None
-            tag = Tag(bare, prefix, parser.CurrentByteIndex, stated, above)
+            tag = Tag(name.rpartition(":")[2], name, parser.CurrentByteIndex, stated, above)
             self.tags.append(tag)
             open_.append(tag)
             if above is not None:
@@ -130,33 +108,44 @@ class XmlFile:
                 self.end = parser.CurrentByteIndex
 
         def doctype(*_: object) -> None:
-            raise InputError(
-                f"{self.path}: has a <!DOCTYPE>, which {self.what} does not; remove it"
-            )
+            raise InputError(f"{path}: has a <!DOCTYPE>, which {what} does not; remove it")
 
-        parser.StartElementHandler, parser.EndElementHandler = start, end
+        parser = expat.ParserCreate("utf-8")
+        parser.StartElementHandler = start
+        parser.EndElementHandler = end
         parser.StartDoctypeDeclHandler = doctype
         try:
             parser.Parse(self.data, True)
         except expat.ExpatError as error:
             told = str(error).partition(": line")[0]
-            reason = _around(self.data) or _undeclared(self.data) or (
-                f"{told} in line {error.lineno}, column {error.offset + 1}; {self.what} is an XML "
-                "file"
-            )  # fmt: skip
-            raise InputError(f"{self.path}: not XML: {reason}") from None
+            place = f"in line {error.lineno}, column {error.offset + 1}; {what} is an XML file"
+            reason = _unlike_xml(self.data) or f"{told} {place}"
+            raise InputError(f"{path}: not XML: {reason}") from None
+
+    @classmethod
+    def read(cls, path: Path, file: str, what: str) -> XmlFile:
+        return cls(path, read_bytes(path, file, MAX_BYTES), what)
+
+    @property
+    def root(self) -> Tag:
+        return self.tags[0]
 
     def insert(self, at: int, text: str) -> None:
-        self._inserted.append((at, at, text.encode("utf-8")))
+        self._edits[at, at] = self._edits.get((at, at), "") + text
 
     def insert_in(self, tag: Tag, text: str) -> None:
-        self.insert(self._end(tag.start), text)
+        self.insert(self._place(tag)[1], text)
 
     def remove(self, tag: Tag) -> None:
-        self._inserted.append((tag.start, self._end(tag.start), b""))
+        self._edits[self._place(tag)] = ""
 
     def set(self, tag: Tag, stated: Mapping[str, str], without: Collection[str] = ()) -> None:
-        self._changed.setdefault(tag.start, {}).update(dict.fromkeys(without) | dict(stated))
+        kept = {key: value for key, value in tag.stated.items() if key not in without}
+        tag.stated = kept | dict(stated)
+        start, end = self._place(tag)
+        new = element(tag.whole, tag.stated)
+        closed = self.data.endswith(b"/>", start, end)
+        self._edits[start, end] = new if closed else f"{new[:-2]}>"
 
     def set_in(self, tag: Tag, name: str, stated: Mapping[str, str]) -> None:
         if inside := tag.first(name):
@@ -166,32 +155,15 @@ class XmlFile:
 
     def result(self) -> str:
         parts, last = [], 0
-        changed = [self._edit(start, stated) for start, stated in self._changed.items()]
-        for start, end, new in sorted([*self._inserted, *changed], key=lambda edit: edit[:2]):
-            parts += [self.data[last:start], new]
+        for (start, end), new in sorted(self._edits.items()):
+            parts += [self.data[last:start], new.encode("utf-8")]
             last = end
         return b"".join([*parts, self.data[last:]]).decode("utf-8")
 
-    def _end(self, start: int) -> int:
-        found = END_OF_TAG.match(self.data, start)
+    def _place(self, tag: Tag) -> tuple[int, int]:
+        found = END_OF_TAG.match(self.data, tag.start)
         assert found, "a parsed tag ends"
-        return found.end()
-
-    def _edit(self, start: int, stated: Mapping[str, str | None]) -> tuple[int, int, bytes]:
-        end = self._end(start)
-        tag = self.data[start:end].decode("utf-8")
-        for name, value in stated.items():
-            pattern = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
-            found = pattern.search(tag)
-            if value is None:
-                tag = pattern.sub("", tag)
-            elif found is not None:
-                tag = tag[: found.start(2)] + quoteattr(value) + tag[found.end(2) :]
-            else:
-                body = tag[:-1].rstrip().removesuffix("/").rstrip()
-                closing = "/>" if tag.endswith("/>") else ">"
-                tag = f"{body} {name}={quoteattr(value)}{closing}"
-        return start, end, tag.encode("utf-8")
+        return tag.start, found.end()
 
 
 def element(tag: str, stated: Mapping[str, str], *inside: str) -> str:
@@ -203,7 +175,7 @@ def comment(text: str) -> str:
     return f"<!-- {text.replace('--', '- -').rstrip('-')} -->"
 
 
-def as_utf8(path: Path, data: bytes) -> bytes:
+def _as_utf8(path: Path, data: bytes) -> bytes:
     declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
     name = declared.group(2).strip("\"'") if declared else "utf-8"
     name = "utf-16" if data.startswith(UTF16) else name
@@ -216,9 +188,12 @@ def as_utf8(path: Path, data: bytes) -> bytes:
     return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
 
 
-def _around(data: bytes) -> str:
+def _unlike_xml(data: bytes) -> str:
+    """Of a text that is no XML why, where that is plainer than what the parser says."""
+
     def first_line(text: bytes) -> str:
-        return printable(text.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        first = text.strip().decode("utf-8", "replace").partition("\n")[0]
+        return printable(first[: messages.SHOWN])
 
     head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
     before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
@@ -230,10 +205,6 @@ def _around(data: bytes) -> str:
     after = data[tail.end() :] if tail else b""
     if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
         return f"'{first_line(after)}' stands after the end of the robot; remove that"
-    return ""
-
-
-def _undeclared(data: bytes) -> str:
     try:
         data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -313,9 +284,7 @@ class Tree:
                 f"{self.path}: link '{joint.child}' has two parents, joints '{joint.name}' and "
                 f"'{other.name}'; kinematic loops are not supported, remove one of them",
             )
-        roots = [name for name in self.links if name not in self.parent_joint]
-        reached = {link for root in roots for link in self._below(root)}
-        if lost := [name for name in self.links if name not in reached]:
+        if lost := [name for name in self.links if name not in self.ways]:
             way = [lost[0]]
             while way.count(way[-1]) < 2:
                 way.append(self.parent_joint[way[-1]].parent)
@@ -325,9 +294,9 @@ class Tree:
                 "that hangs on no root link; loops are not supported, open it at one joint"
             )
         require(
-            len(roots) == 1,
-            f"{self.path}: {len(roots)} links have no parent joint: {listed(roots)}; a robot "
-            "is one tree with one root, connect or remove the others",
+            len(self._roots) == 1,
+            f"{self.path}: {len(self._roots)} links have no parent joint: {listed(self._roots)}; a "
+            "robot is one tree with one root, connect or remove the others",
         )
 
     @cached_property
@@ -335,45 +304,45 @@ class Tree:
         return {joint.child: joint for joint in self.joints}
 
     @cached_property
-    def _children(self) -> dict[str, list[str]]:
-        children: dict[str, list[str]] = {name: [] for name in self.links}
+    def ways(self) -> dict[str, tuple[FileJoint, ...]]:
+        """The joints from the root to each link that hangs on one, a link before those on it."""
+        found: dict[str, tuple[FileJoint, ...]] = {}
+        below: dict[str, list[FileJoint]] = {name: [] for name in self.links}
         for joint in self.joints:
-            children[joint.parent].append(joint.child)
-        return children
+            below[joint.parent].append(joint)
+        waiting = [(name, tuple[FileJoint, ...]()) for name in self._roots]
+        while waiting:
+            link, way = waiting.pop()
+            found[link] = way
+            waiting += [(joint.child, (*way, joint)) for joint in below[link]]
+        return found
+
+    @property
+    def _roots(self) -> list[str]:
+        return [name for name in self.links if name not in self.parent_joint]
 
     @property
     def root(self) -> str:
-        return next(name for name in self.links if name not in self.parent_joint)
-
-    def _below(self, link: str) -> Iterator[str]:
-        waiting = [link]
-        while waiting:
-            link = waiting.pop()
-            yield link
-            waiting += self._children[link]
+        return self._roots[0]
 
     def link_of(self, name: str) -> tuple[str, Array]:
         """The link that a name stands for, and its place (4, 4) in that link's frame."""
         return (name, np.eye(4)) if name in self.links else self.frames[name]
 
     def joints_between(self, base: str, flange: str) -> tuple[FileJoint, ...] | None:
-        joints: list[FileJoint] = []
         link = self.link_of(flange)[0]
-        while link != base:
-            if link not in self.parent_joint:
-                return None
-            joints.append(self.parent_joint[link])
-            link = joints[-1].parent
-        return tuple(reversed(joints))
+        places = [*(joint.parent for joint in self.ways[link]), link]
+        return self.ways[link][places.index(base) :] if base in places else None
+
+    def _below(self, base: str) -> list[str]:
+        return [link for link in self.ways if self.joints_between(base, link) is not None]
 
     def find(self, role: str, name: str, usual: str = "") -> str:
         there = [*self.links, *(self.frames if role == "flange" else ())]
         hint = did_you_mean(name, there)
         hint += f" (usual here: '{usual}')" if usual and f"'{usual}'" not in hint else ""
-        require(
-            name in there,
-            f"{self.path}: {role} '{name}' is not there{hint}; {self.parts}: {listed(there)}",
-        )
+        told = f"{self.path}: {role} '{name}' is not there{hint}; {self.parts}: {listed(there)}"
+        require(name in there, told)
         return name
 
     def ends(self, base: str | None, flange: str | None, choose: bool = True) -> tuple[str, str]:
@@ -418,11 +387,9 @@ class Tree:
 
     def _leaves(self, base: str) -> list[str]:
         """Links on which nothing hangs but tool frames that `export` has added."""
-        return [
-            link for link in self._below(base)
-            if not link.startswith(TOOL_FRAMES)
-            and all(child.startswith(TOOL_FRAMES) for child in self._children[link])
-        ]  # fmt: skip
+        parents = {j.parent for j in self.joints if not j.child.startswith(TOOL_FRAMES)}
+        below = (link for link in self._below(base) if link not in parents)
+        return [link for link in below if not link.startswith(TOOL_FRAMES)]
 
     def _end_of_arm(self, base: str, leaves: Sequence[str]) -> str:
         sizes = {leaf: len(self._moving(base, leaf)) for leaf in leaves}
@@ -438,10 +405,10 @@ class Tree:
             before, after = (len(self._moving(*p)) for p in ((base, link), (link, common[-1])))
             if before < MIN_JOINTS or not 0 < after <= MOST_IN_A_FINGER:
                 continue
-            own = ([self.parent_joint[k] for k in self._below(child)]
-                   for child in self._children[link] if child not in common)  # fmt: skip
+            own = ([self.parent_joint[k] for k in self._below(joint.child)] for joint in self.joints
+                   if joint.parent == link and joint.child not in common)  # fmt: skip
             beside = [joints for joints in own if any(joint.moves for joint in joints)]
-            fingers = (j.follows is not None or FINGERS.search(j.name + j.child)
+            fingers = (j.follows is not None or chain.FINGERS.search(j.name + j.child)
                        for joints in beside for j in joints)  # fmt: skip
             if len(beside) > 1 or any(fingers):
                 return link
@@ -451,8 +418,7 @@ class Tree:
         return [j for j in self.joints_between(base, flange) or () if j.moves]
 
     def placed(self, link: str) -> Array:
-        held = (joint.held for joint in self.joints_between(self.root, link) or ())
-        return reduce(np.matmul, held, np.eye(4))
+        return reduce(np.matmul, (joint.held for joint in self.ways[link]), np.eye(4))
 
     def serial_chain(self, base: str, flange: str) -> tuple[FileJoint, ...]:
         joints = self.joints_between(base, flange)
@@ -462,36 +428,29 @@ class Tree:
                 f"'{base}': {listed(link for link in self._below(base) if link != base)}"
             )
         for joint in joints:
-            where = f"{self.path}: joint '{joint.name}'"
             bounded = joint.moves and joint.kind != "continuous"
             lower, upper = joint.limit or (-math.inf, math.inf)
-            require(
-                joint.moves or joint.kind == "fixed",
-                f"{where} is {joint.kind} and lies between base and flange; only "
-                f"{', '.join(MOVING)} and fixed joints can, choose a base below it",
-            )
-            require(
-                joint.follows is None or not joint.moves,
-                f"{where} mimics '{joint.follows}' and lies between base and flange; coupled "
-                "joints are not supported there, remove <mimic> or choose another flange",
-            )
-            require(
-                joint.limit is not None or not bounded,
-                f'{where} is {joint.kind} without <limit>; add <limit lower="…" upper="…" '
-                'effort="0" velocity="0"/> or make it continuous',
-            )
-            require(
-                lower < upper or not bounded,
-                f"{where}: limits lower={lower:g}, upper={upper:g} leave no room to move; "
-                "lower must be below upper (a URDF takes 0 for one left out)",
-            )
-        moving = self._moving(base, flange)
+            for wrong, told in (
+                (not joint.moves and joint.kind != "fixed",
+                 f" is {joint.kind} and lies between base and flange; only {', '.join(MOVING)} and "
+                 "fixed joints can, choose a base below it"),
+                (joint.follows is not None and joint.moves,
+                 f" mimics '{joint.follows}' and lies between base and flange; coupled joints are "
+                 "not supported there, remove <mimic> or choose another flange"),
+                (joint.limit is None and bounded,
+                 f' is {joint.kind} without <limit>; add <limit lower="…" upper="…" effort="0" '
+                 'velocity="0"/> or make it continuous'),
+                (lower >= upper and bounded,
+                 f": limits lower={lower:g}, upper={upper:g} leave no room to move; lower must be "
+                 "below upper (a URDF takes 0 for one left out)"),
+            ):  # fmt: skip
+                require(not wrong, f"{self.path}: joint '{joint.name}'{told}")
+        moving = [joint for joint in joints if joint.moves]
         names = listed(j.name or f"joint{k}" for k, j in enumerate(moving, start=1)) or "none"
         require(
             MIN_JOINTS <= len(moving) <= MAX_JOINTS,
-            f"{self.path}: {len(moving)} moving joints between '{base}' and '{flange}' "
-            f"({names}); {MIN_JOINTS} to {MAX_JOINTS} are supported, choose base and flange "
-            "accordingly",
+            f"{self.path}: {len(moving)} moving joints between '{base}' and '{flange}' ({names}); "
+            f"{MIN_JOINTS} to {MAX_JOINTS} are supported, choose base and flange accordingly",
         )
         return tuple(moving)
 
@@ -500,13 +459,12 @@ class Tree:
         in its frame."""
         own = {joint.child: k for k, joint in enumerate(moving)}
         at: dict[str, tuple[int, Array]] = {}
-        for link in self._below(self.root):
-            before = self.parent_joint.get(link)
+        for link, way in self.ways.items():
             if link in own:
                 at[link] = own[link], np.eye(4)
-            elif before is not None and before.parent in at:
-                k, T = at[before.parent]
-                at[link] = k, T @ before.held
+            elif way and way[-1].parent in at:
+                k, T = at[way[-1].parent]
+                at[link] = k, T @ way[-1].held
         return at
 
     def chain(self, base: str, flange: str) -> Chain:
@@ -515,7 +473,7 @@ class Tree:
         are zero.  Bodies beyond the flange and on side branches count, those on the base do not."""
         moving = self.serial_chain(base, flange)
         joints, T = list[Joint](), np.eye(4)
-        mass, moment = np.zeros(len(moving)), np.zeros((len(moving), 3))
+        moments = np.zeros((len(moving), 4))  # mass times place, homogeneous
         with np.errstate(over="ignore", invalid="ignore"):  # numbers of 1e308 are judged later
             for source in self.joints_between(base, flange) or ():
                 T = T @ source.origin
@@ -526,12 +484,12 @@ class Tree:
                     T = np.eye(4)
             for link, (k, place) in self.carriers(moving).items():
                 body = self.links[link]
-                mass[k] += body.mass
-                moment[k] += body.mass * (place @ [*body.com, 1.0])[:3]
-            both = zip(mass, moment, strict=True)
-            masses = tuple(LinkMass(float(m), s / m if m > 0 else np.zeros(3)) for m, s in both)
+                moments[k] += body.mass * (place @ [*body.com, 1.0])
+            masses = tuple(
+                LinkMass(float(m[3]), m[:3] / m[3] if m[3] > 0 else np.zeros(3)) for m in moments
+            )
         end = T @ self.link_of(flange)[1]
-        return Chain(self.name, tuple(joints), end, masses if mass.any() else ())
+        return Chain(self.name, tuple(joints), end, masses if moments[:, 3].any() else ())
 
 
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
@@ -560,7 +518,7 @@ def urdf_file(path: Path) -> XmlFile:
 def tree_of(file: XmlFile) -> Tree:
     path, root = file.path, file.root
     for tag in file.tags:
-        require(tag.prefix != "xacro", xacro_left(path, f"<xacro:{tag.name}>"))
+        require(not tag.whole.startswith("xacro:"), xacro_left(path, f"<{tag.whole}>"))
         # Files of meshes and plug-ins are not read.
         values = [v for k, v in tag.stated.items() if k not in ("filename", "file")]
         macro = next((v for v in values if LEFT.search(v)), None)
@@ -592,10 +550,9 @@ def tree_of(file: XmlFile) -> Tree:
         joints[name] = _joint(f"{path}: joint '{name}'", name, tag, links)
     for joint in joints.values():
         if joint.follows is not None and joint.follows not in joints:
-            raise InputError(
-                f"{path}: joint '{joint.name}' mimics joint '{joint.follows}', which is not there"
-                f"{did_you_mean(joint.follows, joints)}; name an existing joint"
-            )
+            hint = f"{did_you_mean(joint.follows, joints)}; name an existing joint"
+            told = f"joint '{joint.name}' mimics joint '{joint.follows}', which is not there{hint}"
+            raise InputError(f"{path}: {told}")
     return Tree(path, root.get("name") or path.stem, links, tuple(joints.values()))
 
 
@@ -610,30 +567,21 @@ def xacro_left(path: Path, what: str) -> str:
 def _name(path: Path, tag: Tag, known: Collection[str]) -> str:
     kind, name = tag.name, tag.get("name").strip()
     require(len(known) < MOST_LINKS, f"{path}: more than {MOST_LINKS} {kind}s; remove some")
-    require(
-        bool(name), f'{path}: {kind} number {len(known) + 1} has no name; write <{kind} name="…">'
-    )
-    require(
-        name not in known,
-        f"{path}: two {kind}s are named '{name}'; names must be unique, rename one",
-    )
+    told = f'{path}: {kind} number {len(known) + 1} has no name; write <{kind} name="…">'
+    require(name, told)
+    told = f"{path}: two {kind}s are named '{name}'; names must be unique, rename one"
+    require(name not in known, told)
     return name
 
 
 def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint:
-    kind = tag.stated.get("type", "")
+    kind = tag.get("type")
     require("type" in tag.stated, f'{where} has no type; write type="{"|".join(JOINT_TYPES)}"')
-    require(
-        kind in JOINT_TYPES,
-        f"{where}: unknown joint type '{kind}'{did_you_mean(kind, JOINT_TYPES)}; "
-        f"valid: {', '.join(JOINT_TYPES)}",
-    )
+    check_known(kind, JOINT_TYPES, f"{where}: unknown joint type '{kind}'", "valid:")
     axis = np.array(_vector(where, tag, "axis", "xyz", (1.0, 0.0, 0.0)))  # URDF default
     length = math.hypot(*axis)
-    require(
-        kind not in MOVING or length >= 1e-9,
-        f'{where}: axis is zero; give a direction such as xyz="0 0 1"',
-    )
+    told = f'{where}: axis is zero; give a direction such as xyz="0 0 1"'
+    require(kind not in MOVING or length >= 1e-9, told)
     limit = None
     if (stated := tag.first("limit")) is not None:
         lower, upper = (
@@ -642,7 +590,7 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
         )
         limit = None if kind == "continuous" else (lower, upper)
     mimic, rpy = tag.first("mimic"), _vector(where, tag, "origin", "rpy")
-    check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
+    chain.check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
     return FileJoint(
         name,
         kind,
@@ -658,11 +606,9 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
 def _end(where: str, joint: Tag, side: str, links: Collection[str]) -> str:
     name = joint.of(side, "link") or ""
     require(bool(name), f'{where} has no {side} link; add <{side} link="…"/>')
-    require(
-        name in links,
-        f"{where}: {side} link '{name}' is not there{did_you_mean(name, links)}; "
-        "name an existing link or add it",
-    )
+    if name not in links:
+        hint = f"{did_you_mean(name, links)}; name an existing link or add it"
+        raise InputError(f"{where}: {side} link '{name}' is not there{hint}")
     return name
 
 

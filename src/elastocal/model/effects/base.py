@@ -180,13 +180,9 @@ class Arm:
 
     def joint_angle(self, i: int) -> ca.SX:
         """Joint i's angle (0-based) with the deflection of its own springs about its axis."""
-        axis = tuple(float(a) for a in self.chain.joints[i].axis)
-        own = [
-            self.theta[k]
-            for k, s in enumerate(self.springs)
-            if s.site == f"joint{i + 1}" and s.axis == axis
-        ]
-        return self.q[i] + sum(own)
+        axis, site = tuple(map(float, self.chain.joints[i].axis)), f"joint{i + 1}"
+        own = (k for k, s in enumerate(self.springs) if (s.site, s.axis) == (site, axis))
+        return self.q[i] + sum(self.theta[k] for k in own)
 
     def assemble(self) -> None:
         """Compose base, springs, joints and links into frames and marker positions."""
@@ -230,13 +226,9 @@ LEVEL_TOLERANCE = 0.01
 
 def row_inputs(arm: Arm, table: Measurements) -> list[NDArray]:
     """One (n, size) array per input the arm declared, in its order."""
-    known = list(arm.markers)
-    strange = {table.marker_names[k] for k in np.unique(table.marker)} - set(known)
-    if strange:
-        raise InputError(
-            f"{table.source}: marker '{min(strange)}' is not one of the cell's markers: "
-            f"{', '.join(known)}"
-        )
+    strange = {table.marker_names[k] for k in np.unique(table.marker)} - set(arm.markers)
+    told = f"marker '{min(strange, default='')}' is not one of the cell's markers:"
+    require(not strange, f"{table.source}: {told} {', '.join(arm.markers)}")
     return [_one(arm, table, name) for name in arm.inputs]
 
 
@@ -264,11 +256,9 @@ def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
     value = getattr(table, name)
     if name == "time" and value is None and arm.cell.model.clock == "rows":
         value = by_rows(table)
-    if value is None:
-        raise InputError(
-            f"{table.source}: the model needs the column {COLUMNS[name]}, which the table lacks"
-        )
-    return value[:, None] if value.ndim == 1 else value
+    told = f"the model needs the column {COLUMNS[name]}, which the table lacks"
+    require(value is not None, f"{table.source}: {told}")
+    return np.asarray(value[:, None] if value.ndim == 1 else value)
 
 
 def given_force(load: ArrayLike | None, poses: int | None = None) -> Array | None:
@@ -285,10 +275,8 @@ def given_force(load: ArrayLike | None, poses: int | None = None) -> Array | Non
         most = "" if not np.isfinite(force).all() else f" of at most {LARGEST_FORCE:g}"
         raise InputError(f"{option('load')} takes three finite numbers in N{most}; found {found}")
     found = "numbers beyond all measure" if known else f"an array of shape {force.shape}"
-    raise InputError(
-        f"{option('load')} takes a force (3,) in N, or one for each pose ({poses}, 3); found "
-        f"{found}"
-    )
+    told = f"takes a force (3,) in N, or one for each pose ({poses}, 3); found {found}"
+    raise InputError(f"{option('load')} {told}")
 
 
 Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]
@@ -507,11 +495,8 @@ def check(effect: object) -> None:
     hooks = ("shape", "load", "read")
     lacking = [] if kind.places is not Effect.places or kind.at else ["places"]
     lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]
-    if lacking:
-        raise InputError(
-            f"{kind.__name__} lacks {' and '.join(lacking)}; it states where it can act (places) "
-            f"and what it does there ({listed(hooks)})"
-        )
+    told = f"{kind.__name__} lacks {' and '.join(lacking)}; it states where it can act (places) and"
+    require(not lacking, f"{told} what it does there ({listed(hooks)})")
 
 
 def joints(chain: Chain) -> tuple[str, ...]:

@@ -62,10 +62,8 @@ def register(effect: Effect) -> None:
     check(effect)
     known = CATALOGUE.get(effect.name)
     if known is not None:
-        require(
-            effect.name not in BUILT_IN and same_class(known, effect),
-            f"there is an effect '{effect.name}' already; choose another name",
-        )
+        told = f"there is an effect '{effect.name}' already; choose another name"
+        require(effect.name not in BUILT_IN and same_class(known, effect), told)
         CATALOGUE[effect.name] = effect
         return
     order = list(CATALOGUE.values())
@@ -120,11 +118,10 @@ def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
     for name, effect in CATALOGUE.items():
         asked = wanted.get(name, [])
         places = effect.places(chain, cell) if asked else ()
-        if asked and not places:
-            raise InputError(
-                f"{cell.source}: [model] effects: {name} has no place on robot "
-                f"'{chain.name}' with observe = \"{cell.model.observe}\"; leave it out"
-            )
+        told = (
+            f"{name} has no place on robot '{chain.name}' with observe = \"{cell.model.observe}\""
+        )
+        require(places or not asked, f"{cell.source}: [model] effects: {told}; leave it out")
         for where in asked:
             if where is not None:
                 _check_known("effects", f"place of {name}", where, places, cell)
@@ -141,14 +138,12 @@ def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[
         value = given.get(setting.key, setting.default)
         where = f"{cell.source}: [model.nominal.settings.{place}] {setting.key}"
         if value is None:
-            raise InputError(
-                f"{where} is missing, which {effect.name} at {place} needs; `elastocal diagnose` "
-                "searches for it"
+            told = (
+                f"is missing, which {effect.name} at {place} needs; `elastocal diagnose` searches"
             )
-        if not setting.lower <= value <= setting.upper:
-            raise InputError(
-                f"{where} takes {setting.lower:g} to {setting.upper:g}; found {value:g}"
-            )
+            raise InputError(f"{where} {told} for it")
+        told = f"takes {setting.lower:g} to {setting.upper:g}; found {value:g}"
+        require(setting.lower <= value <= setting.upper, f"{where} {told}")
         values[setting.key] = ca.SX(value)
     return values
 
@@ -210,11 +205,9 @@ class SymbolicArm:
                 name = f"{place}.{spec.key}"
                 p = Parameter(**vars(spec), name=name, effect=effect.name, where=place)
                 other = known.setdefault(name, p)
-                require(
-                    other is p,
-                    f"{cell.source}: the effects {other.effect} and {p.effect} both "
-                    f"have a parameter '{name}'; give the one that you registered a key of its own",
-                )
+                told = f"the effects {other.effect} and {p.effect} both have a parameter '{name}';"
+                remedy = "give the one that you registered a key of its own"
+                require(other is p, f"{cell.source}: {told} {remedy}")
             bound.append((effect, place, own))
         for effect, place, own in bound:
             effect.shape(arm, place, own)
@@ -448,12 +441,11 @@ def configuration_rows(
     for i in range(len(template)):
         own = [q if name == "q" else ca.SX(ca.DM(value[i])) for name, value in given.items()]
         rows.append(row(*own, x))
-    combined = [
+    combined = (
         sum((float(w) * rows[i] for i, w in zip(line.indices, line.data, strict=True)), ca.SX(0))
         for line in (observed.combine[[k]] for k in range(observed.combine.shape[0]))
-    ]
+    )
     B = ca.vertcat(*combined)
-    W = ca.SX.sym("W", *B.shape)
+    W, cse = ca.SX.sym("W", *B.shape), {"cse": True}
     gradient = ca.gradient(ca.dot(W, B), q)
-    cse = {"cse": True}
     return ca.Function("B", [q, x], [B], cse), ca.Function("adjoint", [q, x, W], [gradient], cse)
