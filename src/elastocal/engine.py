@@ -180,15 +180,8 @@ class Mixed:
         return int(sum((~pack.absent).sum() for pack in self.packs))
 
     def whitened(self, theta: Array) -> tuple[tuple[Whitened, ...], Products, float]:
-        """The packs under V, sums of products over their rows, and Σ log|V|; those of the last
-        state, once, where they are asked for again.
-
-        Raises LinAlgError where V is not positive definite.
-        """
-        last = vars(self).pop("_last", None)
-        if last is not None and np.allclose(last[0], theta, ROUNDING, 0.0):
-            return last[1]
-        del last
+        """The packs under V, sums of products over their rows, and Σ log|V|.  Raises LinAlgError
+        where V is not positive definite."""
         packs, p = tuple(Whitened(pack, theta) for pack in self.packs), len(self.precision)
         M, z, squares = np.zeros((p, p)), np.zeros(p), 0.0
         for w in packs:
@@ -201,8 +194,7 @@ class Mixed:
     def state(self, theta: Array) -> State:
         """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
         without a prior depend on each other."""
-        packs, sums, value = found = self.whitened(theta)
-        vars(self)["_last"] = theta, found
+        packs, sums, value = self.whitened(theta)
         known, M, z = self.precision > 0, sums.M.copy(), sums.z
         # A little more than the prior: what others show as well must not drown in rounding.
         M[np.diag_indices_from(M)] += self.precision + ROUNDING * known * np.diag(M)
@@ -335,26 +327,20 @@ class MixedFit:
 
         @lru_cache(KEPT)
         def known(logarithms: bytes) -> tuple[float, Array, Array]:
-            t = np.frombuffer(logarithms)
             try:
-                return model.objective(t)
+                return model.objective(np.frombuffer(logarithms))
             except np.linalg.LinAlgError:
-                return np.inf, np.zeros(len(t)), np.eye(len(t))
+                return np.inf, np.zeros(model.K), np.eye(model.K)
 
         def evaluated(t: Array) -> tuple[float, Array, Array]:
             return known(t.tobytes())
-
-        def ridged(t: Array) -> tuple[float, Array, Array]:
-            value, slope, information = evaluated(t)
-            ridge = 1e-9 * max(float(np.diag(information).max()), 1e-3)
-            return value, slope, information + ridge * np.eye(len(t))
 
         # Those that the columns could explain all of say nothing: they are none.
         told = np.diag(evaluated(t)[2]) > LEAST_TOLD
         held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
         for _ in range(ROUNDS):
             t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
-            before, (t, ended) = t, climb(ridged, t, lower, upper, enough, STEPS)
+            before, (t, ended) = t, climb(evaluated, t, lower, upper, enough, STEPS)
             value, slope, information = evaluated(t)
             falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
             gone: list[int] = []
@@ -366,7 +352,7 @@ class MixedFit:
             if not gone and (ended or np.array_equal(t, before)):
                 break
             held = np.append(held, gone).astype(np.int64)
-        self.model, self.theta, self.converged = model, np.exp(t), ended
+        self.model, self.theta, self.converged, self.value = model, np.exp(t), ended, value
 
     @cached_property
     def state(self) -> State:
@@ -402,14 +388,12 @@ class MixedFit:
 
     @cached_property
     def log_likelihood(self) -> float:
-        found, prior = -0.5 * self.state.value, self.model.prior
+        found, prior = -0.5 * self.value, self.model.prior
         if prior is None:
             return found
         k = len(prior.mean)
-        H = self._curvature[:k, :k]
-        log_dets = [float(np.linalg.slogdet(part)[1]) for part in (prior.precision, H)]
-        off = prior.penalty(np.log(self.theta[:k]))[0]
-        return found - 0.5 * off + 0.5 * (log_dets[0] - log_dets[1])
+        log_dets = (np.linalg.slogdet(H)[1] for H in (prior.precision, self._curvature[:k, :k]))
+        return found + 0.5 * float(np.subtract(*log_dets))
 
 
 # The least of a function of a few logarithms between limits, by steps of its information.
@@ -418,6 +402,7 @@ class MixedFit:
 Objective = Callable[[Array], tuple[float, Array, Array]]
 
 STRIDE = 1.5  # longest step of a logarithm
+FLAT_RIDGE = 1e-9  # of the largest curvature
 ROUNDED = 1e-11  # of a sum over tens of thousands of rows: its rounding
 EXCHANGES = 30  # of what is held at a bound, after which another method has to end the search
 
@@ -435,6 +420,8 @@ def climb(
     excess = np.zeros_like(information)  # of the curvature over the information, as steps met it
     for _ in range(steps):
         step, H = np.zeros(len(theta)), information + excess
+        # What is next to nothing has next to no curvature.
+        H[np.diag_indices_from(H)] += FLAT_RIDGE * max(float(np.diag(H).max(initial=0.0)), 1e-3)
         low = np.maximum(lower - theta[free], -STRIDE)
         high = np.minimum(upper - theta[free], STRIDE)
         try:
