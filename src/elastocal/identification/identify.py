@@ -71,7 +71,7 @@ from elastocal.identification.start import (
     start_values,
     without_copies,
 )
-from elastocal.identification.weighted_problem import Part, PriorRows, Problem, Weights, weights_for
+from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.messages import ElastocalError, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
@@ -501,10 +501,9 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         return replace(classical, kind=kind, description=text, ends=own.ends)
     V = fit.r_factor.half
 
-    def rows(part: Part) -> Rows:
-        at, own = problem.regressor(part, fit.x, fit.columns), part.observations
-        labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
-        return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
+    def rows(part: Problem) -> Rows:
+        (B, e), own = part.whitened(fit.x, fit.columns), part.observations
+        return B @ V, e, part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
 
     return clustered(problem.each(rows), V, kind.upper())
 

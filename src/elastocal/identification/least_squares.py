@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
+from elastocal.identification.weighted_problem import Problem, Weights, same_size
 from elastocal.measurements import numbered
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
@@ -308,12 +308,12 @@ def held_out_by_parts(
     held, leverage = np.empty((2, len(problem.observations.value)))
     together, size = problem.weights.together, problem.observations.size
 
-    def leave_out(part: Part) -> None:
-        at = problem.regressor(part, x, columns)
+    def leave_out(part: Problem) -> None:
+        at = part.regressor(x, columns)
         residual = at.residual
         if step is not None:
             moved = np.flatnonzero(step)
-            residual = residual - problem.regressor(part, x, moved).B @ step[moved]
+            residual = residual - part.regressor(x, moved).B @ step[moved]
         B = at.B @ half
         Q, e = part.weights.apply(B), part.weights.apply(residual)
         labels = part.observations.configuration if together is None else together
