@@ -484,8 +484,9 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         enough = len(observed.lead) > observed.n_configurations >= ENOUGH * len(fit.columns)
         kind = "cr1" if enough else kind
     sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
+    V = fit.r_factor.half
     classical = Covariance(
-        "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
+        "classical", sigma**2 * V @ V.T, np.full(len(fit.columns), float(dof)),
         "all readings independent, their noise scaled to the residual",
     )  # fmt: skip
     if kind in ("auto", "classical"):
@@ -499,7 +500,6 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         own = intervals_with_knowledge(KnownFit(fit, known, sigma), classical.dof, kind, many)
         text = "profile of the nonlinear sum of squares (all readings independent)"
         return replace(classical, kind=kind, description=text, ends=own.ends)
-    V = fit.r_factor.half
 
     def rows(part: Problem) -> Rows:
         (B, e), own = part.whitened(fit.x, fit.columns), part.observations

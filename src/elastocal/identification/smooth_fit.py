@@ -45,8 +45,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.messages import listed
-from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
-from elastocal.model.observations import Observations
+from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.units import Array, BoolArray, IntArray
 
 # Parameters with a prior beside parameters without one: sizes by restricted likelihood, posterior.
@@ -291,13 +290,6 @@ def fit_smooth(course: Course) -> MethodResult:
     return search.result(fit, cross, noise, good)
 
 
-def _followed(observed: Observations, group: SmoothGroup) -> Array:
-    if group.basis is None:
-        return np.zeros(0)
-    table = observed.table
-    return np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
-
-
 class _Search:
     def __init__(self, course: Course) -> None:
         self.every, self.options, self.progress = course.every, course.options, course.progress
@@ -494,13 +486,15 @@ class _Search:
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
         f, posterior, x = self.functions, fit.posterior, fit.found.x
-        paid = np.zeros(len(f.columns))
+        paid, observed = np.zeros(len(f.columns)), fit.found.problem.observations
         paid[posterior.own] = posterior.effective[len(fit.reduction.kept) :]
+        table = observed.table
         return tuple(
             SmoothPart(
                 group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),
                 x[group.columns], np.zeros((group.columns.size,) * 2),
-                _followed(fit.found.problem.observations, group),
+                np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
+                if group.basis else np.zeros(0),
             ).refitted(x, fit.found.columns, covariance)
             for g, group in enumerate(f.groups)
         )  # fmt: skip

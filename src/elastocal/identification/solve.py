@@ -541,7 +541,7 @@ def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None
         sigma = max(float(np.sqrt(np.mean(misfit**2))), 1e-12)
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        tie = PriorRows.near(problem.x0[free], width / sigma)
+        tie = PriorRows(np.diag(sigma / width), problem.x0[free] * sigma / width)
         found = fit(problem, free, x, known=tie, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:

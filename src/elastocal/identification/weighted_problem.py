@@ -434,11 +434,6 @@ class PriorRows:
     target: Array
     system: System | None = None
 
-    @classmethod
-    def near(cls, centre: Array, width: Array) -> PriorRows:
-        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
-        return cls(np.diag(1 / width), centre / width)
-
     def restricted(self, columns: IntArray, x: Array) -> PriorRows:
         """What it says of the `columns`, the others held at x; InputError where these break a
         constraint."""
@@ -476,12 +471,6 @@ class Fit:
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
         return problem.evaluate(self.x, problem.free)[1]
-
-    def cofactor(self) -> Array:
-        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
-        size = self.problem.sizes[self.columns]
-        inverse = self.r_factor.scaled(size).half
-        return (inverse @ inverse.T) * np.outer(size, size)
 
 
 class Linearised(NamedTuple):
