@@ -588,20 +588,19 @@ class HuberFit:
             kept = np.sort(d)[p // size :]
             h = (special.ndtri(0.975) ** 2 * 1.5 / (2 * np.pi) / len(kept)) ** (1 / 3)
             c = max(c, float(np.quantile(kept, min(2 * h, 0.98))))
-        across = self.weights(c)
-        along, psi = (d <= c).astype(float), np.minimum(d, c)
+        across, along = self.weights(c), (d <= c).astype(float)
         a = float(np.mean(along + (size - 1) * across)) / size
         if not a > 0:
             raise InsufficientDataError(
                 "so many readings lie far from the fit that its covariance cannot be determined; "
                 "use the default method, or look for the cause of the outliers"
             )
+        pseudo = np.repeat(across, size) * self.residual / a
         if cluster is not None:
-            pseudo = np.repeat(across, size) * self.residual / a
             return clustered([(self.Q, pseudo, np.repeat(cluster, size))], self.V, "CR3")
         square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
         k = 1 + p / rows * (square - a**2) / a**2
-        variance = (k * self.scale / a) ** 2 * float(psi @ psi) / (rows - p)
+        variance = k**2 * float(pseudo @ pseudo) / (rows - p)
         name = "l1" if self.c == L1 else "huber"
         text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
         return Covariance("H1", variance * self.V @ self.V.T, np.full(p, float(rows - p)), text)
