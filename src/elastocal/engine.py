@@ -335,26 +335,20 @@ class MixedFit:
 
         @lru_cache(KEPT)
         def known(logarithms: bytes) -> tuple[float, Array, Array]:
-            t = np.frombuffer(logarithms)
             try:
-                return model.objective(t)
+                return model.objective(np.frombuffer(logarithms))
             except np.linalg.LinAlgError:
-                return np.inf, np.zeros(len(t)), np.eye(len(t))
+                return np.inf, np.zeros(model.K), np.eye(model.K)
 
         def evaluated(t: Array) -> tuple[float, Array, Array]:
             return known(t.tobytes())
-
-        def ridged(t: Array) -> tuple[float, Array, Array]:
-            value, slope, information = evaluated(t)
-            ridge = 1e-9 * max(float(np.diag(information).max()), 1e-3)
-            return value, slope, information + ridge * np.eye(len(t))
 
         # Those that the columns could explain all of say nothing: they are none.
         told = np.diag(evaluated(t)[2]) > LEAST_TOLD
         held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
         for _ in range(ROUNDS):
             t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
-            before, (t, ended) = t, climb(ridged, t, lower, upper, enough, STEPS)
+            before, (t, ended) = t, climb(evaluated, t, lower, upper, enough, STEPS)
             value, slope, information = evaluated(t)
             falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
             gone: list[int] = []
@@ -366,7 +360,7 @@ class MixedFit:
             if not gone and (ended or np.array_equal(t, before)):
                 break
             held = np.append(held, gone).astype(np.int64)
-        self.model, self.theta, self.converged = model, np.exp(t), ended
+        self.model, self.theta, self.converged, self.value = model, np.exp(t), ended, value
 
     @cached_property
     def state(self) -> State:
@@ -402,14 +396,12 @@ class MixedFit:
 
     @cached_property
     def log_likelihood(self) -> float:
-        found, prior = -0.5 * self.state.value, self.model.prior
+        found, prior = -0.5 * self.value, self.model.prior
         if prior is None:
             return found
         k = len(prior.mean)
-        H = self._curvature[:k, :k]
-        log_dets = [float(np.linalg.slogdet(part)[1]) for part in (prior.precision, H)]
-        off = prior.penalty(np.log(self.theta[:k]))[0]
-        return found - 0.5 * off + 0.5 * (log_dets[0] - log_dets[1])
+        log_dets = (np.linalg.slogdet(H)[1] for H in (prior.precision, self._curvature[:k, :k]))
+        return found + 0.5 * float(np.subtract(*log_dets))
 
 
 # The least of a function of a few logarithms between limits, by steps of its information.
@@ -419,6 +411,7 @@ Objective = Callable[[Array], tuple[float, Array, Array]]
 
 STRIDE = 1.5  # longest step of a logarithm
 LENGTHS: tuple[float, ...] = (1.0, 0.5, 0.25, 0.0625)  # of a step that are tried
+FLAT_RIDGE = 1e-9  # of the largest curvature
 ROUNDED = 1e-11  # of a sum over tens of thousands of rows: its rounding
 EXCHANGES = 30  # of what is held at a bound, after which another method has to end the search
 
@@ -436,6 +429,8 @@ def climb(
     lacking = np.zeros_like(information)
     for _ in range(steps):
         step, H = np.zeros(len(theta)), information + lacking
+        # What is next to nothing has next to no curvature.
+        H[np.diag_indices_from(H)] += FLAT_RIDGE * max(float(np.diag(H).max(initial=0.0)), 1e-3)
         low = np.maximum(lower - theta[free], -STRIDE)
         high = np.minimum(upper - theta[free], STRIDE)
         lengths = LENGTHS

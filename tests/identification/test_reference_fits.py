@@ -83,7 +83,7 @@ def fitted(model, y, start, sizes, sigma=None, known=None):
     steps = {"max_steps": 2000, "tolerance": 1e-13, "known": known}
     found = fit(problem, problem.free, start, **steps)
     variance = found.whitened @ found.whitened / max(n - p, 1)
-    return found, np.sqrt(variance * np.diag(found.cofactor()))
+    return found, np.sqrt(variance) * np.linalg.norm(found.r_factor.half, axis=1)
 
 
 @pytest.mark.parametrize("start", [0, 1], ids=["far", "near"])

@@ -71,7 +71,7 @@ from elastocal.identification.start import (
     start_values,
     without_copies,
 )
-from elastocal.identification.weighted_problem import Part, PriorRows, Problem, Weights, weights_for
+from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
 from elastocal.messages import ElastocalError, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
@@ -484,8 +484,9 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         enough = len(observed.lead) > observed.n_configurations >= ENOUGH * len(fit.columns)
         kind = "cr1" if enough else kind
     sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
+    V = fit.r_factor.half
     classical = Covariance(
-        "classical", sigma**2 * fit.cofactor(), np.full(len(fit.columns), float(dof)),
+        "classical", sigma**2 * V @ V.T, np.full(len(fit.columns), float(dof)),
         "all readings independent, their noise scaled to the residual",
     )  # fmt: skip
     if kind in ("auto", "classical"):
@@ -499,12 +500,10 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         own = intervals_with_knowledge(KnownFit(fit, known, sigma), classical.dof, kind, many)
         text = "profile of the nonlinear sum of squares (all readings independent)"
         return replace(classical, kind=kind, description=text, ends=own.ends)
-    V = fit.r_factor.half
 
-    def rows(part: Part) -> Rows:
-        at, own = problem.regressor(part, fit.x, fit.columns), part.observations
-        labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
-        return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
+    def rows(part: Problem) -> Rows:
+        (B, e), own = part.whitened(fit.x, fit.columns), part.observations
+        return B @ V, e, part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
 
     return clustered(problem.each(rows), V, kind.upper())
 

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, special
 
-from elastocal.identification.weighted_problem import Part, Problem, Weights, same_size
+from elastocal.identification.weighted_problem import Problem, Weights, same_size
 from elastocal.measurements import numbered
 from elastocal.messages import InputError, InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
@@ -214,7 +213,7 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
         of_one_size = ((own, len(own) * p * max(own.shape[1], p)) for own in same_size(cluster))
         for rows in (b for own, n in of_one_size for b in np.array_split(own, -(-n // ENTRIES))):
             Qc = Q[rows]
-            adjusted, determined = _adjusted(Qc, kind)
+            adjusted, determined = adjusted_rows(Qc, POWERS[kind[-1]])
             lone += cluster[rows[determined][:1, 0]].tolist()
             # A parameter may depend on a direction that one of the clusters determines alone.
             values, U = np.linalg.eigh(Qc[determined].transpose(0, 2, 1) @ Qc[determined])
@@ -256,20 +255,22 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
 
 
-def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
-    """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.  The smaller
-    side of g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) is decomposed."""
+POWERS = {"0": 0.0, "1": 0.0, "2": -0.5, "3": -1.0}  # of I − Q_cQ_cᵀ in A_c
+
+
+def adjusted_rows(Qc: Array, power: float) -> tuple[Array, BoolArray]:
+    """(I − Q_cQ_cᵀ)^power Q_c (k, size, p), and which of the k clusters determine a direction
+    alone, along which it is zero.  The smaller side of g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) is
+    decomposed."""
     by_row = Qc.shape[1] < Qc.shape[2]
     gram = Qc @ Qc.transpose(0, 2, 1) if by_row else Qc.transpose(0, 2, 1) @ Qc
     values, U = np.linalg.eigh(gram)
-    gap = 1 - values
-    single = gap < ALONE
-    determined = np.asarray(single.any(axis=1))
-    if kind[-1] in "01":
-        return Qc, determined
-    power = np.where(single, 1.0, gap) ** (-0.5 if kind[-1] == "2" else -1.0)
-    A = (U * np.where(single, 0.0, power)[:, None, :]) @ U.transpose(0, 2, 1)
-    return (A @ Qc if by_row else Qc @ A), determined
+    single = 1 - values < ALONE
+    if not power:
+        return Qc, np.asarray(single.any(axis=1))
+    factor = np.where(single, 0.0, np.where(single, 1.0, 1 - values) ** power)
+    A = (U * factor[:, None, :]) @ U.transpose(0, 2, 1)
+    return (A @ Qc if by_row else Qc @ A), np.asarray(single.any(axis=1))
 
 
 def held_out_residual(
@@ -308,12 +309,12 @@ def held_out_by_parts(
     held, leverage = np.empty((2, len(problem.observations.value)))
     together, size = problem.weights.together, problem.observations.size
 
-    def leave_out(part: Part) -> None:
-        at = problem.regressor(part, x, columns)
+    def leave_out(part: Problem) -> None:
+        at = part.regressor(x, columns)
         residual = at.residual
         if step is not None:
             moved = np.flatnonzero(step)
-            residual = residual - problem.regressor(part, x, moved).B @ step[moved]
+            residual = residual - part.regressor(x, moved).B @ step[moved]
         B = at.B @ half
         Q, e = part.weights.apply(B), part.weights.apply(residual)
         labels = part.observations.configuration if together is None else together
@@ -340,18 +341,8 @@ def left_out(
     """Rows (g, m) of configurations of one size, Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c (g, columns),
     meaningless where a configuration is alone in some direction, and which are."""
     for rows in same_size(configuration):
-        Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
-        # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
-        many = rows.shape[1] > Q.shape[1]
-        share = Qt @ Qc if many else Qc @ Qt
-        gap, alone = np.eye(share.shape[1]) - share, np.zeros(len(share), dtype=bool)
-        # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
-        heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
-        alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
-        gap[alone] = np.eye(share.shape[1])
-        own = e[rows][..., None]
-        moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)
-        yield rows, np.asarray(moved[..., 0], dtype=np.float64), alone
+        adjusted, alone = adjusted_rows(Q[rows], -1.0)
+        yield rows, (e[rows][:, None] @ adjusted)[:, 0], alone
 
 
 def told_by_one(B: Array, configuration: IntArray) -> Array:

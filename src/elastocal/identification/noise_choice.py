@@ -149,16 +149,12 @@ class NoisyReadings:
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
 
     def start(self, like: Fitted | None = None) -> Array:
-        """Variances (K,) of `like` where it has them; else own ones from the scatter of repeats
-        where there is any, or from all residuals, and shared ones a tenth of these."""
+        """Variances (K,) of `like` where it has them; else own ones from the residuals, and shared
+        ones a tenth of these."""
         sets, size, e2 = self.sets, self.readings.size, (self.sets.e**2).mean(axis=1)
         # Variance of one reading that θ = 1 would give: 1, but for noise that is stated.
         unit = np.trace(self.structure.matrix.sum(axis=1), axis1=1, axis2=2)[sets.first] / size
         own = float(np.median(e2 / unit))
-        if sets.contrasts.size:
-            # A few repeats may agree by rounding: from near zero the search does not come back.
-            square = (sets.contrasts**2).mean(axis=1) / unit[sets.sets]
-            own = max(float(square.mean()), 1e-9 * own)
         share = 0.1 * float((self.readings.e**2).mean())
         shared = [share * size / d.mean_square(size) for d in self.deviations]
         theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)
@@ -254,18 +250,14 @@ NARROWEST = 1e-3  # variance of log θ: equal to within 3 %
 
 
 def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
-    """Prior of the group variances from the scatter of a group's sets about their own mean, less a
-    fit with the plain mean of repeats; InsufficientDataError where groups hold too few readings."""
-    sets, size, K = noisy.sets, noisy.readings.size, noisy.own
-    group = noisy.structure.index[sets.first]
-    B, e = sets.B.reshape(-1, sets.B.shape[2]), sets.e.ravel()
-    repeats = np.repeat(sets.root**2, size)
-    residual = (e - B @ least_norm(B, e)) / np.sqrt(repeats)
-    g = group.ravel()
-    count = np.bincount(g, repeats, K)
-    mean = np.bincount(g, repeats * residual, K) / count
-    squares = np.bincount(g, repeats * (residual - mean[g]) ** 2, K)
-    squares += np.bincount(group[sets.sets].ravel(), sets.contrasts.ravel() ** 2, K)
+    """Prior of the group variances from the scatter of a group's readings about their own mean,
+    less a plain fit; InsufficientDataError where groups hold too few readings."""
+    readings, K, group = noisy.readings, noisy.own, noisy.structure.index.ravel()
+    B, e, size = readings.B.reshape(-1, readings.n_parameters), readings.e.ravel(), readings.size
+    residual = e - B @ least_norm(B, e)
+    count = np.bincount(group, minlength=K)
+    mean = np.bincount(group, residual, K) / count
+    squares = np.bincount(group, (residual - mean[group]) ** 2, K)
     f = np.maximum(count - 1.0, 0.5)
     if np.median(f) < FEWEST or 3 * size > K:
         raise InsufficientDataError(

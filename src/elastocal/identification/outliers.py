@@ -26,7 +26,7 @@ from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.solve import PLACED, SAMPLE, MethodResult, Solution, is_placed
 from elastocal.identification.start import Options
-from elastocal.identification.weighted_problem import Part, Problem
+from elastocal.identification.weighted_problem import Problem
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray
@@ -283,7 +283,7 @@ def find_faulty(solution: Solution) -> BoolArray:
     x0, free = problem.x0, problem.free
     placed = is_placed(problem.model)[free]
     x = (x0 if placed.any() else solution.fit.x).copy()
-    B, y = _whitened(problem, part, x)
+    B, y = _whitened(part, x)
     B, y = B * width, y + B @ (x - x0)[free]
     starts = [majority(B[:, :, placed], y)]
     # An arm's own errors hide what all parameters show; half of few readings shows nothing.
@@ -298,7 +298,7 @@ def find_faulty(solution: Solution) -> BoolArray:
         for _ in range(STEPS):
             x, z = x0.copy(), fit.z
             x[free] += width * z
-            B, e = _whitened(problem, part, x)
+            B, e = _whitened(part, x)
             B, y, variance = B * width, e + B @ (width * z), fit.variance
             fit = FitToGood(B, y, good, variance)
             if np.linalg.norm(fit.R @ (fit.z - z)) <= SETTLED * np.sqrt(fit.variance):
@@ -334,14 +334,13 @@ def prior_widths(problem: Problem) -> Array:
     return np.where(is_placed(problem.model), PLACED, WEAK * problem.sizes)
 
 
-def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
+def _whitened(part: Problem, x: Array) -> tuple[Array, Array]:
     """B (n, size, free) and residual (n, size) of a part at x, whitened."""
-    at, shape = problem.regressor(part, x, problem.free), (len(part.index), -1)
-    B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
-    return B.reshape(len(part.index), part.observations.size, -1), e.reshape(shape)
+    (B, e), shape = part.whitened(x, part.free), (len(part.index), part.observations.size)
+    return B.reshape(*shape, -1), e.reshape(shape)
 
 
-def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) -> BoolArray:
+def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Problem) -> BoolArray:
     """Observations (N,) of a large table, but those of the part that the fit is of, which it
     contradicts. B is evaluated in those parts alone that hold errors too large were the fit
     exact."""
@@ -353,9 +352,9 @@ def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) 
     beyond = (e**2).sum(axis=1) > size * fit.variance * limit
     beyond[known.index] = False
 
-    def of_part(part: Part) -> None:
+    def of_part(part: Problem) -> None:
         if beyond[part.index].any():
-            B, own = _whitened(problem, part, x)
+            B, own = _whitened(part, x)
             outside = np.zeros(len(own), dtype=bool)
             beyond[part.index] &= fit.p_values(fit.coordinates(B * width), own, outside) < level
 
@@ -589,20 +588,19 @@ class HuberFit:
             kept = np.sort(d)[p // size :]
             h = (special.ndtri(0.975) ** 2 * 1.5 / (2 * np.pi) / len(kept)) ** (1 / 3)
             c = max(c, float(np.quantile(kept, min(2 * h, 0.98))))
-        across = self.weights(c)
-        along, psi = (d <= c).astype(float), np.minimum(d, c)
+        across, along = self.weights(c), (d <= c).astype(float)
         a = float(np.mean(along + (size - 1) * across)) / size
         if not a > 0:
             raise InsufficientDataError(
                 "so many readings lie far from the fit that its covariance cannot be determined; "
                 "use the default method, or look for the cause of the outliers"
             )
+        pseudo = np.repeat(across, size) * self.residual / a
         if cluster is not None:
-            pseudo = np.repeat(across, size) * self.residual / a
             return clustered([(self.Q, pseudo, np.repeat(cluster, size))], self.V, "CR3")
         square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
         k = 1 + p / rows * (square - a**2) / a**2
-        variance = (k * self.scale / a) ** 2 * float(psi @ psi) / (rows - p)
+        variance = k**2 * float(pseudo @ pseudo) / (rows - p)
         name = "l1" if self.c == L1 else "huber"
         text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
         return Covariance("H1", variance * self.V @ self.V.T, np.full(p, float(rows - p)), text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, ItemsView, Iterator, KeysView
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
@@ -312,7 +312,7 @@ class Verdict:
 
 
 @dataclass(frozen=True, repr=False, eq=False)
-class Calibration(scrutiny.FoundFit, Result):
+class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
     """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
 
     Attributes:
@@ -504,7 +504,7 @@ class Calibration(scrutiny.FoundFit, Result):
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
-        if name not in self:
+        if name not in self._by_name:
             raise UnknownNameError.of("parameter", name, self._by_name)
         return self._by_name[name]
 
@@ -514,21 +514,6 @@ class Calibration(scrutiny.FoundFit, Result):
 
     def __len__(self) -> int:
         return len(self.estimates)
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._by_name
-
-    def keys(self) -> KeysView[str]:
-        """The parameters' names; with `[]` it makes dict(fit)."""
-        return self._by_name.keys()
-
-    def items(self) -> ItemsView[str, Estimate]:
-        """Name and estimate of each parameter."""
-        return self._by_name.items()
-
-    def get(self, name: str, default: Any = None) -> Any:
-        """The estimate of the parameter `name`, else `default`."""
-        return self._by_name.get(name, default)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self._by_name)

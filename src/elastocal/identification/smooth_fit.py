@@ -38,7 +38,6 @@ from elastocal.identification.solve import (
 from elastocal.identification.start import ordinary
 from elastocal.identification.weighted_problem import (
     Fit,
-    Part,
     PriorRows,
     Problem,
     RFactor,
@@ -46,8 +45,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.messages import listed
-from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
-from elastocal.model.observations import Observations
+from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.units import Array, BoolArray, IntArray
 
 # Parameters with a prior beside parameters without one: sizes by restricted likelihood, posterior.
@@ -255,24 +253,20 @@ class JointFit:
     def posterior(self) -> Posterior:
         return Posterior(self.linear, self.scales)
 
-    def whitened(self, part: Part) -> tuple[Array, Array]:
+    def whitened(self, part: Problem) -> tuple[Array, Array]:
         """Q (rows, columns), whose squares are by how much of the noise the fit varies at the
         readings of a part, and their residual (rows,)."""
-        found, apply = self.found, part.weights.apply
-        at = found.problem.regressor(part, found.x, found.columns)
-        return apply(at.B @ self.posterior.half), apply(at.residual)
+        B, e = part.whitened(self.found.x, self.found.columns)
+        return B @ self.posterior.half, e
 
-    def standardised(self, others: Part | None = None) -> Array:
+    def standardised(self, others: Problem | None = None) -> Array:
         """Residuals (N, size) free of the fit's part in them, in m or rad: of the fit's own
         readings, configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of
         1 − QQᵀ."""
-        problem, side = self.found.problem, -1
-        if others is not None:
-            own, side = others.observations, 1
-            problem = replace(problem, observations=own, weights=others.weights)
+        problem, side = (self.found.problem, -1) if others is None else (others, 1)
         standard = np.empty(len(problem.observations.value))
 
-        def one(part: Part) -> None:
+        def one(part: Problem) -> None:
             (Q, e), own = self.whitened(part), part.observations
             labels = own.configuration if side < 0 else np.arange(len(own.lead))
             for rows in same_size(np.repeat(labels, own.size)):
@@ -296,13 +290,6 @@ def fit_smooth(course: Course) -> MethodResult:
     return search.result(fit, cross, noise, good)
 
 
-def _followed(observed: Observations, group: SmoothGroup) -> Array:
-    if group.basis is None:
-        return np.zeros(0)
-    table = observed.table
-    return np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
-
-
 class _Search:
     def __init__(self, course: Course) -> None:
         self.every, self.options, self.progress = course.every, course.options, course.progress
@@ -324,7 +311,7 @@ class _Search:
         self.standard = np.zeros(bare.e.shape)  # residuals free of the fit's part in them
         self.alike = np.zeros(len(bare), dtype=bool)  # as readings of other configurations
 
-    def chosen(self, noise: NoiseFit | None, good: BoolArray) -> Part:
+    def chosen(self, noise: NoiseFit | None, good: BoolArray) -> Problem:
         part = self.every.problem.part(np.flatnonzero(good))
         if noise is not None:
             part = replace(part, weights=weights_of(noise, self.readings.take(good)))
@@ -499,13 +486,15 @@ class _Search:
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
         f, posterior, x = self.functions, fit.posterior, fit.found.x
-        paid = np.zeros(len(f.columns))
+        paid, observed = np.zeros(len(f.columns)), fit.found.problem.observations
         paid[posterior.own] = posterior.effective[len(fit.reduction.kept) :]
+        table = observed.table
         return tuple(
             SmoothPart(
                 group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),
                 x[group.columns], np.zeros((group.columns.size,) * 2),
-                _followed(fit.found.problem.observations, group),
+                np.asarray(table.q[:, group.joint] if group.lasting else table.time)[observed.lead]
+                if group.basis else np.zeros(0),
             ).refitted(x, fit.found.columns, covariance)
             for g, group in enumerate(f.groups)
         )  # fmt: skip

@@ -440,7 +440,7 @@ def posed(
     largest, placed = np.zeros((1, len(x0))), is_placed(model)
     # Only the size of what states none needs B, which takes long on large tables.
     if any(p.typical is None and not own for p, own in zip(model.parameters, placed, strict=True)):
-        for B in problem.each(lambda part: problem.regressor(part, x0, every).B):
+        for B in problem.each(lambda part: part.regressor(x0, every).B):
             largest[0, every] = np.maximum(largest[0, every], np.abs(B).max(axis=0))
     problem = replace(problem, sizes=np.where(placed, PLACED, model.sizes(largest)))
     rows, p = len(observed.value), len(free)
@@ -495,7 +495,7 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
     steps[:, dropped] = delta = typical * rng.standard_normal((BENDS, len(dropped)))
     steps[:, kept] = rng.standard_normal((BENDS, len(kept))) @ root.T - delta @ chosen.mixing.T
     both = np.concatenate([steps, -steps])
-    there, opposite = np.split(problem.residual_of(looked, found.x + both), 2)
+    there, opposite = np.split(looked.residual_at(found.x + both), 2)
     moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
         return none, none  # so far out the arm has no equilibrium
@@ -523,10 +523,7 @@ def tied_fit(problem: Problem, tolerance: float) -> Fit:
 
 def _sampled(problem: Problem) -> Problem:
     n = len(problem.observations.lead)
-    if n <= MANY:
-        return problem
-    part = problem.sample(min(SAMPLE, n // 4))
-    return replace(problem, observations=part.observations, weights=part.weights)
+    return problem if n <= MANY else problem.sample(min(SAMPLE, n // 4))
 
 
 def _as_of(found: Fit, problem: Problem) -> RFactor:
@@ -544,7 +541,7 @@ def _tied_from(problem: Problem, x: Array, tolerance: float, sigma: float | None
         sigma = max(float(np.sqrt(np.mean(misfit**2))), 1e-12)
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        tie = PriorRows.near(problem.x0[free], width / sigma)
+        tie = PriorRows(np.diag(sigma / width), problem.x0[free] * sigma / width)
         found = fit(problem, free, x, known=tie, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:

@@ -59,20 +59,8 @@ SUCCESSORS = {
 
 @dataclass(frozen=True)
 class Options:
-    """How to identify.
-
-    `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
-    stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
-    published weights with σ by group or from each residual; huber and l1 are robust.  `noise`: the
-    model whose variances reml estimates.
-    `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
-    `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
-    `constraints` and `prior`: a
-    constrained or regularised fit on top of the method's weights (`knowledge_fit`).  `faulty`:
-    readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
-    always, or never; they are listed in the result in any case.  `seed`: of multi-start and
-    searches.
-    """
+    """How to identify, as `elastocal.identify` says of its arguments; `constraints` and `prior`: a
+    fit with knowledge on top of the method's weights (`knowledge_fit`); `faulty`: its outliers."""
 
     method: Method = "auto"
     noise: str = "auto"

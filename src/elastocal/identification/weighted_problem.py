@@ -291,20 +291,10 @@ AT_ONCE = 2
 
 
 @dataclass(frozen=True)
-class Part:
-    """The observations `index` (n,) of a table, whitened by `weights` on their own; `rows`
-    (n·size,) are their rows among those of all observations."""
-
-    index: IntArray
-    rows: IntArray
-    observations: Observations
-    weights: Weights
-
-
-@dataclass(frozen=True)
 class Problem:
     """Fit parameters among those that are `free` to the observations, the others held at x0
-    (parameters,); `sizes` (parameters,) are typical ones, by which variables are scaled."""
+    (parameters,); `sizes` (parameters,) are typical ones, by which variables are scaled.  A part of
+    another problem has its observations `index` (n,), whitened on their own."""
 
     model: Model
     observations: Observations
@@ -312,6 +302,13 @@ class Problem:
     x0: Array
     free: NDArray[np.int64]
     sizes: Array
+    index: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    @cached_property
+    def rows(self) -> IntArray:
+        """The rows (n·size,) of a part among those of all observations."""
+        size = self.observations.size
+        return np.asarray((self.index[:, None] * size + np.arange(size)).ravel())
 
     @property
     def large(self) -> bool:
@@ -332,26 +329,26 @@ class Problem:
         first = np.searchsorted(np.sort(observed.configuration), observed.configuration)
         return tuple(np.flatnonzero(first // limit == k) for k in np.unique(first // limit))
 
-    def part(self, index: IntArray) -> Part:
+    def part(self, index: IntArray) -> Problem:
         """Observations `index` (n,), ascending, with the weights of these alone: exact where what
         is correlated is in `index` together."""
-        observed, weights = self.observations, self.weights
-        rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
+        observed, weights, part = self.observations, self.weights, replace(self, index=index)
         if len(index) == len(observed.lead):
-            return Part(index, rows, observed, weights)
+            return part
         # A block by its ends: picked one by one its rows would be copied, and its columns looked
         # for among those of all readings.
         first, last = int(index[0]), int(index[-1]) + 1
         block = last - first == len(index)
         own = subset(observed, slice(first, last) if block else index)
-        inside = slice(first * observed.size, last * observed.size) if block else rows
+        inside = slice(first * observed.size, last * observed.size) if block else part.rows
         whiten = None if weights.whiten is None else weights.whiten[inside][:, inside]
         mine = replace(weights, whiten=whiten)
         if weights.common is not None and weights.together is not None:
-            mine = replace(mine, common=weights.common[rows], together=weights.together[index])
-        return Part(index, rows, own, mine)
+            common = weights.common[part.rows]
+            mine = replace(mine, common=common, together=weights.together[index])
+        return replace(part, observations=own, weights=mine)
 
-    def sample(self, n: int) -> Part:
+    def sample(self, n: int) -> Problem:
         """About n observations at random, some of every marker, correlated ones together."""
         observed = self.observations
         order = np.random.default_rng(0).permutation(len(observed.lead))
@@ -367,7 +364,7 @@ class Problem:
             chosen = np.flatnonzero(np.isin(own, own[chosen]))
         return self.part(chosen)
 
-    def each(self, work: Callable[[Part], Result]) -> Iterator[Result]:
+    def each(self, work: Callable[[Problem], Result]) -> Iterator[Result]:
         """`work` on every part, AT_ONCE at a time; results in the order of the parts, so that their
         sum does not depend on which is done first.  The first one is done alone: it builds what the
         others share (the model's compiled functions)."""
@@ -381,26 +378,32 @@ class Problem:
         ElastocalError where a reading has no static equilibrium at x."""
         residual = np.empty(len(self.observations.value))
 
-        def reduced(part: Part) -> RFactor:
-            at = self.regressor(part, x, columns)
+        def reduced(part: Problem) -> RFactor:
+            at, apply = part.regressor(x, columns), part.weights.apply
             residual[part.rows] = at.residual
-            return RFactor.of(part.weights.apply(at.B), part.weights.apply(at.residual))
+            return RFactor.of(apply(at.B), apply(at.residual))
 
         return residual, reduce(RFactor.merged, self.each(reduced))
 
     def residual(self, x: Array) -> Array:
         """Observed minus predicted (rows,) at x; NaN in readings without equilibrium."""
         residual = np.empty(len(self.observations.value))
-        for rows, own in self.each(lambda part: (part.rows, self.residual_of(part, x))):
+        for rows, own in self.each(lambda part: (part.rows, part.residual_at(x))):
             residual[rows] = own
         return residual
 
-    def residual_of(self, part: Part, x: Array) -> Array:
-        observed = part.observations
+    def residual_at(self, x: Array) -> Array:
+        """The same of a single part, also at several x (k, parameters)."""
+        observed = self.observations
         return np.asarray(observed.value - self.model.predict(observed.table, x, observed))
 
-    def regressor(self, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
-        return self.model.regressor(part.observations.table, x, columns, part.observations)
+    def regressor(self, x: Array, columns: NDArray[np.integer]) -> Regression:
+        return self.model.regressor(self.observations.table, x, columns, self.observations)
+
+    def whitened(self, x: Array, columns: NDArray[np.integer]) -> tuple[Array, Array]:
+        """B (rows, columns) and residual (rows,) of a single part at x, whitened."""
+        at = self.regressor(x, columns)
+        return self.weights.apply(at.B), self.weights.apply(at.residual)
 
 
 # Nonlinear weighted least squares on the exact B, with what else is known of the parameters:
@@ -431,11 +434,6 @@ class PriorRows:
     target: Array
     system: System | None = None
 
-    @classmethod
-    def near(cls, centre: Array, width: Array) -> PriorRows:
-        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
-        return cls(np.diag(1 / width), centre / width)
-
     def restricted(self, columns: IntArray, x: Array) -> PriorRows:
         """What it says of the `columns`, the others held at x; InputError where these break a
         constraint."""
@@ -461,8 +459,7 @@ class Fit:
     @cached_property
     def B(self) -> Array:
         """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
-        observed = self.problem.observations
-        return self.problem.model.regressor(observed.table, self.x, self.columns, observed).B
+        return self.problem.regressor(self.x, self.columns).B
 
     @cached_property
     def whitened(self) -> Array:
@@ -474,12 +471,6 @@ class Fit:
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
         return problem.evaluate(self.x, problem.free)[1]
-
-    def cofactor(self) -> Array:
-        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
-        size = self.problem.sizes[self.columns]
-        inverse = self.r_factor.scaled(size).half
-        return (inverse @ inverse.T) * np.outer(size, size)
 
 
 class Linearised(NamedTuple):
