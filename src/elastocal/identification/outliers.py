@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -26,7 +26,7 @@ from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.solve import PLACED, SAMPLE, MethodResult, Solution, is_placed
 from elastocal.identification.start import Options
-from elastocal.identification.weighted_problem import Problem
+from elastocal.identification.weighted_problem import Problem, RFactor
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray
@@ -136,16 +136,20 @@ class FitToGood:
     of the variance.  `e` (n, size) is y less its prediction."""
 
     def __init__(self, B: Array, y: Array, good: BoolArray, variance: float) -> None:
-        self.good = good
+        self.B, self.good = B, good
         (_, size, p), n = B.shape, int(good.sum())
         rows = np.vstack([B[good].reshape(n * size, p), np.sqrt(variance) * np.eye(p)])
-        self.R = np.asarray(np.linalg.qr(rows, mode="r"))
-        self.T = self.coordinates(B)
-        fitted = np.einsum("nij,ni->j", self.T[good], y[good])
-        self.z = np.asarray(linalg.solve_triangular(self.R, fitted))
-        self.e = y - self.T @ fitted
+        found = RFactor.of(rows, np.append(y[good], np.zeros(p)))
+        self.R, half = found.R, found.half
+        self.z = half @ found.projected
+        self.e = y - (B.reshape(-1, p) @ self.z).reshape(y.shape)
         self.rss = float((self.e[good] ** 2).sum())
-        self.dof = self.e[good].size - float((self.T[good] ** 2).sum())
+        # Σ TᵀT of the good ones is 1 less the prior's share.
+        self.dof = n * size - p + variance * float((half**2).sum())
+
+    @cached_property
+    def T(self) -> Array:
+        return self.coordinates(self.B)
 
     @property
     def variance(self) -> float:
