@@ -17,10 +17,8 @@ import math
 import os
 import re
 import secrets
-import signal
 import stat
 import sys
-import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
@@ -33,8 +31,6 @@ from elastocal.messages import SHOWN, InputError, option, quoted, raised_at, req
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-# What is being written ends so, after the number of the process that writes it.
-UNFINISHED = ".tmp"
 # Elements within each other, and parts of a dotted key: a file that people write has six.
 DEEPEST = 32
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
@@ -45,13 +41,17 @@ def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> 
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
-        kind = KINDS.get(stat.S_IFMT(found.st_mode), "a device")
-        require(kind != FOLDER, f"{path}: is a directory; give the {what} itself")
-        told = f"is {kind}, not a regular file; save the {what} to disk first"
-        require(not kind, f"{path}: {told}")
+        kind = KINDS.get(stat.S_IFMT(found.st_mode), "device")
+        told = f"is a {kind}, not a regular file; save the {what} to disk first"
+        require(kind != "directory", f"{path}: is a directory; give the {what} itself")
+        require(kind == "file", f"{path}: {told}")
     check_size(path, what, found.st_size, max_bytes)
 
 
+KINDS = {
+    stat.S_IFREG: "file", stat.S_IFDIR: "directory", stat.S_IFIFO: "pipe (FIFO)",
+    stat.S_IFSOCK: "socket",
+}  # fmt: skip
 # What is read by place → endings that tell of a file in another's place.
 OTHERS = {
     "cell file": (".csv", ".tsv", ".parquet", ".pq", ".json"),
@@ -94,24 +94,11 @@ def _read_errors(path: str | Path, what: str) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
-FOLDER = "a directory"
-KINDS = {  # of what is no regular file; empty of one
-    stat.S_IFREG: "", stat.S_IFDIR: FOLDER, stat.S_IFIFO: "a pipe (FIFO)",
-    stat.S_IFSOCK: "a socket",
-}  # fmt: skip
-
-
-PIECE = 1 << 20  # bytes read at once
-
-
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    data = bytearray()
     with open_input(path, what, max_bytes) as handle:
-        # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
-        while len(data) <= max_bytes and (piece := handle.read(PIECE)):
-            data += piece
-    check_size(path, what, len(data), max_bytes)
-    return bytes(data)
+        data = handle.read()
+    check_size(path, what, len(data), max_bytes)  # those of /proc tell no size before
+    return data
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
@@ -125,18 +112,15 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
     text = read_text(path, what, max_bytes)
 
     def number(digits: str) -> float:
-        if math.isinf(value := float(digits)):
-            raise ValueError(f"{digits[:SHOWN]}… is beyond all numbers")
+        if not math.isfinite(value := float(digits)):
+            raise ValueError(f"{digits[:SHOWN]} is no number of JSON")
         return value
 
     def whole(digits: str) -> int | float:
         return int(digits) if len(digits) <= LONGEST_INTEGER else number(digits)
 
-    def refuse(name: str) -> None:
-        raise ValueError(f"{name} is no number of JSON")
-
     try:
-        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=refuse)
+        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=number)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
     except ValueError as error:
@@ -162,14 +146,11 @@ def decoded(
 
 def check_exists(path: Path, key: str, owner: Path) -> Path:
     """`path`, which `key` of the file `owner` names, where it is an existing file."""
-    named, kind = f"{owner}: key {key} names {str(path)!r}", "missing"
-    with suppress(OSError, InputError):
-        _check_path(path)
-        kind = KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "a device")
-    told = "does not exist or cannot be reached; paths are relative to the cell file"
-    require(kind != "missing", f"{named}, which {told}")
-    require(kind != FOLDER, f"{named}, a directory; name the file itself")
-    require(not kind, f"{named}, which is {kind}; name a regular file")
+    try:
+        check_regular(path, "file")
+    except InputError as error:
+        told = f"{owner}: key {key} names {error}; paths are relative to the cell file"
+        raise InputError(told) from None
     return path
 
 
@@ -211,10 +192,9 @@ def together() -> Iterator[None]:
     _written = written = list[tuple[Path, Path]]()
     try:
         yield
-        with _undisturbed():
-            for temporary, target in written:
-                with _write_errors(target):
-                    os.replace(temporary, target)
+        for temporary, target in written:
+            with _write_errors(target):
+                os.replace(temporary, target)
     finally:
         _written = None
         for temporary, _ in written:
@@ -234,10 +214,7 @@ def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
             with open(path, f"w{mode}", **how) as device:
                 yield device
             return
-        with suppress(OSError):
-            remove_abandoned(target.parent, re.escape(target.name[:40]))
-        own = f"{os.getpid()}-{secrets.token_hex(4)}"
-        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
+        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
         try:
             with open(temporary, f"x{mode}", **how) as handle:
                 if target.exists():  # what others may not read they may not read afterwards
@@ -268,49 +245,12 @@ def atomic_write(path: str | Path, content: str | bytes) -> None:
         handle.write(content)
 
 
-@contextmanager
-def _undisturbed() -> Iterator[None]:
-    """In a `with` block Ctrl-C is noted, and takes effect at its end."""
-    before, noted = signal.getsignal(signal.SIGINT), list[int]()
-    if not callable(before) or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    signal.signal(signal.SIGINT, lambda number, frame: noted.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if noted:
-        before(signal.SIGINT, None)
-
-
-def remove_abandoned(folder: Path, name: str) -> None:
-    """Remove what killed processes left in `folder` of files whose names match the pattern `name`:
-    regular files named as unfinished ones are, whose process runs no longer."""
-    known = re.compile(rf"\.{name}\.(\d+)-[0-9a-f]{{8}}{re.escape(UNFINISHED)}", re.DOTALL)
-    for path in folder.iterdir():
-        found = known.fullmatch(path.name)
-        if found and stat.S_ISREG(path.lstat().st_mode) and not _runs(int(found[1])):
-            path.unlink()
-
-
-def _runs(process: int) -> bool:
-    try:
-        if os.name == "posix":  # elsewhere the signal 0 would end it
-            os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except (OSError, OverflowError):  # somebody else's
-        return True
-    return True
-
-
 GROUP = "elastocal.plugins"
 MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
 TRUSTED = "ELASTOCAL_PLUGINS"  # 1, or folders whose cells may have their plug-ins run
 
-RAN: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
+RAN: dict[Path, bytes] = {}  # files that were run, as they were then
 REGISTERED: set[type] = set()  # the classes of effects, noise models and criteria that they gave
 
 
@@ -360,7 +300,7 @@ def _has_run(name: str, fresh: bool) -> bool:
     if not is_plugin_file(name):
         return name in sys.modules
     path = Path(name).resolve()
-    return path in RAN and not (fresh and path.exists() and RAN[path] != _version(path))
+    return path in RAN and not (fresh and path.exists() and RAN[path] != path.read_bytes())
 
 
 def _trusted(cell: Path) -> bool:
@@ -422,8 +362,7 @@ def _run_file(path: Path, where: str) -> None:
         from joblib.externals.cloudpickle import register_pickle_by_value
 
     path = path.resolve()
-    version = _version(path)
-    source = read_text(path, "plug-in", MAX_BYTES)
+    source = read_bytes(path, "plug-in", MAX_BYTES)
     # No file is written beside the user's own, as an import would.
     module = ModuleType(f"plugin_{path.stem}_{zlib.crc32(str(path).encode()):08x}")
     module.__file__ = str(path)
@@ -435,12 +374,7 @@ def _run_file(path: Path, where: str) -> None:
         del sys.modules[module.__name__]
         raise
     register_pickle_by_value(module)  # workers, which have not run it, are sent its classes
-    RAN[path] = version
-
-
-def _version(path: Path) -> tuple[int, int]:
-    state = path.stat()
-    return state.st_mtime_ns, state.st_size
+    RAN[path] = source
 
 
 def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:

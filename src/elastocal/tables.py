@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
 
 import numpy as np
 
-from elastocal.files import PIECE, atomic_write, check_size, decoded, open_input
+from elastocal.files import atomic_write, check_size, decoded, open_input
 from elastocal.messages import (
     InputError,
     cell_meaning,
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 
 MAX_LINE = 64 * 1024
+PIECE = 1 << 20  # bytes read at once
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
 ROWS_AT_ONCE = 10_000
