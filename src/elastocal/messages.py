@@ -154,13 +154,13 @@ def is_label(text: str) -> bool:
 
 # How a cell begins that a spreadsheet would work out, and the mark that stops it.
 _FORMULA = re.compile(r"'*[=+\-@]")
-_NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
+NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
 
 
 def cell_text(cell: object) -> object:
     """As a table is written: text that begins with = + - @ and is no number gets an apostrophe, so
     that no spreadsheet takes it for a formula; `cell_meaning` takes it off."""
-    if not isinstance(cell, str) or _NUMBER.fullmatch(cell):
+    if not isinstance(cell, str) or NUMBER.fullmatch(cell):
         return cell
     return f"'{printable(cell)}" if _FORMULA.match(cell) else printable(cell)
 

@@ -33,6 +33,7 @@ from elastocal.config import (
 )
 from elastocal.measurements import families
 from elastocal.messages import (
+    NUMBER,
     InputError,
     check_known,
     did_you_mean,
@@ -42,7 +43,7 @@ from elastocal.messages import (
     quoted,
     said_of,
 )
-from elastocal.tables import NUMBER, THOUSANDS, column, first_bad_cell
+from elastocal.tables import THOUSANDS, column, first_bad_cell
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
 Place = Annotated[int, Field(ge=1)] | Text
