@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -129,6 +132,45 @@ def test_what_replaces_a_file_is_as_secret_as_it_was(tmp_path):
     assert (tmp_path / "a.txt").stat().st_mode & 0o777 == 0o600
 
 
+WRITER = """
+import os, sys
+from elastocal.files import atomic_writer, atomic_write, together
+with together():
+    atomic_write(sys.argv[1], "half")
+    with atomic_writer(sys.argv[2]) as handle:
+        handle.write("half")
+        print(flush=True)
+        sys.stdin.read()
+"""
+
+
+def test_what_a_killed_process_left_goes_when_the_output_is_written_again(tmp_path):
+    """Not before it is killed; and nothing but what it wrote."""
+    outputs = [tmp_path / "a.txt", tmp_path / ("b" * 60)]
+    others = [
+        tmp_path / name for name in (".a.txt.tmp", ".c.txt.999999999-0123abcd.tmp", "a.txt.tmp")
+    ]
+    (tmp_path / ".a.txt.999999999-0123abcd.tmp").symlink_to("link")
+    for path in (*others, tmp_path / "link"):
+        path.write_text("of the user")
+    command = [sys.executable, "-c", WRITER, *map(str, outputs)]
+    writer = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    writer.stdout.readline()
+
+    def unfinished() -> int:
+        return len([n for n in os.listdir(tmp_path) if n.startswith((".a", ".b"))]) - 2
+
+    for output in outputs:
+        atomic_write(output, "new")
+    assert unfinished() == 2
+    writer.kill()
+    writer.communicate()
+    for output, left in zip(outputs, (1, 0), strict=True):
+        atomic_write(output, "newer")
+        assert unfinished() == left and output.read_text() == "newer"
+    assert all(path.read_text() == "of the user" for path in others)
+
+
 def test_files_written_together_appear_at_the_end(tmp_path):
     first, second = tmp_path / "a.txt", tmp_path / "b.bin"
     first.write_text("old")
@@ -151,3 +193,23 @@ def test_of_files_written_together_none_appears_where_one_fails(tmp_path, failur
         raise failure
     assert (tmp_path / "a.txt").read_text() == "old"
     assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_an_interrupt_between_files_written_together_waits_for_the_last(tmp_path, monkeypatch):
+    first, second = tmp_path / "a.txt", tmp_path / "b.txt"
+    replace = os.replace
+
+    def interrupted(*paths):
+        signal.raise_signal(signal.SIGINT)
+        replace(*paths)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr(os, "replace", interrupted)
+    try:
+        with pytest.raises(KeyboardInterrupt), together():
+            atomic_write(first, "new")
+            atomic_write(second, "new")
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sorted(os.listdir(tmp_path)) == ["a.txt", "b.txt"]

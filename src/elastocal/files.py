@@ -17,8 +17,10 @@ import math
 import os
 import re
 import secrets
+import signal
 import stat
 import sys
+import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
@@ -31,6 +33,8 @@ from elastocal.messages import SHOWN, InputError, option, quoted, raised_at, req
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+# What is being written ends so, after the number of the process that writes it.
+UNFINISHED = ".tmp"
 # Elements within each other, and parts of a dotted key: a file that people write has six.
 DEEPEST = 32
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
@@ -192,9 +196,10 @@ def together() -> Iterator[None]:
     _written = written = list[tuple[Path, Path]]()
     try:
         yield
-        for temporary, target in written:
-            with _write_errors(target):
-                os.replace(temporary, target)
+        with _undisturbed():
+            for temporary, target in written:
+                with _write_errors(target):
+                    os.replace(temporary, target)
     finally:
         _written = None
         for temporary, _ in written:
@@ -214,7 +219,10 @@ def atomic_writer(path: str | Path, binary: bool = False) -> Iterator[Any]:
             with open(path, f"w{mode}", **how) as device:
                 yield device
             return
-        temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.tmp")
+        with suppress(OSError):
+            remove_abandoned(target.parent, re.escape(target.name[:40]))
+        own = f"{os.getpid()}-{secrets.token_hex(4)}"
+        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
         try:
             with open(temporary, f"x{mode}", **how) as handle:
                 if target.exists():  # what others may not read they may not read afterwards
@@ -243,6 +251,43 @@ def _write_errors(path: str | Path) -> Iterator[None]:
 def atomic_write(path: str | Path, content: str | bytes) -> None:
     with atomic_writer(path, isinstance(content, bytes)) as handle:
         handle.write(content)
+
+
+@contextmanager
+def _undisturbed() -> Iterator[None]:
+    """In a `with` block Ctrl-C is noted, and takes effect at its end."""
+    before, noted = signal.getsignal(signal.SIGINT), list[int]()
+    if not callable(before) or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, lambda number, frame: noted.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if noted:
+        before(signal.SIGINT, None)
+
+
+def remove_abandoned(folder: Path, name: str) -> None:
+    """Remove what killed processes left in `folder` of files whose names match the pattern `name`:
+    regular files named as unfinished ones are, whose process runs no longer."""
+    known = re.compile(rf"\.{name}\.(\d+)-[0-9a-f]{{8}}{re.escape(UNFINISHED)}", re.DOTALL)
+    for path in folder.iterdir():
+        found = known.fullmatch(path.name)
+        if found and stat.S_ISREG(path.lstat().st_mode) and not _runs(int(found[1])):
+            path.unlink()
+
+
+def _runs(process: int) -> bool:
+    try:
+        if os.name == "posix":  # elsewhere the signal 0 would end it
+            os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        pass  # somebody else's
+    return True
 
 
 GROUP = "elastocal.plugins"
