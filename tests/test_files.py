@@ -68,12 +68,6 @@ def test_what_is_no_strict_json_is_refused_with_the_remedy(tmp_path, text):
         read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
 
 
-def test_a_number_of_five_thousand_digits_is_named_by_its_line(tmp_path):
-    (tmp_path / "a.toml").write_text(f"a = 1\nb = {'7' * 5000}\n")
-    with pytest.raises(InputError, match=r"a\.toml: .*thousands of digits \(at line 2\)$"):
-        read_toml(tmp_path / "a.toml", "cell")
-
-
 def test_a_matrix_that_states_more_than_it_holds_is_refused(tmp_path):
     np.save(tmp_path / "a.npy", np.eye(3))
     assert np.array_equal(read_matrix(tmp_path / "a.npy", "noise covariance"), np.eye(3))

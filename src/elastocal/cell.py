@@ -63,6 +63,7 @@ Scale = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Radii = Positive | Annotated[Array, numbers(least=0)]
 Joint = Annotated[Array, numbers(2), RISING]
 Distance = Annotated[float, Field(ge=0), AllowInfNan(True)]
+Label = Annotated[str, holding(is_label)]
 Country = Annotated[str, Field(pattern="^[A-Z]{2}$")]
 # shape → keys that it needs; `scale` alone may be left out.
 NEEDED = {
@@ -82,6 +83,7 @@ PLACE = (
     Key("position_m", note=", the solid's centre or the mesh's origin", form=Vector3),
     Key("rpy_deg", note=": roll, pitch, yaw", form=Vector3),
 )
+NAME = 'a name of its own, e.g. "table", on one line without blanks at its ends'
 PARTS = re.compile(r"base|flange|load|rope|link[0-9]+")
 
 
@@ -100,7 +102,7 @@ class Solid:
     the file `mesh`.
     """
 
-    name: str = keyed(takes='a name of its own, e.g. "table"', form=Text)
+    name: str = keyed(takes=NAME, form=Label)
     shape: Shape = keyed()
     size: Numbers = keyed(keys=SIZES)
     placement: Transform = keyed(keys=PLACE, default_factory=lambda: np.eye(4))
@@ -151,7 +153,7 @@ class CarriedBody:
 class HalfSpace:
     """Nothing may be where normal · (x − point) < 0; `normal` (3,) is a unit vector."""
 
-    name: str = keyed(takes='a name of its own, e.g. "walkway"', form=Text)
+    name: str = keyed(takes=NAME, form=Label)
     point: Vector3 = keyed("point_m", note=", a point of the boundary plane")
     normal: Direction = keyed(note=", a direction to the side where the arm may be")
 
@@ -286,11 +288,6 @@ def _check_names(table: Any, spot: Spot) -> None:
     for kind in ("obstacle", "body", "keep_out"):
         for i, entry in enumerate(table.get(kind, ())):
             here, name = (spot / kind / i).key("name"), getattr(entry, "solid", entry).name
-            spot.require(
-                is_label(name),
-                f"key {here} takes a text on one line without blanks at its ends; found "
-                f"{quoted(name)}",
-            )
             spot.require(
                 not PARTS.fullmatch(name),
                 f"key {here} is {quoted(name)}, which names a part of the arm or its load; "
@@ -448,15 +445,8 @@ class Cell:
         return {"path": spot.path, "name": table.get("name") or spot.path.stem}
 
     def check(self, known_effects: Collection[str] | None = None) -> None:
-        """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
-
-        Args:
-            known_effects: the names that `model.effects` may use; None leaves them unchecked.
-
-        Raises:
-            InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
-                there is none of.
-        """
+        """Raises InputError where the parts of the cell do not fit together, which `replace` may
+        leave, or `model.effects` names none of the `known_effects`; None leaves these unchecked."""
         where, sight = self.source, self.workspace.visibility
         normals = f"{where}: [workspace.visibility.normals]"
         self._check_markers(normals, sight.normals if sight else ())

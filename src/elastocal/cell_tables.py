@@ -286,11 +286,7 @@ class EffectChoice:
 
     @classmethod
     def parse(cls, entry: str) -> EffectChoice:
-        """Returns the choice that "effect" or "effect:where" states; raises InputError for others.
-
-        >>> EffectChoice.parse("joint_compliance:joint2")
-        EffectChoice(name='joint_compliance', where='joint2')
-        """
+        """The choice that "effect" or "effect:where" states."""
         name, colon, where = entry.partition(":")
         ok = name and (where or not colon) and entry == entry.strip()
         require(ok, f'key model.effects takes "effect" or "effect:where"; found {quoted(entry)}')

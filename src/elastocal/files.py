@@ -21,17 +21,14 @@ import signal
 import stat
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from elastocal.messages import SHOWN, InputError, option, quoted, raised_at, require
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 # What is being written ends so, after the number of the process that writes it.
 UNFINISHED = ".tmp"
@@ -311,19 +308,19 @@ def load_plugins(
     for k, name in enumerate(modules):
         if _has_run(name, fresh):
             continue
-        key, path = f"plugins.modules[{k}]", Path(name) if is_plugin_file(name) else None
-        what = f"the module {name!r}" if path is None else f"the Python file {path}"
+        key = f"plugins.modules[{k}]"
+        what = f"the Python file {name}" if is_plugin_file(name) else f"the module {name!r}"
         require(
             asked or _trusted(owner),
             f"{owner}: key {key} names {what}, which runs with your rights and so not unasked; "
             f"read it, then say {option('plugins', True)}, or set {TRUSTED}="
             f"{owner.absolute().parent} for all cells of this folder",
         )
-        where = f"{owner}: key {key}"
-        if path is None:
-            _run(where, None, partial(_import, name))
+        if is_plugin_file(name):
+            _run_file(check_exists(Path(name), key, owner), f"{owner}: key {key}")
         else:
-            _run_file(check_exists(path, key, owner), where)
+            with _running(f"{owner}: key {key}"):
+                _import(name)
 
 
 class Carried:
@@ -369,14 +366,10 @@ def _load_installed_in(folders: tuple[str, ...]) -> None:
 
     for point in entry_points(group=GROUP):
         source = f" of the package {point.dist.name}" if point.dist else ""
-
-        def enter(point: EntryPoint = point) -> None:
-            """A module registers when it is imported, a function when it is called."""
+        with _running(f"plug-in '{point.name}'{source}"):
             found = point.load()
-            if not isinstance(found, ModuleType):
+            if not isinstance(found, ModuleType):  # a module registers when it is imported
                 found()
-
-        _run(f"plug-in '{point.name}'{source}", None, enter)
 
 
 def _import(name: str) -> None:
@@ -412,23 +405,21 @@ def _run_file(path: Path, where: str) -> None:
     module = ModuleType(f"plugin_{path.stem}_{zlib.crc32(str(path).encode()):08x}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module
-
-    try:
-        _run(where, path, lambda: exec(compile(source, str(path), "exec"), module.__dict__))
-    except InputError:
-        del sys.modules[module.__name__]
-        raise
+    with _running(where, str(path)):
+        exec(compile(source, str(path), "exec"), module.__dict__)
     register_pickle_by_value(module)  # workers, which have not run it, are sent its classes
     RAN[path] = source
 
 
-def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
+@contextmanager
+def _running(where: str, path: str = "") -> Iterator[None]:
+    """What a plug-in raises is told with the last line of its file `path`, or of any not ours."""
     try:
-        run()
+        yield
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:
-        found = raised_at(error, lambda f: f == str(path))
+        found = raised_at(error, lambda f: f == path)
         foreign = raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
         file, line = found or foreign or ("", 0)
         text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"
