@@ -597,7 +597,7 @@ class DesignSpec:
     elsewhere_cap: NonNegative | None = keyed(note=", as in 0.05", default=None)
     candidates: Count | None = keyed(
         takes=CANDIDATES,
-        form=Count | Text | Annotated[list[Count | Text], Field(min_length=1, max_length=2)],
+        form=Annotated[Count | Text | list[Count | Text], holding(of_candidates)],
         default=None,
     )
     taught: File | None = None
@@ -646,52 +646,22 @@ class DesignSpec:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The levels and their numbers of poses; where poses is not given, it is their sum."""
+        """The levels and their numbers of poses, whose sum stands for poses; that they fit is for
+        who plans."""
         given = table.get("levels") or LevelsTable()
         levels = joint_values(given.model_extra or {}, spot, "levels", ("poses_per_level",))
-        per_level = _per_level(given.poses_per_level, levels, spot)
-        poses = table.get("poses")
-        if per_level:
-            spot.require(
-                poses in (None, sum(per_level)),
-                f"key design.poses is {poses}, but the poses per level in [design.levels] sum to "
-                f"{sum(per_level)}; drop or correct one of them",
-            )
-            poses = sum(per_level)
-        for joint, values in levels.items():
-            spot.require(
-                poses is None or poses >= len(values),
-                f"key design.poses is {poses}, but {joint} has {len(values)} levels in "
-                "[design.levels], and each needs at least one pose; ask for more poses or fewer "
-                "levels",
-            )
-        known = {"levels": levels, "per_level": per_level, "poses": poses}
+        each, n = given.poses_per_level, sum(map(len, levels.values()))
+        told = "key design.levels.poses_per_level has no meaning without levels; name the joint"
+        spot.require(levels or each is None, f"{told}, as in joint2_deg = [-90, -45, 0]")
+        per_level = (each,) * n if isinstance(each, int) else tuple(each or ())
+        poses, told = table.get("poses"), f"[design.levels] sum to {sum(per_level)}; drop one"
+        spot.require(
+            not per_level or poses in (None, sum(per_level)),
+            f"key design.poses is {poses}, but the poses per level in {told} or correct it",
+        )
+        known = {"levels": levels, "per_level": per_level, "poses": sum(per_level) or poses}
         if "candidates" in table:
-            found = of_candidates(table["candidates"]) or (None, None)
-            told = f"takes {CANDIDATES}; found {table['candidates']}"
-            spot.require(any(found), f"key {spot.key('candidates')} {told}")
-            known["candidates"] = found[0]
-            if found[1] is not None:
-                known["taught"] = existing_file(str(found[1]), spot, "candidates")
+            known["candidates"], taught = of_candidates(table["candidates"]) or (None, None)
+            if taught is not None:
+                known["taught"] = existing_file(str(taught), spot, "candidates")
         return known
-
-
-def _per_level(
-    given: int | list[int] | None, levels: dict[str, tuple[float, ...]], spot: Spot
-) -> tuple[int, ...]:
-    if given is None or len(levels) > 1:
-        return ()
-    spot.require(
-        levels,
-        "key design.levels.poses_per_level has no meaning without levels; name the joint, as in "
-        "joint2_deg = [-90, -45, 0]",
-    )
-    ((joint, values),) = levels.items()
-    if isinstance(given, int):
-        return (given,) * len(values)
-    spot.require(
-        len(given) == len(values),
-        f"key design.levels.poses_per_level has {len(given)} numbers for {len(values)} levels of "
-        f"{joint}; give one number for all, or one per level",
-    )
-    return tuple(given)

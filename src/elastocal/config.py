@@ -517,7 +517,7 @@ def numbers(
     return PlainValidator(check)
 
 
-def holding(rule: Callable[[Any], bool]) -> AfterValidator:
+def holding(rule: Callable[[Any], object]) -> AfterValidator:
     """The validator of values that keep a rule, which the note of their key has in words."""
 
     def check(value: Any) -> Any:
