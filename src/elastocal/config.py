@@ -61,9 +61,6 @@ from elastocal.units import Array, rotation_from_rpy, to_si
 MAX_BYTES = 1_000_000
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
-_UNIT = re.compile(
-    r"_([munkd]?m|m?rad|urad|deg|ppm|k?N|Nm|s|min|si|N_per_m?m|(deg|rad|m?m)_per_s)$"
-)
 # A key of DEEPEST parts where a key may begin, for which tomllib takes time that grows with their
 # square.
 _DOTTED = re.compile(
@@ -89,8 +86,6 @@ UNITS = {
 }
 
 WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
-
-_stem = partial(_UNIT.sub, "")  # of a key's name, without its unit
 
 Record = TypeVar("Record")
 Member = TypeVar("Member")
@@ -309,7 +304,7 @@ def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> 
 
 
 def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
-    known, found = {one.name: one for one in keys_of(cls)}, {}
+    known, found = [one.name for one in keys_of(cls)], {}
     more = getattr(cls, "more", "forbid")  # of a record
     more = cls.model_config.get("extra") if issubclass(cls, BaseModel) else more
     others = [name for name in data if name not in known]
@@ -318,12 +313,13 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     for name in others if more == "allow" else ():
         kind = get_args(get_type_hints(cls, include_extras=True)["__pydantic_extra__"])[1]
         found[name] = _value(kind, data[name], spot / name, takes, did_you_mean(name, known))
-    for name, one in known.items():
-        if name in data:
-            found[name] = _value(one.kind, data[name], spot / name, one.takes)
-        elif one.required and _stem(name) not in map(_stem, data):  # it may be in another unit
-            told = f"key {spot.key(name)} is missing; it takes {one.takes}"
-            raise InputError(f"{spot.path}: {told}")
+    for keys in fields_of(cls).values():
+        in_a_unit = all(one.required for one in keys) and any(one.name in data for one in keys)
+        for one in keys:
+            told = f"key {spot.key(one.name)} is missing; it takes {one.takes}"
+            spot.require(one.name in data or in_a_unit or not one.required, told)
+            if one.name in data:
+                found[one.name] = _value(one.kind, data[one.name], spot / one.name, one.takes)
     if issubclass(cls, BaseModel):
         return cls.model_construct(**found)
     return from_table(cls, found, spot)
@@ -461,14 +457,11 @@ def _unknown(cls: Any, name: str, found: Any, spot: Spot) -> str:
         table, full = [str(k) for k in above[:-1]], f"{above[-1]}.{name}"
         return f'unknown key {here}; write a full name in quotes: [{dotted(table)}."{full}"]'
     where = header(above).split(" no. ")[0] if above else "the top level"
-    hint = ""
-    for what, stem in (("other", _stem(name)), ("missing", name)):
-        units = [v for v in valid if v.startswith(stem + "_") and _stem(v) == stem]
-        hint = f"{what} unit: did you mean {' or '.join(units)}? " if units else hint
-    if not hint and (homes := list(_homes_of(name, spot.root, ()))):
-        hint = f"did you mean it in {' or '.join(homes[:4])}? "
-    elif not hint and (near := nearest(name, valid)):
-        hint = f"did you mean {near}? "
+    # First what it lacks but the unit, then where else it stands.
+    near = [v for v in valid if v.startswith(f"{name}_")]
+    near = near or [f"it in {home}" for home in _homes_of(name, spot.root, ())][:4]
+    near = near or [v for v in [nearest(name, valid)] if v]
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
     return f"unknown key {here}; {hint}{where} takes {listed(valid)}"
 
 
