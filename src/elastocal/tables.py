@@ -228,11 +228,15 @@ Choose = Callable[[Sequence[str]], Columns]  # by the header
 
 def match_columns(
     source: str, header: Sequence[str], known: Mapping[str, Family],
+    needed: Sequence[Sequence[str]], needed_by: str, exclusive: Sequence[tuple[str, str]] = (),
     passed_over: Callable[[str], bool] = lambda text: False,
     explain: Callable[[str], str | None] = lambda text: None,
     called: Mapping[str, str] = CALLED, valid: str = "",
 ) -> Columns:  # fmt: skip
-    """Which column of a header is which of the `known` families.  `passed_over`: headers that mean
+    """Which column of a header is which of the `known` families, none of which is there in part.
+
+    `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
+    needs"); `exclusive`: pairs of families that say the same; `passed_over`: headers that mean
     nothing here; `explain`: what to say of an unknown one; `called`: what its name may mean, as
     CALLED; `valid`: what to say where it is like none."""
     for i, text in enumerate(header, start=1):
@@ -267,19 +271,18 @@ def match_columns(
                     f"{family.meaning} in one unit"
                 )
         found[stem] = Column(text, stem, unit, family.is_label, stem in family.optional)
-    return {
+    columns = {
         name: tuple(found[stem] for stem in known[name].units if stem in found)
         for name, found in present.items()
     }
+    _check_columns(source, columns, known, needed, needed_by, exclusive)
+    return columns
 
 
-def check_columns(
-    source: str, columns: Columns, known: Mapping[str, Family],
-    needed: Sequence[Sequence[str]] = (), needed_by: str = "",
-    exclusive: Sequence[tuple[str, str]] = (),
-) -> Columns:  # fmt: skip
-    """No family is there in part.  `needed`: of each entry one family must be there, because
-    `needed_by` (as in "a DH table needs"); `exclusive`: pairs of families that say the same."""
+def _check_columns(
+    source: str, columns: Columns, known: Mapping[str, Family], needed: Sequence[Sequence[str]],
+    needed_by: str, exclusive: Sequence[tuple[str, str]],
+) -> None:  # fmt: skip
     for name, found in columns.items():
         family, unit, stems = known[name], found[0].unit, [c.stem for c in found]
         absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
@@ -308,7 +311,6 @@ def check_columns(
                 f"{source}: the columns {wanted} are missing, which {needed_by}; found "
                 f"{there or 'no known column'}"
             )
-    return columns
 
 
 def _unknown(
