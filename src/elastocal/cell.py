@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable
-from contextlib import suppress
 from dataclasses import field
 from datetime import date
 from functools import partial
@@ -85,12 +84,6 @@ PLACE = (
 )
 NAME = 'a name of its own, e.g. "table", on one line without blanks at its ends'
 PARTS = re.compile(r"base|flange|load|rope|link[0-9]+")
-
-
-def _is_day(text: str) -> bool:
-    with suppress(ValueError):
-        return date.fromisoformat(text).isoformat() == text
-    return False
 
 
 @record
@@ -352,7 +345,7 @@ class CertificateEntries:
     instrument: str | None = ENTRY()
     instrument_calibration: str | None = ENTRY()
     place: str | None = ENTRY()
-    measured_on: Annotated[str, holding(_is_day)] | None = keyed(
+    measured_on: Annotated[str, holding(date.fromisoformat)] | None = keyed(
         takes='the date of measurement, as in "2026-03-17"', default=None
     )
     operator: str | None = ENTRY()

@@ -511,7 +511,8 @@ def numbers(
 
 
 def holding(rule: Callable[[Any], object]) -> AfterValidator:
-    """The validator of values that keep a rule, which the note of their key has in words."""
+    """The validator of values for which a rule, told in the note of their key, returns something
+    true, and raises no ValueError."""
 
     def check(value: Any) -> Any:
         if not rule(value):
@@ -561,8 +562,7 @@ TUPLE = BeforeValidator(_as_tuple)
 AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
 Levels = Annotated[Many[float], DISTINCT]
-AS_PATH = BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
-File = Annotated[Path, AS_PATH]
+File = Annotated[Path, BeforeValidator(lambda path: Path(path) if isinstance(path, str) else path)]
 Rotation = Annotated[Array, numbers(3, 3)]
 Transform = Annotated[Array, numbers(4, 4)]
 Direction = Annotated[Array, PlainValidator(_direction), Field(description="three numbers")]
