@@ -22,7 +22,7 @@ def page() -> str:
         parts += [f"## `{title}`\n", "| key | takes |", "|---|---|"]
         for key in keys_of(table):
             required = " (required)" if key.required else ""
-            takes = key.takes.replace("|", "\\|")
+            takes = key.takes.replace("|", "\\|").replace("…]]", f"{title[1:-1]}.{key.name}]]")
             parts.append(f"| `{key.name}`{required} | {takes} |")
         parts.append("")
     return "\n".join(parts)

@@ -223,16 +223,6 @@ def _array(value: Any) -> bool:
     return numbers.dtype.kind in "iuf" and bool((np.abs(numbers) <= LARGEST).all())
 
 
-def _values(value: Any) -> bool:
-    """Numbers, complex ones too; what computes with them says whether it can."""
-    import numpy as np
-
-    try:
-        return np.asarray(value).dtype.kind in "iufc"
-    except ValueError:  # rows of different length
-        return False
-
-
 def _truth(value: Any) -> bool:
     return type(value).__name__ in ("bool", "bool_")
 
@@ -250,10 +240,6 @@ def _number(value: Any) -> bool:
     return bool(size <= LARGEST)
 
 
-def _text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
 def _list_of(check: Check, least: int = 0, most: float = math.inf) -> Check:
     def checked(value: Any) -> bool:
         several = isinstance(value, Collection) and not isinstance(value, str | bytes)
@@ -266,7 +252,8 @@ def _list_of(check: Check, least: int = 0, most: float = math.inf) -> Check:
 
 def _by_name(check: Check) -> Check:
     return lambda value: (
-        isinstance(value, Mapping) and all(_text(k) and check(v) for k, v in value.items())
+        isinstance(value, Mapping)
+        and all(isinstance(k, str) and check(v) for k, v in value.items())
     )
 
 
@@ -281,12 +268,12 @@ KINDS: dict[str, tuple[str, Check]] = {
     "int": (f"a whole number of at most {MOST:,}", _counted),
     "float": ("a finite number", _number),
     "bool": ("True or False", _truth),
-    "str": ("a text", _text),
-    "Path": ("a path", lambda v: isinstance(v, Path) or bool(_text(v) and v)),
+    "str": ("a text", lambda v: isinstance(v, str)),
+    "Path": ("a path", lambda v: isinstance(v, str | Path) and v != ""),
     "ArrayLike": ("finite numbers", _array),
-    "Array": ("numbers", _values),
+    "Array": ("finite numbers", _array),
     "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
-    "Sequence[str]": ("a list of names", _list_of(_text)),
+    "Sequence[str]": ("a list of names", _list_of(lambda v: isinstance(v, str))),
     "Sequence[TargetPose]": ("a list of TargetPose", _list_of(_is_a("TargetPose"))),
     "Mapping[str, float]": ("numbers by name", _by_name(_number)),
     "Mapping[str, Sequence[float]]": ("a list of numbers by name", _by_name(_list_of(_number, 1))),
@@ -400,10 +387,7 @@ def shown(value: Any) -> str:
 
 def whole(name: str, given: Any, least: int | None = None) -> int:
     more = "" if least is None else f", {least} or more"
-    if _whole(given) and abs(given) > MOST:
-        more += f" and at most {MOST:,}"
-    require(
-        _counted(given) and (least is None or given >= least),
-        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
-    )
+    good = _counted(given) and (least is None or given >= least)
+    told = f"{option(name)} takes a whole number of at most {MOST:,}{more}"
+    require(good, f"{told}; found {quoted(given)}")
     return int(given)

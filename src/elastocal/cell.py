@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AllowInfNan, Field
 
 from elastocal.cell_tables import DesignSpec, ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.config import (
+    RISING,
     TUPLE,
-    AnyFloat,
     Count,
     Direction,
     File,
@@ -29,16 +29,17 @@ from elastocal.config import (
     NonNegative,
     Numbers,
     Positive,
+    Positives,
     Spot,
     Table,
     Text,
     Transform,
-    Vector2,
     Vector3,
     checked,
     fields_of,
     file_key,
     from_table,
+    holding,
     joint_values,
     key,
     keyed,
@@ -55,10 +56,14 @@ from elastocal.units import Array, pose_at, rotation_from_rpy
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]
 Pair = Annotated[tuple[Text, Text], TUPLE]
-Angle = Annotated[float, Field(gt=0, le=180)]
+Angle = Annotated[float, Field(gt=0, le=180, description="a positive number")]
 Edges = Annotated[Array, numbers(3, above=0)]
 Scale = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Radii = Positive | Annotated[Array, numbers(least=0)]
+Joint = Annotated[Array, numbers(2), RISING]
+Distance = Annotated[float, Field(ge=0), AllowInfNan(True)]
+Label = Annotated[str, holding(is_label)]
+Country = Annotated[str, Field(pattern="^[A-Z]{2}$")]
 # shape → keys that it needs; `scale` alone may be left out.
 NEEDED = {
     "box": ("size_m",),
@@ -67,17 +72,17 @@ NEEDED = {
     "capsule": ("radius_m", "length_m"),
     "mesh": ("file",),
 }
-SIZE_KEYS = (
-    Key("size_m", "three positive numbers in m, the edges of a box", Edges),
-    Key("radius_m", "a positive number in m", Positive),
-    Key("length_m", "a positive number in m, along the solid's z axis", Positive),
-    Key("scale", "a positive number, or three for x, y, z", Scale),
+SIZES = (
+    Key("size_m", note=", the edges of a box", form=Edges),
+    Key("radius_m", form=Positive),
+    Key("length_m", note=", along the solid's z axis", form=Positive),
+    Key("scale", note=", or three for x, y, z", form=Scale),
 )
-PLACE_KEYS = (
-    Key("position_m", "three numbers in m, the solid's centre or the mesh's origin", Vector3),
-    Key("rpy_deg", "three numbers in degrees: roll, pitch, yaw", Vector3),
+PLACE = (
+    Key("position_m", note=", the solid's centre or the mesh's origin", form=Vector3),
+    Key("rpy_deg", note=": roll, pitch, yaw", form=Vector3),
 )
-ANGLE = "a number in degrees, over 0 and up to 180"
+NAME = 'a name of its own, e.g. "table", on one line without blanks at its ends'
 PARTS = re.compile(r"base|flange|load|rope|link[0-9]+")
 
 
@@ -90,11 +95,11 @@ class Solid:
     the file `mesh`.
     """
 
-    name: str = keyed('a name of its own, e.g. "table"', form=Text, required=True)
-    shape: Shape = keyed(required=True)
-    size: Numbers = keyed(keys=SIZE_KEYS)
-    placement: Transform = keyed(keys=PLACE_KEYS, default_factory=lambda: np.eye(4))
-    mesh: File | None = file_key('the path of a mesh, e.g. "fixture.stl"', "file", default=None)
+    name: str = keyed(takes=NAME, form=Label)
+    shape: Shape = keyed()
+    size: Numbers = keyed(keys=SIZES)
+    placement: Transform = keyed(keys=PLACE, default_factory=lambda: np.eye(4))
+    mesh: File | None = file_key("file", takes='the path of a mesh, as "part.stl"', default=None)
 
     def __post_init__(self) -> None:
         count = {"box": 3, "mesh": 3, "sphere": 1}.get(self.shape, 2)
@@ -107,19 +112,14 @@ class Solid:
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         shape = table["shape"]
         needed = NEEDED[shape]
-        for known in keys_of(cls):
+        for known in (*SIZES, *fields_of(cls)["mesh"]):
             name = known.name
-            of_shapes = name == "file" or name in [one.name for one in SIZE_KEYS]
-            allowed = name in needed or (name == "scale" and shape == "mesh")
-            spot.require(
-                allowed or not (of_shapes and name in table),
-                f"key {spot.key(name)} has no meaning for a {shape}, which takes "
-                f"{' and '.join(needed)}; drop it",
-            )
-            spot.require(
-                name in table or name not in needed,
-                f"key {spot.key(name)} is missing; for a {shape} it takes {known.takes}",
-            )
+            if name in needed:
+                told = f"key {spot.key(name)} is missing; for a {shape} it takes"
+                spot.require(name in table, f"{told} {known.of(name, known.form).takes}")
+            elif name in table and (name, shape) != ("scale", "mesh"):
+                told = f"{shape}, which takes {' and '.join(needed)}; drop it"
+                spot.require(False, f"key {spot.key(name)} has no meaning for a {told}")
         size = table.get("scale", np.ones(3))
         if shape != "mesh":
             size = np.hstack([table[name] for name in needed])
@@ -134,7 +134,7 @@ class CarriedBody:
 
     solid: Solid = keyed(keys=keys_of(Solid))
     on: Part = keyed(
-        '"flange", "base", or a link as in "link3" (the one joint 3 moves)', default="flange"
+        takes='"flange", "base", or a link as in "link3" (the one joint 3 moves)', default="flange"
     )
 
     @classmethod
@@ -146,13 +146,9 @@ class CarriedBody:
 class HalfSpace:
     """Nothing may be where normal · (x − point) < 0; `normal` (3,) is a unit vector."""
 
-    name: str = keyed('a name of its own, e.g. "walkway"', form=Text, required=True)
-    point: Vector3 = keyed(
-        "three numbers in m, a point of the boundary plane", "point_m", required=True
-    )
-    normal: Direction = keyed(
-        "three numbers, a direction to the side where the arm may be", required=True
-    )
+    name: str = keyed(takes=NAME, form=Label)
+    point: Vector3 = keyed("point_m", note=", a point of the boundary plane")
+    normal: Direction = keyed(note=", a direction to the side where the arm may be")
 
 
 @record
@@ -165,14 +161,12 @@ class HangingLoad:
     """
 
     solid: Solid = keyed(keys=keys_of(Solid, without=("name", "position_m", "rpy_deg")))
-    rope: NonNegative = keyed("a number >= 0 in m, from load point to load", "rope_m", default=0.0)
-    rope_radius: Positive = keyed("a positive number in mm", "rope_radius_mm", default=0.01)
-    rope_axis: Direction | None = keyed(
-        "three numbers, a direction in the flange frame", default=None
-    )
-    max_angle: float | None = keyed(ANGLE, "max_angle_deg", form=Angle, default=None)
+    rope: NonNegative = keyed("rope_m", note=", from load point to load", default=0.0)
+    rope_radius: Positive = keyed("rope_radius_mm", default=0.01)
+    rope_axis: Direction | None = keyed(note=", a direction in the flange frame", default=None)
+    max_angle: float | None = keyed("max_angle_deg", note=", at most 180", form=Angle, default=None)
     min_height: float | None = keyed(
-        "a number in m, a height in the data's frame", "min_height_m", default=None
+        "min_height_m", note=", a height in the data's frame", default=None
     )
 
     @classmethod
@@ -195,23 +189,22 @@ class Visibility:
     """
 
     normals: dict[str, Direction] = keyed(
-        "three numbers per marker, in the flange frame", default_factory=dict
+        note=" per marker, in the flange frame", default_factory=dict
     )
-    max_incidence: float | None = keyed(ANGLE, "max_incidence_deg", form=Angle, default=None)
-    range: Annotated[tuple[AnyFloat, AnyFloat], TUPLE] = keyed(
-        "two numbers in m, [nearest, farthest]", "range_m", form=Vector2, default=(0.0, np.inf)
+    max_incidence: float | None = keyed(
+        "max_incidence_deg", note=", at most 180", form=Angle, default=None
     )
-    beam_radius: NonNegative = keyed("a number >= 0 in mm", "beam_radius_mm", default=0.005)
+    range: Annotated[tuple[Distance, Distance], TUPLE, RISING] = keyed(
+        "range_m",
+        takes="[nearest, farthest] in m with 0 <= nearest < farthest",
+        form=Annotated[Array, numbers(2, least=0), RISING],
+        default=(0.0, np.inf),
+    )
+    beam_radius: NonNegative = keyed("beam_radius_mm", default=0.005)
     line_of_sight: bool = keyed(default=True)
-    min_markers: Count | None = keyed("a whole number >= 1", default=None)
+    min_markers: Count | None = keyed(default=None)
 
     def __post_init__(self) -> None:
-        low, high = self.range
-        require(
-            0 <= low < high,
-            "key workspace.visibility.range_m takes [nearest, farthest] in m with "
-            f"0 <= nearest < farthest; found {quoted([low, high])}",
-        )
         require(
             not self.normals or self.max_incidence is not None,
             "[workspace.visibility.normals] has no meaning without max_incidence_deg of "
@@ -239,38 +232,30 @@ class Workspace:
         0.05
     """
 
-    obstacles: Many[Solid] = keyed(
-        "tables, each headed [[workspace.obstacle]]", "obstacle", default=()
-    )
-    bodies: Many[CarriedBody] = keyed("tables, each headed [[workspace.body]]", "body", default=())
-    keep_out: Many[HalfSpace] = keyed("tables, each headed [[workspace.keep_out]]", default=())
-    load: HangingLoad | None = keyed("a table headed [workspace.load]", default=None)
-    visibility: Visibility | None = keyed("a table headed [workspace.visibility]", default=None)
+    obstacles: Many[Solid] = keyed("obstacle", default=())
+    bodies: Many[CarriedBody] = keyed("body", default=())
+    keep_out: Many[HalfSpace] = keyed(default=())
+    load: HangingLoad | None = keyed(default=None)
+    visibility: Visibility | None = keyed(default=None)
     link_radius: Many[float] = keyed(
-        "a positive number in {}, or one per link (0: no body)",
-        "link_radius_mm",
-        "link_radius_m",
-        form=Radii,
+        "link_radius_mm", "link_radius_m", note=", or one per link (0: no body)", form=Radii,
         default=(),
-    )
+    )  # fmt: skip
     urdf_geometry: bool = keyed(
-        "",
         "geometry",
         form=Literal["capsules", "urdf", "none"],
         into=lambda found, *_: found == "urdf",
         default=False,
     )
     self_collision: bool = keyed(default=True)
-    mounting_plane: bool | None = keyed("true or false", default=None)
-    ignored_pairs: Many[Pair] = keyed('pairs of names, as in [["link2", "link4"]]', default=())
-    clearance: NonNegative = keyed(
-        "a number >= 0 in {}", "clearance_mm", "clearance_m", default=0.0
+    mounting_plane: bool | None = keyed(default=None)
+    ignored_pairs: Many[Pair] = keyed(
+        takes='pairs of names, as in [["link2", "link4"]]', default=()
     )
-    self_clearance: NonNegative = keyed(
-        "a number >= 0 in {}", "self_clearance_mm", "self_clearance_m", default=0.0
-    )
+    clearance: NonNegative = keyed("clearance_mm", "clearance_m", default=0.0)
+    self_clearance: NonNegative = keyed("self_clearance_mm", "self_clearance_m", default=0.0)
     torque_limits: Many[Positive] = keyed(
-        "one positive number per joint, in N m", "torque_limits_Nm", default=()
+        "torque_limits_Nm", note=", one per joint", form=Positives, default=()
     )
 
     @classmethod
@@ -296,11 +281,6 @@ def _check_names(table: Any, spot: Spot) -> None:
     for kind in ("obstacle", "body", "keep_out"):
         for i, entry in enumerate(table.get(kind, ())):
             here, name = (spot / kind / i).key("name"), getattr(entry, "solid", entry).name
-            spot.require(
-                is_label(name),
-                f"key {here} takes a text on one line without blanks at its ends; found "
-                f"{quoted(name)}",
-            )
             spot.require(
                 not PARTS.fullmatch(name),
                 f"key {here} is {quoted(name)}, which names a part of the arm or its load; "
@@ -339,12 +319,12 @@ class Acceptance:
     readings that took no part in the fit.
     """
 
-    heldout: Positive | None = keyed("a positive number in µm", "heldout_um", default=None)
-    new_poses: Positive | None = keyed("a positive number in µm", "new_poses_um", default=None)
-    test: Positive | None = keyed("a positive number in µm", "test_um", default=None)
+    heldout: Positive | None = keyed("heldout_um", default=None)
+    new_poses: Positive | None = keyed("new_poses_um", default=None)
+    test: Positive | None = keyed("test_um", default=None)
 
 
-ENTRY = partial(keyed, "a text", form=Text, default=None)
+ENTRY = partial(keyed, form=Text, default=None)
 
 
 @record
@@ -358,37 +338,21 @@ class CertificateEntries:
 
     number: str | None = ENTRY()
     laboratory: str | None = ENTRY()
-    country: str | None = ENTRY()
+    country: Country | None = keyed(takes='the two letters of ISO 3166, as in "DE"', default=None)
     customer: str | None = ENTRY()
     robot_serial: str | None = ENTRY()
     tool_serial: str | None = ENTRY()
     instrument: str | None = ENTRY()
     instrument_calibration: str | None = ENTRY()
     place: str | None = ENTRY()
-    measured_on: str | None = ENTRY()
+    measured_on: Annotated[str, holding(date.fromisoformat)] | None = keyed(
+        takes='the date of measurement, as in "2026-03-17"', default=None
+    )
     operator: str | None = ENTRY()
     procedure: str | None = ENTRY()
-    temperature: float | None = keyed("a number in °C", "temperature_c", default=None)
-    instrument_uncertainty: NonNegative | None = keyed(
-        "a number >= 0 in µm", "instrument_uncertainty_um", default=None
-    )
-    limit: Positive | None = keyed("a positive number in µm", "limit_um", default=None)
-
-    def __post_init__(self) -> None:
-        require(
-            self.country is None or re.fullmatch("[A-Z]{2}", self.country),
-            f"key certificate.country is {quoted(self.country)}, which takes the two letters of "
-            'ISO 3166, as in "DE"',
-        )
-        try:
-            day = date.fromisoformat(self.measured_on or "2000-01-01").isoformat()
-        except ValueError:
-            day = ""
-        require(
-            self.measured_on in (None, "", day),
-            f"key certificate.measured_on is {quoted(self.measured_on)}, which takes the date of "
-            'measurement, as in "2026-03-17"',
-        )
+    temperature: float | None = keyed("temperature_c", takes="a number in °C", default=None)
+    instrument_uncertainty: NonNegative | None = keyed("instrument_uncertainty_um", default=None)
+    limit: Positive | None = keyed("limit_um", default=None)
 
     @property
     def missing(self) -> list[str]:
@@ -418,36 +382,28 @@ class Cell:
         'joint2.compliance'
     """
 
-    name: str = keyed("a text", form=Text)
+    name: str = keyed(form=Text, required=False)
     path: File | None = field(default=None, compare=False)
     robot: Robot = keyed(
-        'a table with urdf = "arm.urdf", mjcf = "arm.xml" or dh = "dh.csv"',
+        takes='a table with urdf = "arm.urdf", mjcf = "arm.xml" or dh = "dh.csv"',
         required=True,
         default_factory=Robot,
     )
-    tool: Tool = keyed("a table", default_factory=Tool)
-    tracker: Tracker = keyed("a table", default_factory=Tracker)
-    model: ModelSpec = keyed("a table", default_factory=ModelSpec)
-    limits: dict[str, Annotated[tuple[float, float], TUPLE]] = keyed(
-        "two numbers per joint, as in joint1_deg = [-170.0, 170.0]",
-        form=dict[str, Vector2],
+    tool: Tool = keyed(default_factory=Tool)
+    tracker: Tracker = keyed(default_factory=Tracker)
+    model: ModelSpec = keyed(default_factory=ModelSpec)
+    limits: dict[str, Joint] = keyed(
+        takes="[lower, upper] per joint, lower < upper, as in joint1_deg = [-170.0, 170.0]",
+        form=dict[str, Joint],
         into=joint_values,
         default_factory=dict,
     )
-    workspace: Workspace = keyed("a table", default_factory=Workspace)
-    design: DesignSpec = keyed("a table", default_factory=DesignSpec)
-    require: Acceptance = keyed("a table", default_factory=Acceptance)
-    certificate: CertificateEntries = keyed("a table", default_factory=CertificateEntries)
-    plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
-    noise: Unsteadiness = keyed("a table", default_factory=Unsteadiness)
-
-    def __post_init__(self) -> None:
-        for joint, (low, high) in self.limits.items():
-            require(
-                low < high,
-                f"the limits of {joint} in [limits] take [lower, upper] with lower < upper; swap "
-                "or correct them",
-            )
+    workspace: Workspace = keyed(default_factory=Workspace)
+    design: DesignSpec = keyed(default_factory=DesignSpec)
+    require: Acceptance = keyed(default_factory=Acceptance)
+    certificate: CertificateEntries = keyed(default_factory=CertificateEntries)
+    plugins: Many[Text] = keyed(form=PluginsTable, into=_modules, default=())
+    noise: Unsteadiness = keyed(default_factory=Unsteadiness)
 
     @classmethod
     def read(cls, path: str | Path, known_effects: Collection[str] | None = None) -> Cell:
@@ -482,15 +438,8 @@ class Cell:
         return {"path": spot.path, "name": table.get("name") or spot.path.stem}
 
     def check(self, known_effects: Collection[str] | None = None) -> None:
-        """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
-
-        Args:
-            known_effects: the names that `model.effects` may use; None leaves them unchecked.
-
-        Raises:
-            InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
-                there is none of.
-        """
+        """Raises InputError where the parts of the cell do not fit together, which `replace` may
+        leave, or `model.effects` names none of the `known_effects`; None leaves these unchecked."""
         where, sight = self.source, self.workspace.visibility
         normals = f"{where}: [workspace.visibility.normals]"
         self._check_markers(normals, sight.normals if sight else ())

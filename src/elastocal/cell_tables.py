@@ -13,15 +13,17 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
 
 from elastocal.config import (
-    AS_PATH,
+    DISTINCT,
     AnyFloat,
     Count,
     File,
     Key,
+    Levels,
     Many,
     NonNegative,
     Numbers,
     Positive,
+    Positives,
     Rotation,
     Spot,
     Table,
@@ -32,6 +34,7 @@ from elastocal.config import (
     fields_of,
     file_key,
     from_table,
+    holding,
     joint_values,
     key,
     keyed,
@@ -41,17 +44,20 @@ from elastocal.config import (
     stated,
     turn_key,
 )
-from elastocal.messages import InputError, is_label, listed, quoted, require, wish
+from elastocal.messages import is_label, listed, quoted, require, wish
 from elastocal.units import Array
 
 Observe = Literal["position", "deflection", "pose", "distance"]
 Convention = Literal["standard", "modified"]
 Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
+Speeds = Annotated[Array, numbers(above=0, one_for_all=True)]
 Scatter = Annotated[Array, numbers(least=0, one_for_all=True)]
 Compliances = Annotated[Many[NonNegative], Field(min_length=1)]
+Effects = Annotated[list[Text], DISTINCT]
 ZEROS = partial(np.zeros, 3)
 SOURCES = ("urdf", "mjcf", "dh")  # keys of [robot] that state the nominal arm
 POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
+OF_THE_FILE = "the name of a link of the URDF, or of a body{} of the MuJoCo model"
 
 
 @record
@@ -68,22 +74,17 @@ class Robot:
         6
     """
 
-    urdf: File | None = file_key('the path of a URDF file, e.g. "arm.urdf"', default=None)
-    mjcf: File | None = file_key('the path of a MuJoCo model, e.g. "arm.xml"', default=None)
-    base: Text | None = keyed(
-        "the name of a link of the URDF, or of a body of the MuJoCo model", default=None
-    )
-    flange: Text | None = keyed(
-        "the name of a link of the URDF, or of a body or site of the MuJoCo model", default=None
-    )
-    dh: File | None = file_key('the path of a DH table, e.g. "nominal_dh.csv"', default=None)
+    urdf: File | None = file_key(takes='the path of a URDF file, e.g. "arm.urdf"', default=None)
+    mjcf: File | None = file_key(takes='the path of a MuJoCo model, e.g. "arm.xml"', default=None)
+    base: Text | None = keyed(takes=OF_THE_FILE.format(""), default=None)
+    flange: Text | None = keyed(takes=OF_THE_FILE.format(" or site"), default=None)
+    dh: File | None = file_key(takes='the path of a DH table, e.g. "dh.csv"', default=None)
     dh_convention: Convention = keyed(default="standard")
-    masses: File | None = file_key(
-        'the path of a table of link masses, e.g. "links.csv"', default=None
-    )
-    ur_model: Text | None = keyed('the name of a Universal Robot, e.g. "UR10e"', default=None)
+    masses: File | None = file_key(takes='a table of link masses, e.g. "links.csv"', default=None)
+    ur_model: Text | None = keyed(takes='a Universal Robot, e.g. "UR10e"', default=None)
     joint_names: Literal["order", "file"] | None = keyed(
-        '"order" (jointN is the Nth joint) or "file" (names of the robot\'s file)', default=None
+        note=": whether jointN is the Nth joint, or one of that name in the robot's file",
+        default=None,
     )
 
     def __post_init__(self) -> None:
@@ -114,9 +115,6 @@ class Robot:
             base: name of the first link; None takes the root.
             flange: name of the last link; None takes the last one.
 
-        Raises:
-            InputError: a value is of the wrong type.
-
         Examples:
             >>> ec.Robot.from_urdf("kr270_2.urdf", flange="flange").flange
             'flange'
@@ -134,9 +132,6 @@ class Robot:
             base: name of the body in whose frame the chain starts; None takes the world.
             flange: name of a body or a site; None takes the body before the fingers branch off.
 
-        Raises:
-            InputError: a value is of the wrong type.
-
         Examples:
             >>> ec.Robot.from_mjcf("arm.xml", flange="attachment_site").flange
             'attachment_site'
@@ -153,9 +148,6 @@ class Robot:
             path: the table, with columns theta0_rad, d_m or d_mm, a_m or a_mm, alpha_rad.
             convention: "standard", or "modified" (Craig's).
             masses: table of link masses in kg and centres of mass in m, for weights.
-
-        Raises:
-            InputError: a value is of the wrong type, or the convention is unknown.
 
         Examples:
             >>> ec.Robot.from_dh("dh.csv", convention="modified").dh_convention
@@ -175,11 +167,9 @@ class Tool:
         array([0.25, 0.  , 0.05])
     """
 
-    load_point: Vector3 = keyed(
-        "three numbers in m, in the flange frame", "load_point_m", default_factory=ZEROS
-    )
+    load_point: Vector3 = keyed("load_point_m", note=", in the flange frame", default_factory=ZEROS)
     markers: dict[str, Vector3] = keyed(
-        "three numbers in m per marker, flange frame", "markers_m", default_factory=dict
+        "markers_m", note=" per marker, in the flange frame", default_factory=dict
     )
 
     def __post_init__(self) -> None:
@@ -195,17 +185,17 @@ class Tool:
 class CartesianNoise:
     """Standard deviations (3,) in m along x, y, z of the tracker frame; one number for all."""
 
-    sigma: Sigma = keyed("one positive number in µm, or three for x, y, z", "sigma_um")
+    sigma: Sigma = keyed("sigma_um", note=", or three for x, y, z", required=False)
 
 
 @record
 class PolarNoise:
     """Range and transverse standard deviation: constant part in m, part per metre of range (1)."""
 
-    range: Positive = keyed("a positive number in µm", "range_um")
-    range_per_m: NonNegative = keyed("a number >= 0 in µm per m", "range_ppm")
-    transverse: Positive = keyed("a positive number in µm", "transverse_um")
-    transverse_per_m: NonNegative = keyed("a number >= 0 in µm per m", "transverse_ppm")
+    range: Positive = keyed("range_um", required=False)
+    range_per_m: NonNegative = keyed("range_ppm", required=False)
+    transverse: Positive = keyed("transverse_um", required=False)
+    transverse_per_m: NonNegative = keyed("transverse_ppm", required=False)
 
 
 @record
@@ -221,15 +211,13 @@ class Tracker:
         array([1.e-05, 1.e-05, 1.e-05])
     """
 
-    position: Vector3 = keyed("three numbers in m", "position_m", default_factory=ZEROS)
+    position: Vector3 = keyed("position_m", default_factory=ZEROS)
     noise: CartesianNoise | PolarNoise | None = keyed(
         keys=keys_of(CartesianNoise, PolarNoise), default=None
     )
-    anchor: Vector3 | None = keyed("three numbers in m", "anchor_m", default=None)
-    rotation_sigma: Positive | None = keyed(
-        "a positive number in µrad", "rotation_urad", default=None
-    )
-    distance_sigma: Positive | None = keyed("a positive number in µm", "distance_um", default=None)
+    anchor: Vector3 | None = keyed("anchor_m", default=None)
+    rotation_sigma: Positive | None = keyed("rotation_urad", default=None)
+    distance_sigma: Positive | None = keyed("distance_um", default=None)
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
@@ -263,20 +251,17 @@ class Unsteadiness:
     """
 
     joints: Scatter = keyed(
-        "a number >= 0 in µrad (µm where a joint slides), or one per joint", "joints_urad",
+        "joints_urad", takes="a number >= 0 in µrad (µm where a joint slides), or one per joint",
         default_factory=partial(np.zeros, 1),
     )  # fmt: skip
-    drift: NonNegative = keyed("a number >= 0 in µm", "drift_um", default=0.0)
-    lasting: Positive = keyed("a positive number in s", "lasting_s", default=3600.0)
-    configuration: NonNegative = keyed("a number >= 0 in µm", "configuration_um", default=0.0)
-    tails: Positive | None = keyed("a number > 2", default=None)
-
-    def __post_init__(self) -> None:
-        require(
-            self.tails is None or self.tails > 2,
-            f"key noise.tails is {self.tails}: Student's t with two degrees of freedom or fewer "
-            "has no standard deviation, which is what [tracker] states; take a number > 2, as 3",
-        )
+    drift: NonNegative = keyed("drift_um", default=0.0)
+    lasting: Positive = keyed("lasting_s", default=3600.0)
+    configuration: NonNegative = keyed("configuration_um", default=0.0)
+    tails: Annotated[float, Field(gt=2)] | None = keyed(
+        takes="a number > 2, as 3: with two degrees of freedom or fewer Student's t has no "
+        "standard deviation, which is what [tracker] states",
+        default=None,
+    )
 
     @property
     def shared(self) -> bool:
@@ -301,14 +286,10 @@ class EffectChoice:
 
     @classmethod
     def parse(cls, entry: str) -> EffectChoice:
-        """Returns the choice that "effect" or "effect:where" states; raises InputError for others.
-
-        >>> EffectChoice.parse("joint_compliance:joint2")
-        EffectChoice(name='joint_compliance', where='joint2')
-        """
+        """The choice that "effect" or "effect:where" states."""
         name, colon, where = entry.partition(":")
         ok = name and (where or not colon) and entry == entry.strip()
-        require(ok, f'takes "effect" or "effect:where"; found {quoted(entry)}')
+        require(ok, f'key model.effects takes "effect" or "effect:where"; found {quoted(entry)}')
         return cls(name, where or None)
 
     def __str__(self) -> str:
@@ -318,13 +299,7 @@ class EffectChoice:
 def _choices(entries: object) -> object:
     if not isinstance(entries, list | tuple):
         return entries
-    choices: list[object] = []
-    for i, entry in enumerate(entries):
-        try:
-            choices.append(EffectChoice.parse(entry) if isinstance(entry, str) else entry)
-        except InputError as error:
-            raise InputError(f"key model.effects[{i}] {error}") from None
-    return tuple(choices)
+    return tuple(EffectChoice.parse(one) if isinstance(one, str) else one for one in entries)
 
 
 class CompensatorTable(Table):
@@ -349,27 +324,25 @@ class Nominal:
     """
 
     joint_compliance: Many[NonNegative] | None = keyed(
-        "one number >= 0 per joint, in rad/(N m)", form=Compliances, default=None
+        note=" per joint, in rad/(N m)", form=Compliances, default=None
     )
-    base_position: Vector3 | None = keyed("three numbers in m", "base_position_m", default=None)
+    base_position: Vector3 | None = keyed("base_position_m", default=None)
     base_rotation: Rotation | None = turn_key(
-        "three numbers in degrees: roll, pitch, yaw", "base_rpy_deg", default=None
+        "base_rpy_deg", note=": roll, pitch, yaw", default=None
     )
     gravity_compensator: dict[str, Any] | None = keyed(
-        'a table with joint = "joint2"',
+        takes='a table with joint = "joint2"',
         form=CompensatorTable,
         into=lambda table, *_: table.model_dump(exclude_none=True),
         default=None,
     )
     settings: dict[str, dict[str, AnyFloat]] = keyed(
-        "a table per place, as in settings.joint2 = { jump_time_s = 720.0 }",
+        takes="a table per place, as in settings.joint2 = { jump_time_s = 720.0 }",
         form=dict[str, dict[str, float]],
         default_factory=dict,
     )
     sizes: dict[str, dict[str, Positive]] = keyed(
-        "a table per place, as in sizes.joint2 = { move_lag = 0.002 }",
-        form=dict[str, dict[str, Positive]],
-        default_factory=dict,
+        takes="a table per place, as in sizes.joint2 = { move_lag = 0.002 }", default_factory=dict
     )
 
     def __post_init__(self) -> None:
@@ -396,24 +369,24 @@ class ModelSpec:
     """
 
     observe: Observe = keyed(default="position")
-    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices)] = keyed(
-        'a list of "effect" or "effect:where"', form=list[Text], default=()
+    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices), DISTINCT] = keyed(
+        takes='a list of "effect" or "effect:where", each once', form=Effects, default=()
     )
     torque: Literal["computed", "measured"] = keyed(default="computed")
     link_gravity: bool = keyed(default=False)
     deflection_model: Literal["equilibrium", "linear"] = keyed(default="equilibrium")
-    compliance_levels: dict[str, Many[float]] = keyed(
-        "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
-        form=dict[str, Numbers],
+    compliance_levels: dict[str, Levels] = keyed(
+        note=" per joint, each once, as in joint2_deg = [-25.2, 0.0]",
+        form=dict[str, Annotated[Numbers, DISTINCT]],
         into=joint_values,
         default_factory=dict,
     )
-    gear_ripple_orders: Many[Positive] = keyed("a list of positive numbers", default=())
+    gear_ripple_orders: Many[Positive] = keyed(takes="a list of positive numbers", default=())
     thermal_driver: Literal["time", "temperature"] = keyed(default="time")
     play_side: Literal["load", "load_and_approach"] = keyed(default="load")
     approach: Literal["column", "order"] = keyed(default="column")
     clock: Literal["column", "rows"] = keyed(default="column")
-    nominal: Nominal = keyed("a table", default_factory=Nominal)
+    nominal: Nominal = keyed(default_factory=Nominal)
 
     def with_effect(
         self, name: str, where: str, settings: Mapping[str, float], sizes: Mapping[str, float] = {}
@@ -422,37 +395,12 @@ class ModelSpec:
         nominal = self.nominal.at(where, settings, sizes)
         return replace(self, effects=(*self.effects, EffectChoice(name, where)), nominal=nominal)
 
-    def __post_init__(self) -> None:
-        for i, choice in enumerate(self.effects):
-            require(
-                choice not in self.effects[:i],
-                f"key model.effects[{i}] repeats {quoted(str(choice))}; keep one",
-            )
-        for joint, levels in self.compliance_levels.items():
-            require(
-                len(set(levels)) == len(levels),
-                f"[model.compliance_levels] repeats a level of {joint}; give each once",
-            )
 
-
-Positives = Annotated[Array, numbers(above=0)]
 TEST_POSE = "test_pose"  # the criterion where none is asked for
 EXTRA_TIME = 0.05  # of the shortest time, for a longer way where none is stated
 ELSEWHERE_CAP = 0.05  # where the user states no test poses: a price that buys most of what can be
-
-
-SPEED_KEYS = (
-    Key(
-        "speed_deg_per_s",
-        "a positive number in °/s, or one per joint",
-        Annotated[Array, numbers(above=0, one_for_all=True)],
-    ),
-    Key("speed_si", "one positive number per joint, in rad/s or m/s", Positives),
-)
-
-
-FORCE = partial(keyed, "three numbers in N, a force in the data's frame", "load_N", default=None)
-POINT = partial(keyed, "three numbers in m, a point in the flange frame", "point_m", default=None)
+FORCE = partial(keyed, "load_N", note=", a force in the data's frame", default=None)
+POINT = partial(keyed, "point_m", note=", a point in the flange frame", default=None)
 
 
 @record
@@ -465,20 +413,14 @@ class TargetPose:
     revolute joints only.
     """
 
-    q: Numbers = keyed("one number per joint, in {}", "q_deg", "q_si")
+    q: Numbers = keyed("q_deg", "q_si", note=", one per joint")
     force: Vector3 | None = FORCE()
-    weight: Positive = keyed("a positive number", default=1.0)
+    weight: Positive = keyed(default=1.0)
     point: Vector3 | None = POINT()
     degrees: bool = False
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The joints, in one of two units."""
-        spot.require(
-            "q_deg" in table or "q_si" in table,
-            f"key {spot.key('q_deg')} is missing; it takes one number per joint, in degrees "
-            "(q_si: in rad or m)",
-        )
         return {"degrees": "q_deg" in table}
 
 
@@ -486,7 +428,7 @@ class TargetPose:
 class TargetPath:
     """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
 
-    file: File = file_key('the path of a table of poses, e.g. "path.csv"', required=True)
+    file: File = file_key(takes='the path of a table of poses, e.g. "path.csv"')
     force: Vector3 | None = FORCE()
     point: Vector3 | None = POINT()
 
@@ -498,15 +440,11 @@ class TargetBox:
     `rotation` (3, 3) of the flange in the data's frame, None for any that the arm reaches.
     """
 
-    lower: Vector3 = keyed(
-        "three numbers in m, a corner in the data's frame", "lower_m", required=True
-    )
-    upper: Vector3 = keyed(
-        "three numbers in m, the opposite corner in the data's frame", "upper_m", required=True
-    )
-    count: Annotated[int, Field(ge=1, le=10_000)] = keyed("a whole number, 1 to 10000", default=20)
+    lower: Vector3 = keyed("lower_m", note=", a corner in the data's frame")
+    upper: Vector3 = keyed("upper_m", note=", the opposite corner")
+    count: Annotated[int, Field(ge=1, le=10_000)] = keyed(note=" from 1 to 10000", default=20)
     rotation: Rotation | None = turn_key(
-        "three numbers in degrees: roll, pitch, yaw of the flange", "rpy_deg", default=None
+        "rpy_deg", note=": roll, pitch, yaw of the flange", default=None
     )
     force: Vector3 | None = FORCE()
     point: Vector3 | None = POINT()
@@ -532,16 +470,20 @@ class Motion:
     `reference_every`: after so many visits one pose is visited again. `degrees`: speed or home were
     stated in degrees, which fits revolute joints only."""
 
-    speed: Positives | None = keyed(keys=SPEED_KEYS, default=None)
-    home: Numbers | None = keyed("one number per joint, in {}", "home_deg", "home_si", default=None)
-    dwell: NonNegative = keyed("a number >= 0 in s", "dwell_s", default=30.0)
-    reading: NonNegative = keyed("a number >= 0 in s", "reading_s", default=0.0)
-    load_change: NonNegative = keyed("a number >= 0 in s", "load_change_s", default=600.0)
+    speed: Positives | None = keyed(
+        keys=[Key("speed_deg_per_s", note=", or one per joint", form=Speeds),
+              Key("speed_si", "one positive number per joint, in rad/s or m/s", form=Positives)],
+        default=None,
+    )  # fmt: skip
+    home: Numbers | None = keyed("home_deg", "home_si", note=", one per joint", default=None)
+    dwell: NonNegative = keyed("dwell_s", default=30.0)
+    reading: NonNegative = keyed("reading_s", default=0.0)
+    load_change: NonNegative = keyed("load_change_s", default=600.0)
     both_directions: bool = keyed(default=False)
-    overshoot: Positive = keyed("a positive number in degrees", "overshoot_deg", default=0.05)
-    load_changes: Count | None = keyed("a whole number >= 1", default=None)
-    extra_time: NonNegative | None = keyed("a number >= 0, a share of the time", default=None)
-    reference_every: Count | None = keyed("a whole number >= 1", default=None)
+    overshoot: Positive = keyed("overshoot_deg", default=0.05)
+    load_changes: Count | None = keyed(default=None)
+    extra_time: NonNegative | None = keyed(note=", a share of the time", default=None)
+    reference_every: Count | None = keyed(default=None)
     degrees: bool = False
 
     @property
@@ -563,8 +505,8 @@ class Motion:
         return {"degrees": any(degrees)}
 
 
-Box = Annotated[Array, numbers(2, 3)]
-BOX = "two corners in m, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
+Box = Annotated[Array, numbers(2, 3), holding(lambda ends: bool((ends[0] <= ends[1]).all()))]
+BOX = "two corners in m, the lower first, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
 
 
 @record
@@ -573,21 +515,10 @@ class Freedom:
     `markers` by name and the `load_point` (flange frame) and for the `tracker` (data's frame), and
     how many of the design's `loads` that are not zero will hang."""
 
-    markers: dict[str, Box] = keyed(
-        f"per marker {BOX}", "markers_m", form=dict[str, Box], default_factory=dict
-    )
-    load_point: Box | None = keyed(BOX, "load_point_m", default=None)
-    tracker: Box | None = keyed(BOX, "tracker_m", default=None)
-    loads: Count | None = keyed("a whole number >= 1", default=None)
-
-    def __post_init__(self) -> None:
-        boxes = [(f"markers_m.{name}", box) for name, box in self.markers.items()]
-        for name, box in (*boxes, ("load_point_m", self.load_point), ("tracker_m", self.tracker)):
-            require(
-                box is None or (box[0] <= box[1]).all(),
-                f"[design.choose] {name} takes the lower corner and then the upper; "
-                "swap or correct them",
-            )
+    markers: dict[str, Box] = keyed("markers_m", takes=f"per marker {BOX}", default_factory=dict)
+    load_point: Box | None = keyed("load_point_m", takes=BOX, default=None)
+    tracker: Box | None = keyed("tracker_m", takes=BOX, default=None)
+    loads: Count | None = keyed(default=None)
 
 
 CANDIDATES = (
@@ -610,7 +541,7 @@ class LevelsTable(Table):
     """One joint's levels under a key such as joint2_deg, and how many poses each gets."""
 
     model_config = ConfigDict(extra="allow")
-    __pydantic_extra__: dict[str, Numbers] = Field(init=False)
+    __pydantic_extra__: dict[str, Annotated[Numbers, DISTINCT]] = Field(init=False)
     poses_per_level: Count | Annotated[list[Count], Field(min_length=1)] | None = key(
         "a whole number >= 1, or one per level"
     )
@@ -630,52 +561,53 @@ class DesignSpec:
     little error there as can be had (see `cap`); `combination` name → factor for c; `candidates` to
     draw, and `taught`: a table of poses that are brought, instead of these or beside them."""
 
-    poses: Count | None = keyed("a whole number >= 1", default=None)
+    poses: Count | None = keyed(default=None)
     criterion: Text = keyed(
-        'the name of a planning criterion, as "test_pose" or "D"', default=TEST_POSE
+        takes='the name of a planning criterion, as "test_pose" or "D"', default=TEST_POSE
     )
-    levels: dict[str, Many[float]] = keyed(
-        "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
+    levels: dict[str, Levels] = keyed(
+        takes="a list of numbers per joint, each once, as in joint2_deg = [-25.2, 0.0]",
         form=LevelsTable,
         default_factory=dict,
     )
     per_level: Many[Count] = ()
-    repeats: Count = keyed("a whole number >= 1", default=1)
-    loads: Annotated[Array, numbers(None, 3)] | None = keyed(
-        "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
+    repeats: Count = keyed(default=1)
+    loads: Annotated[Array, numbers(None, 3), DISTINCT] | None = keyed(
+        "loads_N",
+        takes="a list of forces in N, each once ([design] repeats says how often each is read), "
+        "as in [[0, 0, 0], [0, 0, -2600]]",
+        default=None,
     )
-    repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
+    repeatability: NonNegative = keyed("repeatability_um", default=0.0)
     marker_sigma: dict[str, Positive] = keyed(
-        "a positive number in µm per marker", "marker_sigma_um", default_factory=dict
+        "marker_sigma_um", note=" per marker", default_factory=dict
     )
     interest: Many[Text] = keyed(
-        'a list of names, as in ["joint_compliance", "joint2"]', default=()
+        takes='a list of names, as in ["joint_compliance", "joint2"]', default=()
     )
     combination: dict[str, float] = keyed(
-        'factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
+        takes='factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
         default_factory=dict,
     )
     load_states: Literal["all", "chosen"] = keyed(default="all")
     prior: Literal["none", "typical"] = keyed(default="none")
     elsewhere: Annotated[float, Field(ge=0, lt=1)] | None = keyed(
-        "a number from 0 to below 1", default=None
+        takes="a number from 0 to below 1", default=None
     )
-    elsewhere_cap: NonNegative | None = keyed("a number >= 0, as in 0.05", default=None)
+    elsewhere_cap: NonNegative | None = keyed(note=", as in 0.05", default=None)
     candidates: Count | None = keyed(
-        CANDIDATES,
-        form=Count | Text | Annotated[list[Count | Text], Field(min_length=1, max_length=2)],
+        takes=CANDIDATES,
+        form=Annotated[Count | Text | list[Count | Text], holding(of_candidates)],
         default=None,
     )
-    taught: Annotated[Path, AS_PATH] | None = None
-    target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
-    minutes: Positive | None = keyed("a positive number", default=None)
-    test_poses: Many[TargetPose] = keyed(
-        "tables, each headed [[design.test_pose]]", "test_pose", default=()
-    )
-    test_path: TargetPath | None = keyed("a table headed [design.test_path]", default=None)
-    test_box: TargetBox | None = keyed("a table headed [design.test_box]", default=None)
-    motion: Motion = keyed("a table headed [design.motion]", default_factory=Motion)
-    choose: Freedom | None = keyed("a table headed [design.choose]", default=None)
+    taught: File | None = None
+    target: Positive | None = keyed("target_um", default=None)
+    minutes: Positive | None = keyed(default=None)
+    test_poses: Many[TargetPose] = keyed("test_pose", default=())
+    test_path: TargetPath | None = keyed(default=None)
+    test_box: TargetBox | None = keyed(default=None)
+    motion: Motion = keyed(default_factory=Motion)
+    choose: Freedom | None = keyed(default=None)
 
     def __post_init__(self) -> None:
         joints, levels = " and ".join(self.levels), wish("levels", "[design.levels]")
@@ -683,16 +615,6 @@ class DesignSpec:
             len(self.levels) < 2,
             f"{levels} has levels of {joints}; only one joint can have levels: keep one, and "
             "narrow the others in [limits]",
-        )
-        for joint, values in self.levels.items():
-            require(
-                len(set(values)) == len(values),
-                f"{levels} repeats a level of {joint}; give each once",
-            )
-        require(
-            self.loads is None or len(np.unique(self.loads, axis=0)) == len(self.loads),
-            f"{wish('loads', 'key design.loads_N')} repeats a load; give each once ([design] "
-            "repeats says how often each is read)",
         )
         require(
             self.minutes is None or self.target is None,
@@ -724,52 +646,22 @@ class DesignSpec:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The levels and their numbers of poses; where poses is not given, it is their sum."""
+        """The levels and their numbers of poses, whose sum stands for poses; that they fit is for
+        who plans."""
         given = table.get("levels") or LevelsTable()
         levels = joint_values(given.model_extra or {}, spot, "levels", ("poses_per_level",))
-        per_level = _per_level(given.poses_per_level, levels, spot)
-        poses = table.get("poses")
-        if per_level:
-            spot.require(
-                poses in (None, sum(per_level)),
-                f"key design.poses is {poses}, but the poses per level in [design.levels] sum to "
-                f"{sum(per_level)}; drop or correct one of them",
-            )
-            poses = sum(per_level)
-        for joint, values in levels.items():
-            spot.require(
-                poses is None or poses >= len(values),
-                f"key design.poses is {poses}, but {joint} has {len(values)} levels in "
-                "[design.levels], and each needs at least one pose; ask for more poses or fewer "
-                "levels",
-            )
-        known = {"levels": levels, "per_level": per_level, "poses": poses}
+        each, n = given.poses_per_level, sum(map(len, levels.values()))
+        told = "key design.levels.poses_per_level has no meaning without levels; name the joint"
+        spot.require(levels or each is None, f"{told}, as in joint2_deg = [-90, -45, 0]")
+        per_level = (each,) * n if isinstance(each, int) else tuple(each or ())
+        poses, told = table.get("poses"), f"[design.levels] sum to {sum(per_level)}; drop one"
+        spot.require(
+            not per_level or poses in (None, sum(per_level)),
+            f"key design.poses is {poses}, but the poses per level in {told} or correct it",
+        )
+        known = {"levels": levels, "per_level": per_level, "poses": sum(per_level) or poses}
         if "candidates" in table:
-            found = of_candidates(table["candidates"]) or (None, None)
-            told = f"takes {CANDIDATES}; found {table['candidates']}"
-            spot.require(any(found), f"key {spot.key('candidates')} {told}")
-            known["candidates"] = found[0]
-            if found[1] is not None:
-                known["taught"] = existing_file(str(found[1]), spot, "candidates")
+            known["candidates"], taught = of_candidates(table["candidates"]) or (None, None)
+            if taught is not None:
+                known["taught"] = existing_file(str(taught), spot, "candidates")
         return known
-
-
-def _per_level(
-    given: int | list[int] | None, levels: dict[str, tuple[float, ...]], spot: Spot
-) -> tuple[int, ...]:
-    if given is None or len(levels) > 1:
-        return ()
-    spot.require(
-        levels,
-        "key design.levels.poses_per_level has no meaning without levels; name the joint, as in "
-        "joint2_deg = [-90, -45, 0]",
-    )
-    ((joint, values),) = levels.items()
-    if isinstance(given, int):
-        return (given,) * len(values)
-    spot.require(
-        len(given) == len(values),
-        f"key design.levels.poses_per_level has {len(given)} numbers for {len(values)} levels of "
-        f"{joint}; give one number for all, or one per level",
-    )
-    return tuple(given)

@@ -30,6 +30,7 @@ from typing import (
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     AllowInfNan,
     BaseModel,
     BeforeValidator,
@@ -60,10 +61,6 @@ from elastocal.units import Array, rotation_from_rpy, to_si
 MAX_BYTES = 1_000_000
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
 FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
-UNIT_SUFFIX = re.compile(
-    r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"
-    r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
-)
 # A key of DEEPEST parts where a key may begin, for which tomllib takes time that grows with their
 # square.
 _DOTTED = re.compile(
@@ -83,7 +80,12 @@ UNITS = {
     "deg": ("degrees", "rad"),
     "urad": ("µrad", "rad"),
     "deg_per_s": ("°/s", "rad/s"),
+    "s": ("s", "s"),
+    "N": ("N", "N"),
+    "Nm": ("N m", "N m"),
 }
+
+WORDS = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
 
 Record = TypeVar("Record")
 Member = TypeVar("Member")
@@ -107,16 +109,18 @@ def key(takes: str, default: Any = None) -> Any:
 
 @dataclass(frozen=True)
 class Key:
-    """A key of a file; `takes` completes the sentence 'key … takes …'.  `form`: the type of its
-    value there, None where it is the field's.  `into`: makes the field's value of it, its table and
-    its name; None converts from the unit that the name ends with.  `kind`: the type that is
-    checked, as `fields_of` finds it."""
+    """A key of a file; `takes` completes the sentence 'key … takes …', "" for what its type takes
+    in the unit that its name ends with, and the `note` behind that.  `form`: the type of its value
+    there, None where it is the field's.  `into`: makes the field's value of it, its table and its
+    name; None converts from the unit.  `kind`: the type that is checked, as `fields_of` finds it.
+    """
 
     name: str = ""
     takes: str = ""
     form: Any = None
     into: Into | None = None
     required: bool = False
+    note: str = ""
     kind: Any = None
 
     @property
@@ -124,17 +128,22 @@ class Key:
         """The unit of its value, "" where that is SI or has none."""
         return max((u for u in UNITS if self.name.endswith("_" + u)), key=len, default="")
 
+    def of(self, field: str, hint: Any) -> Key:
+        known = replace(self, name=self.name or field, kind=self.kind or self.form or hint)
+        unit = f" in {UNITS[known.unit][0]}" if known.unit else ""
+        return replace(known, takes=known.takes or f"{described(known.kind)}{unit}{known.note}")
+
 
 def keyed(
-    takes: str = "", *names: str, form: Any = None, into: Into | None = None,
-    keys: Sequence[Key] = (), required: bool = False, **default: Any,
+    *names: str, takes: str = "", note: str = "", form: Any = None, into: Into | None = None,
+    keys: Sequence[Key] = (), required: bool | None = None, **default: Any,
 ) -> Any:  # fmt: skip
     """A field of a record that a file states; `default` or `default_factory` as of `field`.
-    `names` of its key end with their unit, {} in `takes`; none is the field's own name, and of
-    several the user chooses one.  Without `takes` it is one of a Literal, or true or false.  `keys`
-    in their place where several state the field together; then `from_keys` of the record puts them
-    together."""
-    own = [Key(name, takes, form, into, required) for name in names or ("",)]
+    `names` of its key end with their unit; none is the field's own name, and of several the user
+    chooses one.  `keys` in their place where several state the field together; then `from_keys` of
+    the record puts them together.  What has no default is `required`, if nothing else is said."""
+    needed = not default if required is None else required
+    own = [Key(name, takes, form, into, needed, note) for name in names or ("",)]
     return field(metadata={"keys": tuple(keys or own)}, **default)
 
 
@@ -171,7 +180,8 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
     name = fields[name] if isinstance(name, int) else name
     told = first["msg"].removeprefix("Input should be ")
     for known in fields_of(cls)[name][:1]:
-        if known.form is None and kind != "matrix" and "dataclass" not in kind:
+        by_type = known.form is not None or kind == "matrix" or "dataclass" in kind
+        if kind == "rule" or not by_type:
             told = known.takes.replace(*UNITS.get(known.unit, ("", "")))
     words = re.findall(r'"(\w+)"', told) if kind == "literal_error" else ()
     hint = did_you_mean(str(first["input"]), words)
@@ -182,22 +192,14 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
 def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     hints = get_type_hints(cls, include_extras=True)
     if issubclass(cls, BaseModel):
+        of = cls.model_fields
+        keys = {name: Key(name, one.description or "") for name, one in of.items()}
         return {
-            name: (Key(name, of.description or _choice(hints[name]), None, None,
-                       of.is_required(), hints[name]),)
-            for name, of in cls.model_fields.items()
-        }  # fmt: skip
+            name: (replace(one.of(name, hints[name]), required=of[name].is_required()),)
+            for name, one in keys.items()
+        }
     return {
-        name: tuple(
-            replace(
-                known,
-                name=known.name or name,
-                takes=known.takes.replace("{}", UNITS[known.unit][0] if known.unit else "")
-                or _choice(known.form or hints[name]),
-                kind=known.kind or known.form or hints[name],
-            )
-            for known in one.metadata.get("keys", ())
-        )
+        name: tuple(known.of(name, hints[name]) for known in one.metadata.get("keys", ()))
         for name, one in cls.__dataclass_fields__.items()
     }
 
@@ -211,13 +213,19 @@ def keys_of(*classes: Any, without: Sequence[str] = ()) -> list[Key]:
     return [known for known in every if known.name not in without]
 
 
-def _choice(hint: Any) -> str:
-    """The members of a Literal as a sentence lists them, or true or false."""
-    for one in (hint, *get_args(hint)):
-        if get_origin(one) is Literal:
-            *first, last = (f'"{name}"' for name in get_args(one))
-            return f"{', '.join(first)} or {last}"
-    return "true or false"
+def described(kind: Any) -> str:
+    """A type in words: its own, the members of a Literal, of a dict or union the first one's."""
+    stated = [getattr(one, "func", one) for one in getattr(kind, "__metadata__", ())]
+    own = [told for one in stated if (told := getattr(one, "description", None))]
+    inner = get_args(kind)
+    if own or is_table(kind) or not inner:
+        return own[0] if own else WORDS.get(kind, "a table")
+    if get_origin(kind) is Literal:
+        *first, last = (f'"{name}"' for name in inner)
+        return f"{', '.join(first)} or {last}"
+    if tables_in(kind) and get_origin(kind) is tuple:
+        return "tables, each headed [[…]]"
+    return described(inner[get_origin(kind) is dict])
 
 
 def is_table(kind: object) -> bool:
@@ -267,9 +275,6 @@ def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[s
         lines = text.split("\n")
         end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
         reason = str(error).replace("(at end of document)", end)
-        if long := re.search(r"(?<!\d)\d{4300}", text):  # what Python refuses to read
-            line = text.count("\n", 0, long.start()) + 1
-            reason = f"a number of thousands of digits (at line {line})"
         raise InputError(f"{path}: not valid TOML: {reason}") from None
 
 
@@ -299,7 +304,7 @@ def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> 
 
 
 def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
-    known, found = {one.name: one for one in keys_of(cls)}, {}
+    known, found = [one.name for one in keys_of(cls)], {}
     more = getattr(cls, "more", "forbid")  # of a record
     more = cls.model_config.get("extra") if issubclass(cls, BaseModel) else more
     others = [name for name in data if name not in known]
@@ -308,12 +313,13 @@ def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
     for name in others if more == "allow" else ():
         kind = get_args(get_type_hints(cls, include_extras=True)["__pydantic_extra__"])[1]
         found[name] = _value(kind, data[name], spot / name, takes, did_you_mean(name, known))
-    for name, one in known.items():
-        if name in data:
-            found[name] = _value(one.kind, data[name], spot / name, one.takes)
-        elif one.required:
-            told = f"key {spot.key(name)} is missing; it takes {one.takes}"
-            raise InputError(f"{spot.path}: {told}")
+    for keys in fields_of(cls).values():
+        in_a_unit = all(one.required for one in keys) and any(one.name in data for one in keys)
+        for one in keys:
+            told = f"key {spot.key(one.name)} is missing; it takes {one.takes}"
+            spot.require(one.name in data or in_a_unit or not one.required, told)
+            if one.name in data:
+                found[one.name] = _value(one.kind, data[one.name], spot / one.name, one.takes)
     if issubclass(cls, BaseModel):
         return cls.model_construct(**found)
     return from_table(cls, found, spot)
@@ -350,6 +356,7 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
                 keys, found = (*keys, name), found[name]
     if problem == "literal_error" and isinstance(found, str):
         hint = did_you_mean(found, re.findall(r'"(\w+)"', takes))
+    takes = takes.replace("[[…]]", f"[[{place(*keys)}]]")
     raise InputError(f"{spot.path}: key {place(*keys)} takes {takes}; found {shown(found)}{hint}")
 
 
@@ -450,14 +457,11 @@ def _unknown(cls: Any, name: str, found: Any, spot: Spot) -> str:
         table, full = [str(k) for k in above[:-1]], f"{above[-1]}.{name}"
         return f'unknown key {here}; write a full name in quotes: [{dotted(table)}."{full}"]'
     where = header(above).split(" no. ")[0] if above else "the top level"
-    hint = ""
-    for what, stem in (("other", UNIT_SUFFIX.sub("", name)), ("missing", name)):
-        units = [v for v in valid if v.startswith(stem + "_") and UNIT_SUFFIX.sub("", v) == stem]
-        hint = f"{what} unit: did you mean {' or '.join(units)}? " if units else hint
-    if not hint and (homes := list(_homes_of(name, spot.root, ()))):
-        hint = f"did you mean it in {' or '.join(homes[:4])}? "
-    elif not hint and (near := nearest(name, valid)):
-        hint = f"did you mean {near}? "
+    # First what it lacks but the unit, then where else it stands.
+    near = [v for v in valid if v.startswith(f"{name}_")]
+    near = near or [f"it in {home}" for home in _homes_of(name, spot.root, ())][:4]
+    near = near or [v for v in [nearest(name, valid)] if v]
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
     return f"unknown key {here}; {hint}{where} takes {listed(valid)}"
 
 
@@ -485,7 +489,9 @@ def numbers(
     `shape` None stands for any number but zero; `one_for_all` takes a single number too, as that of
     all.  Each is at least `least` and greater than `above`."""
     n, *columns = wanted = shape or (None,)
-    kind, takes = "numbers", f"{n or 'a list of'} {'positive ' * (above == 0)}numbers"
+    kind, few = "numbers", {2: "two", 3: "three", None: "a list of"}.get(n, f"{n}")
+    size = "positive " * (above == 0)
+    takes = f"a {size}number" if one_for_all else f"{few} {size}numbers"
     if columns:
         kind, takes = "matrix", f"an array ({n or 'n'}, {columns[0]})"
 
@@ -500,7 +506,25 @@ def numbers(
                 return found
         raise PydanticCustomError(kind, takes)
 
+    check.description = takes  # type: ignore[attr-defined]
     return PlainValidator(check)
+
+
+def holding(rule: Callable[[Any], object]) -> AfterValidator:
+    """The validator of values for which a rule, told in the note of their key, returns something
+    true, and raises no ValueError."""
+
+    def check(value: Any) -> Any:
+        if not rule(value):
+            raise PydanticCustomError("rule", "")
+        return value
+
+    return AfterValidator(check)
+
+
+def _all_differ(values: Any) -> bool:
+    listing = (values + 0.0).tolist() if isinstance(values, np.ndarray) else values
+    return len(set(map(str, listing))) == len(listing)
 
 
 def _direction(value: object) -> Array:
@@ -528,17 +552,20 @@ Text = Annotated[str, Field(min_length=1, description="a text")]
 Positive = Annotated[float, Field(gt=0, description="a positive number")]
 NonNegative = Annotated[float, Field(ge=0, description="a number >= 0")]
 Count = Annotated[int, Field(ge=1, le=10_000_000, description="a whole number >= 1")]
-Numbers = Annotated[Array, numbers(), Field(description="a list of numbers")]
-Vector2 = Annotated[Array, numbers(2), Field(description="two numbers")]
-Vector3 = Annotated[Array, numbers(3), Field(description="three numbers")]
+Numbers = Annotated[Array, numbers()]
+Positives = Annotated[Array, numbers(above=0)]
+Vector2 = Annotated[Array, numbers(2)]
+Vector3 = Annotated[Array, numbers(3)]
+DISTINCT = holding(_all_differ)
+RISING = holding(lambda ends: bool(np.less(ends[0], ends[-1]).all()))
 TUPLE = BeforeValidator(_as_tuple)
 AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
-AS_PATH = BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
-File = Annotated[Path, AS_PATH]
+Levels = Annotated[Many[float], DISTINCT]
+File = Annotated[Path, BeforeValidator(lambda path: Path(path) if isinstance(path, str) else path)]
 Rotation = Annotated[Array, numbers(3, 3)]
 Transform = Annotated[Array, numbers(4, 4)]
-Direction = Annotated[Array, PlainValidator(_direction)]
+Direction = Annotated[Array, PlainValidator(_direction), Field(description="three numbers")]
 # Fields of these two types, which a file states otherwise.
 file_key = partial(keyed, form=Text, into=existing_file)
 turn_key = partial(keyed, form=Vector3, into=lambda v, *_: rotation_from_rpy(np.radians(v)))

@@ -21,17 +21,14 @@ import signal
 import stat
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import Any, BinaryIO
 
 from elastocal.messages import SHOWN, InputError, option, quoted, raised_at, require
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 # What is being written ends so, after the number of the process that writes it.
 UNFINISHED = ".tmp"
@@ -45,13 +42,17 @@ def check_regular(path: str | Path, what: str, max_bytes: int | None = None) -> 
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
-        kind = KINDS.get(stat.S_IFMT(found.st_mode), "a device")
-        require(kind != FOLDER, f"{path}: is a directory; give the {what} itself")
-        told = f"is {kind}, not a regular file; save the {what} to disk first"
-        require(not kind, f"{path}: {told}")
+        kind = KINDS.get(stat.S_IFMT(found.st_mode), "device")
+        told = f"is a {kind}, not a regular file; save the {what} to disk first"
+        require(kind != "directory", f"{path}: is a directory; give the {what} itself")
+        require(kind == "file", f"{path}: {told}")
     check_size(path, what, found.st_size, max_bytes)
 
 
+KINDS = {
+    stat.S_IFREG: "file", stat.S_IFDIR: "directory", stat.S_IFIFO: "pipe (FIFO)",
+    stat.S_IFSOCK: "socket",
+}  # fmt: skip
 # What is read by place → endings that tell of a file in another's place.
 OTHERS = {
     "cell file": (".csv", ".tsv", ".parquet", ".pq", ".json"),
@@ -94,24 +95,11 @@ def _read_errors(path: str | Path, what: str) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
-FOLDER = "a directory"
-KINDS = {  # of what is no regular file; empty of one
-    stat.S_IFREG: "", stat.S_IFDIR: FOLDER, stat.S_IFIFO: "a pipe (FIFO)",
-    stat.S_IFSOCK: "a socket",
-}  # fmt: skip
-
-
-PIECE = 1 << 20  # bytes read at once
-
-
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    data = bytearray()
     with open_input(path, what, max_bytes) as handle:
-        # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
-        while len(data) <= max_bytes and (piece := handle.read(PIECE)):
-            data += piece
-    check_size(path, what, len(data), max_bytes)
-    return bytes(data)
+        data = handle.read()
+    check_size(path, what, len(data), max_bytes)  # those of /proc tell no size before
+    return data
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
@@ -125,18 +113,15 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
     text = read_text(path, what, max_bytes)
 
     def number(digits: str) -> float:
-        if math.isinf(value := float(digits)):
-            raise ValueError(f"{digits[:SHOWN]}… is beyond all numbers")
+        if not math.isfinite(value := float(digits)):
+            raise ValueError(f"{digits[:SHOWN]} is no number of JSON")
         return value
 
     def whole(digits: str) -> int | float:
         return int(digits) if len(digits) <= LONGEST_INTEGER else number(digits)
 
-    def refuse(name: str) -> None:
-        raise ValueError(f"{name} is no number of JSON")
-
     try:
-        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=refuse)
+        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=number)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
     except ValueError as error:
@@ -162,14 +147,11 @@ def decoded(
 
 def check_exists(path: Path, key: str, owner: Path) -> Path:
     """`path`, which `key` of the file `owner` names, where it is an existing file."""
-    named, kind = f"{owner}: key {key} names {str(path)!r}", "missing"
-    with suppress(OSError, InputError):
-        _check_path(path)
-        kind = KINDS.get(stat.S_IFMT(os.stat(path).st_mode), "a device")
-    told = "does not exist or cannot be reached; paths are relative to the cell file"
-    require(kind != "missing", f"{named}, which {told}")
-    require(kind != FOLDER, f"{named}, a directory; name the file itself")
-    require(not kind, f"{named}, which is {kind}; name a regular file")
+    try:
+        check_regular(path, "file")
+    except InputError as error:
+        told = f"{owner}: key {key} names {error}; paths are relative to the cell file"
+        raise InputError(told) from None
     return path
 
 
@@ -300,8 +282,8 @@ def _runs(process: int) -> bool:
             os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (OSError, OverflowError):  # somebody else's
-        return True
+    except (OSError, OverflowError):
+        pass  # somebody else's
     return True
 
 
@@ -310,7 +292,7 @@ MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
 TRUSTED = "ELASTOCAL_PLUGINS"  # 1, or folders whose cells may have their plug-ins run
 
-RAN: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
+RAN: dict[Path, bytes] = {}  # files that were run, as they were then
 REGISTERED: set[type] = set()  # the classes of effects, noise models and criteria that they gave
 
 
@@ -326,19 +308,19 @@ def load_plugins(
     for k, name in enumerate(modules):
         if _has_run(name, fresh):
             continue
-        key, path = f"plugins.modules[{k}]", Path(name) if is_plugin_file(name) else None
-        what = f"the module {name!r}" if path is None else f"the Python file {path}"
+        key = f"plugins.modules[{k}]"
+        what = f"the Python file {name}" if is_plugin_file(name) else f"the module {name!r}"
         require(
             asked or _trusted(owner),
             f"{owner}: key {key} names {what}, which runs with your rights and so not unasked; "
             f"read it, then say {option('plugins', True)}, or set {TRUSTED}="
             f"{owner.absolute().parent} for all cells of this folder",
         )
-        where = f"{owner}: key {key}"
-        if path is None:
-            _run(where, None, partial(_import, name))
+        if is_plugin_file(name):
+            _run_file(check_exists(Path(name), key, owner), f"{owner}: key {key}")
         else:
-            _run_file(check_exists(path, key, owner), where)
+            with _running(f"{owner}: key {key}"):
+                _import(name)
 
 
 class Carried:
@@ -360,7 +342,7 @@ def _has_run(name: str, fresh: bool) -> bool:
     if not is_plugin_file(name):
         return name in sys.modules
     path = Path(name).resolve()
-    return path in RAN and not (fresh and path.exists() and RAN[path] != _version(path))
+    return path in RAN and not (fresh and path.exists() and RAN[path] != path.read_bytes())
 
 
 def _trusted(cell: Path) -> bool:
@@ -384,14 +366,10 @@ def _load_installed_in(folders: tuple[str, ...]) -> None:
 
     for point in entry_points(group=GROUP):
         source = f" of the package {point.dist.name}" if point.dist else ""
-
-        def enter(point: EntryPoint = point) -> None:
-            """A module registers when it is imported, a function when it is called."""
+        with _running(f"plug-in '{point.name}'{source}"):
             found = point.load()
-            if not isinstance(found, ModuleType):
+            if not isinstance(found, ModuleType):  # a module registers when it is imported
                 found()
-
-        _run(f"plug-in '{point.name}'{source}", None, enter)
 
 
 def _import(name: str) -> None:
@@ -422,34 +400,26 @@ def _run_file(path: Path, where: str) -> None:
         from joblib.externals.cloudpickle import register_pickle_by_value
 
     path = path.resolve()
-    version = _version(path)
-    source = read_text(path, "plug-in", MAX_BYTES)
+    source = read_bytes(path, "plug-in", MAX_BYTES)
     # No file is written beside the user's own, as an import would.
     module = ModuleType(f"plugin_{path.stem}_{zlib.crc32(str(path).encode()):08x}")
     module.__file__ = str(path)
     sys.modules[module.__name__] = module
-
-    try:
-        _run(where, path, lambda: exec(compile(source, str(path), "exec"), module.__dict__))
-    except InputError:
-        del sys.modules[module.__name__]
-        raise
+    with _running(where, str(path)):
+        exec(compile(source, str(path), "exec"), module.__dict__)
     register_pickle_by_value(module)  # workers, which have not run it, are sent its classes
-    RAN[path] = version
+    RAN[path] = source
 
 
-def _version(path: Path) -> tuple[int, int]:
-    state = path.stat()
-    return state.st_mtime_ns, state.st_size
-
-
-def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
+@contextmanager
+def _running(where: str, path: str = "") -> Iterator[None]:
+    """What a plug-in raises is told with the last line of its file `path`, or of any not ours."""
     try:
-        run()
+        yield
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     except (Exception, SystemExit) as error:
-        found = raised_at(error, lambda f: f == str(path))
+        found = raised_at(error, lambda f: f == path)
         foreign = raised_at(error, lambda f: not f.startswith((OURS, "<frozen")))
         file, line = found or foreign or ("", 0)
         text = f"{type(error).__name__}: {error.msg if isinstance(error, SyntaxError) else error}"

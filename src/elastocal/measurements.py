@@ -391,7 +391,7 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
         Family("configuration", "configuration", {"configuration": NO_UNIT}, is_label=True),
         Family("repeat", "repeat", {"repeat": NO_UNIT}),
         Family("marker", "marker", {"marker": NO_UNIT}, is_label=True),
-        Family("q", "joint positions", per_joint("q", ANGLE, LENGTH[:2])),
+        Family("q", f"positions of the {len(numbered)} joints", per_joint("q", ANGLE, LENGTH[:2])),
         Family("force", "forces", same(("force_x", "force_y", "force_z"), ("N",))),
         Family("position", "positions", same("xyz", LENGTH)),
         Family("rotation", "rotation vector", same(("rx", "ry", "rz"), ANGLE)),
@@ -426,41 +426,22 @@ def columns_of(
     """What the columns of a table mean; `observe` decides what must be there, `extra` are families
     that this table may have besides."""
     known = families(joint_kinds) | {family.name: family for family in extra}
-    found = tables.match_columns(
-        source,
-        header,
-        known,
+    joints = [("q",)] if joint_kinds and observe != "targets" else []
+    what = "a plan" if observe in PLANS else f'observe = "{observe}" in the cell file'
+    return tables.match_columns(
+        source, header, known, (*joints, *REQUIRED[observe]), f"{what} needs", EXCLUSIVE,
         lambda text: observe in PLANS and (text in PLAN_ONLY or text.startswith(BESIDE_COMMANDS)),
-        lambda text: _wrong_joint(text, header, known),
-    )
-    stated = observe != "targets" or "q" in found  # targets need no joints, perhaps no positions
-    if joint_kinds and stated and len(found.get("q", ())) != len(joint_kinds):
-        raise InputError(f"{source}: {_wrong_count(header, known['q'])}")
-    needed_by = f'observe = "{observe}" in the cell file needs'
-    return tables.check_columns(source, found, known, REQUIRED[observe], needed_by, EXCLUSIVE)
+        lambda text: _wrong_joint(text, known),
+    )  # fmt: skip
 
 
-def _wrong_joint(text: str, header: Sequence[str], known: Mapping[str, Family]) -> str | None:
+def _wrong_joint(text: str, known: Mapping[str, Family]) -> str | None:
     numbered = NUMBERED.fullmatch(text)
     if not numbered or any(numbered[1] + numbered[2] in f.units for f in known.values()):
         return None
-    if numbered[1] == "q":
-        return _wrong_count(header, known["q"])
     n = len(known["q"].units)
-    return f"column {quoted(text)} is of joint {numbered[2]}, but the robot has {n} joints"
-
-
-def _wrong_count(header: Sequence[str], family: Family) -> str:
-    n = len(family.units)
-    found = {t: f"q{m[2]}" for t in header if (m := NUMBERED.fullmatch(t)) and m[1] == "q"}
-    stems = set(found.values())
-    unit = next(iter(found), "deg").rpartition("_")[2]
-    missing = [max(family.columns(stem), key=lambda column: column.endswith(unit))
-               for stem in family.units if stem not in stems]  # fmt: skip
-    names = f" ({listed(found, 8)})" if found else ""
-    way = f"add {listed(missing, 8)}" if missing else (
-        "drop the columns too many, or use the cell of the right robot")  # fmt: skip
-    return f"{len(stems)} joint columns{names}, but the robot has {n} joints; {way}"
+    told = f"column {quoted(text)} is of joint {numbered[2]}, but the robot has {n} joints"
+    return f"{told}; drop it, or use the cell of the right robot"
 
 
 READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured

@@ -154,13 +154,13 @@ def is_label(text: str) -> bool:
 
 # How a cell begins that a spreadsheet would work out, and the mark that stops it.
 _FORMULA = re.compile(r"'*[=+\-@]")
-_NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
+NUMBER = re.compile(r"[+-]?([0-9]+[.,]?[0-9]*|[.,][0-9]+)([eE][+-]?[0-9]+)?", re.ASCII)
 
 
 def cell_text(cell: object) -> object:
     """As a table is written: text that begins with = + - @ and is no number gets an apostrophe, so
     that no spreadsheet takes it for a formula; `cell_meaning` takes it off."""
-    if not isinstance(cell, str) or _NUMBER.fullmatch(cell):
+    if not isinstance(cell, str) or NUMBER.fullmatch(cell):
         return cell
     return f"'{printable(cell)}" if _FORMULA.match(cell) else printable(cell)
 
@@ -224,15 +224,7 @@ GONE = {
     "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
     "design.robust_samples": "it went with design.robust; drop it",
 }
-# No name of a file is as long, and nobody reads more.
-LONGEST_WORD, LONGEST_MESSAGE = 400, 8000
-_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
-
-
-def bounded(message: str) -> str:
-    short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
-    half = LONGEST_MESSAGE // 2
-    return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
+LONGEST = 4000  # nobody reads more
 
 
 class ElastocalError(Exception):
@@ -241,7 +233,8 @@ class ElastocalError(Exception):
     exit_code = 2
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(bounded(str(message)))
+        text, half = str(message), LONGEST // 2
+        super().__init__(text if len(text) <= LONGEST else f"{text[:half]} … {text[-half:]}")
 
 
 class InputError(ElastocalError):

@@ -15,14 +15,15 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO, StringIO
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TextIO
+from typing import Any, BinaryIO, TextIO
 
 import numpy as np
 
-from elastocal.files import PIECE, atomic_write, check_size, decoded, open_input
+from elastocal.files import atomic_write, check_size, decoded, open_input
 from elastocal.messages import (
+    NUMBER,
     InputError,
     cell_meaning,
     cell_text,
@@ -36,18 +37,13 @@ from elastocal.messages import (
 )
 from elastocal.units import FACTORS, Array, IntArray, to_si
 
-if TYPE_CHECKING:
-    import pandas as pd
-
-
 MAX_LINE = 64 * 1024
+PIECE = 1 << 20  # bytes read at once
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
-ROWS_AT_ONCE = 10_000
 DELIMITERS = ",;\t"
 UTF16 = (b"\xff\xfe", b"\xfe\xff")
 ARCHIVE = b"PK\x03\x04"
-NUMBER = re.compile(r"[+-]?(?:[0-9]+(?:[.,][0-9]*)?|[.,][0-9]+)(?:[eE][+-]?[0-9]+)?")
 NOT_FINITE = re.compile(r"[+-]?(nan|na|n/a|null|none|inf|infinity|#n/?a|#num!)", re.IGNORECASE)
 THOUSANDS = re.compile(r"[+-]?[0-9]+([.,' ][0-9]{3})*[.,][0-9]+")
 
@@ -75,25 +71,19 @@ def csv_lines(
 
 
 def _sound_lines(source: str, handle: BinaryIO, what: str, comments: bool) -> Lines:
-    number, data, more = 1, b"", True
-    while more:
-        more = bool(piece := handle.read(PIECE))
-        data += piece
-        if number == 1 and data.startswith(UTF16):
-            raise InputError(f"{source}: is UTF-16; save the table as CSV in UTF-8")
-        if number == 1 and data.startswith(ARCHIVE):
+    number, remedy = 1, "save the table as CSV in UTF-8"
+    while lines := handle.readlines(PIECE):
+        whole = b"".join(lines)
+        if number == 1 and whole.startswith(UTF16):
+            raise InputError(f"{source}: is UTF-16; {remedy}")
+        if number == 1 and whole.startswith(ARCHIVE):
             raise InputError(f"{source}: is a workbook or archive; export the sheet as CSV")
-        end = data.rfind(b"\n") + 1 if more and len(data) <= PIECE + MAX_LINE else len(data)
-        whole, data = data[:end], data[end:]
-        lines = whole.removesuffix(b"\n").split(b"\n") if whole else []
-        if b"\0" in whole or b"\r" in whole or max(map(len, lines), default=0) > MAX_LINE:
+        if b"\0" in whole or b"\r" in whole or max(map(len, lines)) > MAX_LINE:
             for k, line in enumerate(lines, number):
-                if fault := _fault(line, what):
+                if fault := _fault(line.removesuffix(b"\n"), what):
                     raise InputError(f"{source}, line {k}: {fault}")
-        remedy = "save the table as CSV in UTF-8"
-        text = decoded(source, whole, remedy, "utf-8", line=number)
-        texts = text.replace("\r", "").removesuffix("\n").split("\n") if whole else []
-        found = enumerate(texts, number)
+        text = decoded(source, whole, remedy, "utf-8", line=number).replace("\r", "")
+        found = enumerate(text.removesuffix("\n").split("\n"), number)
         yield [(k, t) for k, t in found if not (comments and _says_nothing(t))]
         number += len(lines)
 
@@ -238,11 +228,15 @@ Choose = Callable[[Sequence[str]], Columns]  # by the header
 
 def match_columns(
     source: str, header: Sequence[str], known: Mapping[str, Family],
+    needed: Sequence[Sequence[str]], needed_by: str, exclusive: Sequence[tuple[str, str]] = (),
     passed_over: Callable[[str], bool] = lambda text: False,
     explain: Callable[[str], str | None] = lambda text: None,
     called: Mapping[str, str] = CALLED, valid: str = "",
 ) -> Columns:  # fmt: skip
-    """Which column of a header is which of the `known` families.  `passed_over`: headers that mean
+    """Which column of a header is which of the `known` families, none of which is there in part.
+
+    `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
+    needs"); `exclusive`: pairs of families that say the same; `passed_over`: headers that mean
     nothing here; `explain`: what to say of an unknown one; `called`: what its name may mean, as
     CALLED; `valid`: what to say where it is like none."""
     for i, text in enumerate(header, start=1):
@@ -277,19 +271,18 @@ def match_columns(
                     f"{family.meaning} in one unit"
                 )
         found[stem] = Column(text, stem, unit, family.is_label, stem in family.optional)
-    return {
+    columns = {
         name: tuple(found[stem] for stem in known[name].units if stem in found)
         for name, found in present.items()
     }
+    _check_columns(source, columns, known, needed, needed_by, exclusive)
+    return columns
 
 
-def check_columns(
-    source: str, columns: Columns, known: Mapping[str, Family],
-    needed: Sequence[Sequence[str]] = (), needed_by: str = "",
-    exclusive: Sequence[tuple[str, str]] = (),
-) -> Columns:  # fmt: skip
-    """No family is there in part.  `needed`: of each entry one family must be there, because
-    `needed_by` (as in "a DH table needs"); `exclusive`: pairs of families that say the same."""
+def _check_columns(
+    source: str, columns: Columns, known: Mapping[str, Family], needed: Sequence[Sequence[str]],
+    needed_by: str, exclusive: Sequence[tuple[str, str]],
+) -> None:  # fmt: skip
     for name, found in columns.items():
         family, unit, stems = known[name], found[0].unit, [c.stem for c in found]
         absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
@@ -318,7 +311,6 @@ def check_columns(
                 f"{source}: the columns {wanted} are missing, which {needed_by}; found "
                 f"{there or 'no known column'}"
             )
-    return columns
 
 
 def _unknown(
@@ -425,18 +417,12 @@ def read_table(
     """The columns of a CSV or Parquet file that `choose` picks from its header.  `what` names the
     kind of table in messages; `comments` as of `csv_lines`.  With `text` the table is that CSV
     text, and `path` only its name; a file has `most` bytes."""
-    source = str(path)
+    source, noun = str(path), "line"
     if text is None and Path(path).suffix.lower() in PARQUET:
-        frame = _parquet(source, what)
-        cells = frame.astype(object).where(frame.notna(), "")
-        texts = (list(map(str, row)) for row in cells.itertuples(index=False, name=None))
-        numbered = enumerate(texts, start=1)
-        rows = iter(lambda: list(islice(numbered, ROWS_AT_ONCE)), [])
-        table = _read(source, "row", list(frame.columns), rows, choose)
-    else:
-        with open_input(path, what, most) if text is None else BytesIO(text.encode()) as handle:
-            header, delimiter, lines = csv_lines(source, handle, what, comments)
-            table = _read(source, "line", header, lines, choose, delimiter)
+        text, noun = _parquet(source, what), "row"
+    with open_input(path, what, most) if text is None else BytesIO(text.encode()) as handle:
+        header, delimiter, lines = csv_lines(source, handle, what, comments)
+        table = _read(source, noun, header, lines, choose, delimiter)
     for column in (c for own in table.columns.values() for c in own if c.is_label):
         labels = table.labels[column.header]
         for code, name in enumerate(labels.names):
@@ -448,27 +434,27 @@ def read_table(
 
 
 def _read(
-    source: str, noun: str, header: Sequence[str], pieces: Iterable[list[tuple[int, Any]]],
-    choose: Choose, delimiter: str = "",
-) -> RawTable:  # fmt: skip
-    """Of `pieces` of lines with a delimiter, or of rows without."""
+    source: str, noun: str, header: Sequence[str], pieces: Lines, choose: Choose, delimiter: str
+) -> RawTable:
     chosen = choose(header)
     every = {column.header: column for family in chosen.values() for column in family}
     columns = {i: name for i, name in enumerate(header) if name in every}
     numbers, labels = ({i: name for i, name in columns.items() if every[name].is_label == whether}
                        for whether in (False, True))  # fmt: skip
     blanks = {name for name, column in every.items() if column.may_be_blank}
-    commas = delimiter not in ("", ",")  # for decimals
+    commas = delimiter != ","  # for decimals
     found, marks = list[int](), dict[str, str]()
     read: list[tuple[Array, np.ndarray]] = []
     for some in pieces:
+        if noun == "row":  # the header is the line before the first of them
+            some = [(number - 1, line) for number, line in some]
         found += [number for number, _ in some]
         told = f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out"
         require(len(found) <= MAX_ROWS, told)
-        lines = [line if delimiter else ",".join(line) for _, line in some]
+        lines = [line for _, line in some]
         plain = None if commas else _plain(lines, len(header), numbers, labels)
         if plain is None:
-            rows = some if not delimiter else _split_all(source, some, len(header), delimiter)
+            rows = _split_all(source, some, len(header), delimiter)
             for _, cells in rows:
                 for i in numbers:  # labels stay as they are written
                     cells[i] = plain_minus(cells[i])
@@ -507,7 +493,8 @@ def _plain(
     return (values, texts) if whole and np.isfinite(values).all() else None
 
 
-def _parquet(source: str, what: str) -> pd.DataFrame:
+def _parquet(source: str, what: str) -> str:
+    """The table as CSV."""
     with open_input(source, what, MOST_BYTES) as handle:
         told = f"{source}: is not a Parquet file; check it, or name a CSV .csv"
         require(handle.read(4) == b"PAR1", told)
@@ -517,7 +504,7 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
             file = ParquetFile(handle)
             groups = map(file.metadata.row_group, range(file.num_row_groups))
             check_size(source, what, sum(group.total_byte_size for group in groups), MOST_BYTES)
-            frame: pd.DataFrame = file.read().to_pandas()
+            frame = file.read().to_pandas()
         except InputError:
             raise
         except ImportError:
@@ -527,9 +514,11 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
             ) from None
         except Exception as error:  # it has exceptions of its own
             raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
-    frame.columns = [str(name) for name in frame.columns]
-    require(len(frame) > 0, f"{source}: has columns but no rows; add measurements")
-    return frame
+    cells, text = frame.astype(object).where(frame.notna(), ""), StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(frame.columns)
+    writer.writerows(cells.itertuples(index=False, name=None))
+    return text.getvalue()
 
 
 def write_csv(

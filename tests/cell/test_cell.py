@@ -285,11 +285,11 @@ IN_PYTHON = {
     "unknown": (lambda: Tool(load_pont=[0, 0, 0]), "Tool has no load_pont.*'load_point'"),
     "missing": (lambda: Solid("a", "box"), "Solid: size is missing"),
     "shape": (lambda: Tool([0, 0]), r"Tool: load_point takes three numbers in m.*\[0, 0\]"),
-    "unit": (lambda: CartesianNoise(-1), "sigma takes one positive number in m, or three"),
+    "unit": (lambda: CartesianNoise(-1), "sigma takes a positive number in m, or three"),
     "choice": (lambda: ModelSpec(observe="positon"), r"observe takes .* \(did you mean 'position'"),
     "spring": (
         lambda: Nominal(gravity_compensator={"joint": "joint2", "arm": 1.0}),
-        "gravity_compensator: unknown key arm; missing unit: did you mean arm_m",
+        "gravity_compensator: unknown key arm; did you mean arm_m",
     ),
     "not a part": (lambda: Cell("a", robot="arm.urdf"), "Cell: robot takes an instance of Robot"),
     "no marker": (

@@ -189,7 +189,7 @@ def test_a_bad_plug_in_is_one_sentence_with_file_and_line(code: str, tmp_path: P
 @pytest.mark.parametrize(
     ("entry", "told"),
     [
-        ("absent.py", r"names '.*absent\.py', which does not exist"),
+        ("absent.py", r"names .*absent\.py: no such file"),
         ("no_such_package.effects", "there is no module 'no_such_package'; install its package"),
         ("my effects", 'is a file that ends with .py, as "my_effects.py", or a module'),
     ],

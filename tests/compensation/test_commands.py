@@ -303,7 +303,7 @@ def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
     ("text", "told"),
     [
         ("rx_deg,ry_deg,rz_deg\n1,2,3\n", "x_mm,y_mm,z_mm are missing"),
-        ("x_mm,y_mm,z_mm,q1_deg\n1,2,3,4\n", "the robot has 6 joints"),
+        ("x_mm,y_mm,z_mm,q1_deg\n1,2,3,4\n", "positions of the 6 joints"),
         ("x_mm,y_mm,z_mm,marker\n1,2,3,A\n1,2,3,B\n", "`point`"),
     ],
 )

@@ -111,7 +111,7 @@ def test_a_fit_within_millimetres_is_no_warning(tmp_path, readings):
 def test_markers_and_joints_must_be_the_cells(tmp_path, readings):
     with pytest.raises(InputError, match=r"line 3.*'M5' is no marker of the cell.*from .*p.txt"):
         with_cell(tmp_path, readings, readings[2], marker="M5")
-    with pytest.raises(InputError, match="5 joint columns"):
+    with pytest.raises(InputError, match=r"without q6_deg.*positions of the 6 joints"):
         with_cell(tmp_path, readings, readings[2], joints=5)
 
 

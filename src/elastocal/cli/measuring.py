@@ -291,7 +291,7 @@ def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[P
     written, chain = dict[Path, str](), load_chain(cell)
     for path in paths:
         with said_of(f"--program {path}"):
-            check_six_axes(chain, LANGUAGES[path.suffix.lower()][0])
+            check_six_axes(chain, LANGUAGES[path.suffix.lower()].title)
             if plan is not None:
                 written[path] = robot_program(
                     path.suffix, plan.execution, chain, plan.configurations, plan.forces,

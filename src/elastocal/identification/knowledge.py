@@ -146,10 +146,10 @@ class Bounds:
     """lower ≤ x ≤ upper for one parameter, in its unit; equal bounds fix it."""
 
     name: str = keyed(
-        'the name of a parameter, as in "joint2.compliance"', "parameter", form=Text, required=True
+        "parameter", takes='the name of a parameter, as in "joint2.compliance"', form=Text
     )
-    lower: AnyFloat = keyed(f"{NUMBER}; without one, none", form=float, default=-math.inf)
-    upper: AnyFloat = keyed(f"{NUMBER}; without one, none", form=float, default=math.inf)
+    lower: AnyFloat = keyed(takes=f"{NUMBER}; without one, none", form=float, default=-math.inf)
+    upper: AnyFloat = keyed(takes=f"{NUMBER}; without one, none", form=float, default=math.inf)
 
     @classmethod
     def from_keys(cls, table: Mapping[str, Any], spot: Spot) -> dict[str, float]:
@@ -170,9 +170,9 @@ class Bounds:
 class LinearEquality:
     """Σ coefficient · x = value over the named parameters: a symmetry, a known sum."""
 
-    terms: Annotated[dict[Text, float], Field(min_length=1)] = keyed(FACTORS, required=True)
-    value: float = keyed(NUMBER, default=0.0)
-    label: str = keyed("a text", default="")
+    terms: Annotated[dict[Text, float], Field(min_length=1)] = keyed(takes=FACTORS)
+    value: float = keyed(takes=NUMBER, default=0.0)
+    label: str = keyed(default="")
 
     def __post_init__(self) -> None:
         require(
@@ -193,9 +193,9 @@ class SemidefiniteMatrix:
     `entries` are its rows; an entry is a parameter's name, {name: coefficient, …}, or a number.
     """
 
-    label: str = keyed("a text")
+    label: str = keyed(required=False)
     entries: Many[Many[Entry]] = keyed(
-        "rows of parameter names, numbers or factors by parameter, as in "
+        takes="rows of parameter names, numbers or factors by parameter, as in "
         '[["a", "b"], ["b", "c"]]',
         form=Annotated[list[list[str | float | dict[str, float]]], Field(min_length=1)],
         into=lambda rows, *_: tuple(map(tuple, rows)), required=True,
@@ -440,7 +440,7 @@ class Knowledge:
         default_factory=Constraints,
     )
     prior: GaussianPrior | None = keyed(
-        'tables by parameter, as in [prior."joint2.compliance"]', form=dict[Text, PriorTable],
+        takes='tables by parameter, as in [prior."joint2.compliance"]', form=dict[Text, PriorTable],
         into=_stated_prior, default=None,
     )  # fmt: skip
     source: str = field(default="knowledge", compare=False)

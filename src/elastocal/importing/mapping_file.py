@@ -23,8 +23,16 @@ from pydantic import Field
 from elastocal import config, messages
 from elastocal.config import NonNegative, Positive, Table, Text, Vector3, checked, key, place
 from elastocal.measurements import families
-from elastocal.messages import InputError, did_you_mean, listed, option, quoted, require
-from elastocal.tables import NUMBER, THOUSANDS, column, first_bad_cell
+from elastocal.messages import (
+    NUMBER,
+    InputError,
+    did_you_mean,
+    listed,
+    option,
+    quoted,
+    require,
+)
+from elastocal.tables import THOUSANDS, column, first_bad_cell
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
 Place = Annotated[int, Field(ge=1)] | Text

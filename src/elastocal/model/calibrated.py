@@ -68,10 +68,10 @@ class OpenParameters:
     """
 
     more: ClassVar[str] = "ignore"
-    names: Many[str] = keyed("a list of names", required=True)
-    mixing: Matrix = keyed("shares, a row for each parameter of covariance_of", required=True)
-    typical: Matrix = keyed("a number for each of its names", required=True)
-    redundant: Many[str] = keyed("a list of names", default=())
+    names: Many[str] = keyed(takes="a list of names")
+    mixing: Matrix = keyed(takes="shares, a row for each parameter of covariance_of")
+    typical: Matrix = keyed(takes="a number for each of its names")
+    redundant: Many[str] = keyed(takes="a list of names", default=())
 
 
 @record
@@ -80,8 +80,8 @@ class ShownPoses:
     in m of the place predicted from the others is `most` at most."""
 
     more: ClassVar[str] = "ignore"
-    most: float = keyed("a number", "largest_std_um", required=True)
-    configurations: int = keyed("a whole number", required=True)
+    most: float = keyed("largest_std_um")
+    configurations: int = keyed()
 
     def chance(self, beyond: int, n: int) -> float:
         """Probability that so many of n poses or more are less sure than all that were measured,
@@ -99,8 +99,8 @@ class MeasuredVisits:
     (k, 3) N at each."""
 
     more: ClassVar[str] = "ignore"
-    q: Matrix = keyed("joints, a row for each visit", required=True)
-    force: Triples = keyed("forces, three numbers for each visit", "force_N", required=True)
+    q: Matrix = keyed(takes="joints, a row for each visit")
+    force: Triples = keyed("force_N", takes="forces, three numbers for each visit")
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready; joints to a µrad or µm, forces to a mN."""
@@ -116,8 +116,8 @@ class Scatter:
     (CR2), and its degrees of freedom (K,)."""
 
     more: ClassVar[str] = "ignore"
-    covariance: Matrix = keyed("a row for each parameter of covariance_of", required=True)
-    dof: Matrix = keyed("a number for each parameter of covariance_of", required=True)
+    covariance: Matrix = keyed(takes="a row for each parameter of covariance_of")
+    dof: Matrix = keyed(takes="a number for each parameter of covariance_of")
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,13 +143,10 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
 
     def choose(header: Sequence[str]) -> Columns:
         every = listed(way for f in known for stem in f.units for way in f.columns(stem))
-        found = tables.match_columns(
-            str(path), header, named, explain=partial(_no_table, what), called=CALLED,
-            valid=f"; a {what} takes {every}",
+        return tables.match_columns(
+            str(path), header, named, [(n,) for n in needed], f"a {what} needs", called=CALLED,
+            explain=partial(_no_table, what), valid=f"; a {what} takes {every}",
         )  # fmt: skip
-        return tables.check_columns(
-            str(path), found, named, [(n,) for n in needed], f"a {what} needs"
-        )
 
     return tables.read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
 
