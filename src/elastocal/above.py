@@ -223,6 +223,16 @@ def _array(value: Any) -> bool:
     return numbers.dtype.kind in "iuf" and bool((np.abs(numbers) <= LARGEST).all())
 
 
+def _values(value: Any) -> bool:
+    """Numbers, complex ones too; what computes with them says whether it can."""
+    import numpy as np
+
+    try:
+        return np.asarray(value).dtype.kind in "iufc"
+    except ValueError:  # rows of different length
+        return False
+
+
 def _truth(value: Any) -> bool:
     return type(value).__name__ in ("bool", "bool_")
 
@@ -271,7 +281,7 @@ KINDS: dict[str, tuple[str, Check]] = {
     "str": ("a text", lambda v: isinstance(v, str)),
     "Path": ("a path", lambda v: isinstance(v, str | Path) and v != ""),
     "ArrayLike": ("finite numbers", _array),
-    "Array": ("finite numbers", _array),
+    "Array": ("numbers", _values),
     "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
     "Sequence[str]": ("a list of names", _list_of(lambda v: isinstance(v, str))),
     "Sequence[TargetPose]": ("a list of TargetPose", _list_of(_is_a("TargetPose"))),

@@ -142,7 +142,7 @@ class FitToGood:
         found = RFactor.of(rows, np.append(y[good], np.zeros(p)))
         self.R, half = found.R, found.half
         self.z = half @ found.projected
-        self.e = y - (B.reshape(-1, p) @ self.z).reshape(y.shape)
+        self.e = y - (B.reshape(y.size, p) @ self.z).reshape(y.shape)
         self.rss = float((self.e[good] ** 2).sum())
         # Σ TᵀT of the good ones is 1 less the prior's share.
         self.dof = n * size - p + variance * float((half**2).sum())
