@@ -266,11 +266,12 @@ def adjusted_rows(Qc: Array, power: float) -> tuple[Array, BoolArray]:
     gram = Qc @ Qc.transpose(0, 2, 1) if by_row else Qc.transpose(0, 2, 1) @ Qc
     values, U = np.linalg.eigh(gram)
     single = 1 - values < ALONE
+    determined = np.asarray(single.any(axis=1))
     if not power:
-        return Qc, np.asarray(single.any(axis=1))
+        return Qc, determined
     factor = np.where(single, 0.0, np.where(single, 1.0, 1 - values) ** power)
     A = (U * factor[:, None, :]) @ U.transpose(0, 2, 1)
-    return (A @ Qc if by_row else Qc @ A), np.asarray(single.any(axis=1))
+    return (A @ Qc if by_row else Qc @ A), determined
 
 
 def held_out_residual(
@@ -341,8 +342,18 @@ def left_out(
     """Rows (g, m) of configurations of one size, Q_cᵀ (I − Q_c Q_cᵀ)⁻¹ e_c (g, columns),
     meaningless where a configuration is alone in some direction, and which are."""
     for rows in same_size(configuration):
-        adjusted, alone = adjusted_rows(Q[rows], -1.0)
-        yield rows, (e[rows][:, None] @ adjusted)[:, 0], alone
+        Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
+        # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
+        many = rows.shape[1] > Q.shape[1]
+        share = Qt @ Qc if many else Qc @ Qt
+        gap, alone = np.eye(share.shape[1]) - share, np.zeros(len(share), dtype=bool)
+        # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
+        heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
+        alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
+        gap[alone] = np.eye(share.shape[1])
+        own = e[rows][..., None]
+        moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)
+        yield rows, np.asarray(moved[..., 0], dtype=np.float64), alone
 
 
 def told_by_one(B: Array, configuration: IntArray) -> Array:
