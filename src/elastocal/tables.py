@@ -352,10 +352,10 @@ class Labels:
     @classmethod
     def of(cls, cells: Iterable[object]) -> Labels:
         """The labels of a column; blanks at the ends of a name are cut off."""
-        texts, code_of = list(map(str, cells)), dict[str, int]()
+        texts = list(map(str, cells))
         meant = {text: cell_meaning(text.strip()).strip() for text in dict.fromkeys(texts)}
-        code = {text: code_of.setdefault(name, len(code_of)) for text, name in meant.items()}
-        return cls(np.array([code[text] for text in texts], dtype=np.int64), tuple(code_of))
+        code = {name: k for k, name in enumerate(dict.fromkeys(meant.values()))}
+        return cls(np.array([code[meant[text]] for text in texts], dtype=np.int64), tuple(code))
 
 
 @dataclass(frozen=True)

@@ -629,9 +629,9 @@ class _Table:
         same = np.ptp(unit) < 1e-10
         shape, omnibus, away = (0.0, 0.0), None, unit - unit.mean()
         if not same:
-            squared = (away**2).mean()
-            kurtosis = float((away**4).mean() / squared**2 - 3)
-            shape = float((away**3).mean() / squared**1.5), kurtosis
+            square = away**2  # products: of other powers numpy takes the logarithm
+            kurtosis = float((square @ square) / len(z) / (variance := square.mean()) ** 2 - 3)
+            shape = float((square @ away) / len(z) / variance**1.5), kurtosis
             omnibus = _p_normal(*shape, len(z)) if len(z) >= FEWEST_FOR_SHAPE else None
         held = self.held[rows]
         held = held[np.isfinite(held)]

@@ -370,7 +370,8 @@ def with_placed(problem: Problem, tolerance: float) -> tuple[Problem, Array]:
     if not len(placed):
         return problem, problem.residual(problem.x0)
     found = tied_fit(replace(problem, free=placed), tolerance)
-    return replace(problem, x0=found.x), found.residual
+    of_all = len(found.residual) == len(problem.observations.value)
+    return replace(problem, x0=found.x), found.residual if of_all else problem.residual(found.x)
 
 
 def is_placed(model: Model) -> NDArray[np.bool_]:
@@ -513,9 +514,11 @@ def bent(solution: Solution, covariance: Array, unsure: float) -> tuple[Array, A
 
 def tied_fit(problem: Problem, tolerance: float) -> Fit:
     """Fit of all free parameters with weak ties, scaled by a noise level found on the way.  Many
-    readings start where such a fit to a sample of them ends."""
+    readings start where such a fit to a sample of them ends, which is enough to begin with."""
     if (rough := _sampled(problem)) is not problem:
         found = _tied_from(rough, problem.x0, CHOOSING)
+        if tolerance >= CHOOSING:
+            return found
         with suppress(ElastocalError):  # it may lead where other readings have no equilibrium
             return _tied_from(problem, found.x, tolerance, residual_sigma(found, 0))
     return _tied_from(problem, problem.x0, tolerance)

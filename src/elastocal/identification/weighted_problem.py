@@ -137,8 +137,9 @@ def stated_by_observation(observed: Observations, tracker: Tracker) -> Array | N
     if kind == "none":
         return None
     rows = stated_covariance(observed, tracker, kind)[0]
-    stated = observed.combine.power(2) @ rows.reshape(len(rows), -1)
-    return np.asarray(stated).reshape(-1, observed.size, observed.size)
+    if observed.kind == "deflection":
+        rows = observed.combine.power(2) @ rows.reshape(len(rows), -1)
+    return np.asarray(rows).reshape(-1, observed.size, observed.size)
 
 
 def _available(observed: Observations, tracker: Tracker) -> str:
@@ -445,7 +446,8 @@ class PriorRows:
 @dataclass(frozen=True)
 class Fit:
     """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual; `columns`
-    (fitted,) index the parameters; `known` is what the fit knew of them."""
+    (fitted,) index the parameters; `known` is what the fit knew of them, `every` the R factor of
+    all free columns, where the fit came by it."""
 
     x: Array
     residual: Array
@@ -455,6 +457,7 @@ class Fit:
     problem: Problem = field(repr=False)
     columns: NDArray[np.int64]
     known: PriorRows
+    every: RFactor | None = None
 
     @cached_property
     def B(self) -> Array:
@@ -470,16 +473,18 @@ class Fit:
         problem = self.problem
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
-        return problem.evaluate(self.x, problem.free)[1]
+        return self.every or problem.evaluate(self.x, problem.free)[1]
 
 
 class Linearised(NamedTuple):
-    """The residual, its R factor with B per unit of u, and the cost |b − A step|² about a u."""
+    """The residual, its R factor with B per unit of u, and the cost |b − A step|² about a u; that
+    of all free columns, raw, where they were asked for."""
 
     residual: Array
     r_factor: RFactor
     A: Array
     b: Array
+    every: RFactor | None
 
     @property
     def cost(self) -> float:
@@ -502,9 +507,15 @@ class Objective:
         self.system = known.system
         self.limits = None if self.system is None else self.system.moved(x[columns], size)
 
-    def evaluate(self, u: Array) -> Linearised:
-        """ElastocalError where the model has no prediction."""
-        residual, r_factor = self.problem.evaluate(self.values(u), self.columns)
+    def evaluate(self, u: Array, ahead: bool = False) -> Linearised:
+        """ElastocalError where the model has no prediction.  `ahead`: with what a large table will
+        be asked if the fit ends here, so that it is gone through once."""
+        free, own = self.problem.free, self.columns
+        ahead = ahead and self.problem.large and bool(np.isin(own, free).all())
+        residual, r_factor = self.problem.evaluate(self.values(u), free if ahead else own)
+        every = r_factor if ahead else None
+        if every is not None:
+            r_factor = every.of_columns(np.searchsorted(free, own))
         if not np.isfinite(r_factor.rss):
             source = self.problem.observations.table.source
             raise ElastocalError(
@@ -514,7 +525,7 @@ class Objective:
         r_factor = r_factor.scaled(self.size)
         A = np.vstack([r_factor.augmented[:, :-1], self.P])
         b = np.concatenate([r_factor.augmented[:, -1], self.target - self.P @ u])
-        return Linearised(residual, r_factor, A, b)
+        return Linearised(residual, r_factor, A, b, every)
 
     def values(self, u: Array) -> Array:
         """X (parameters,), what lies at its bound but for rounding on it."""
@@ -547,10 +558,10 @@ class Objective:
             left = at.b - at.A @ step
             promised, trial, cost = at.cost - float(left @ left), at, np.inf
             last, small = promised <= tolerance * at.cost, np.abs(step).max(initial=0) <= ROUNDING
-            if last and small:
+            if promised <= ROUNDING * at.cost or (last and small):
                 return u, at, NEGLIGIBLE
             with suppress(ElastocalError):
-                trial = self.evaluate(u + step)
+                trial = self.evaluate(u + step, ahead=True)
                 cost = trial.cost
             if last:  # more than what is left is not to be had
                 kept = cost <= at.cost * (1 + ROUNDING)
@@ -597,5 +608,5 @@ def fit(
     u, at, reason = objective.descend(u, tolerance, max_steps)
     return Fit(
         objective.values(u), at.residual, at.r_factor.scaled(1 / size), reason != EXHAUSTED, reason,
-        problem, columns, known,
+        problem, columns, known, at.every,
     )  # fmt: skip
