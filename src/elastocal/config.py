@@ -351,6 +351,7 @@ def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any
         except ValidationError as error:
             first = error.errors(include_url=False, include_context=False)[0]
             problem, path = first["type"], first["loc"]
+            hint = first["msg"] if problem == "repeated" else hint
             # A name in a table of the user's own; what stands below it is shown whole.
             for name in [p for p in path if isinstance(found, dict) and p in found][:1]:
                 keys, found = (*keys, name), found[name]
@@ -458,10 +459,11 @@ def _unknown(cls: Any, name: str, found: Any, spot: Spot) -> str:
         return f'unknown key {here}; write a full name in quotes: [{dotted(table)}."{full}"]'
     where = header(above).split(" no. ")[0] if above else "the top level"
     # First what it lacks but the unit, then where else it stands.
-    near = [v for v in valid if v.startswith(f"{name}_")]
+    units = near = [v for v in valid if v.startswith(f"{name}_")]
     near = near or [f"it in {home}" for home in _homes_of(name, spot.root, ())][:4]
     near = near or [v for v in [nearest(name, valid)] if v]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
+    hint = f"missing unit: {hint}" if units else hint
     return f"unknown key {here}; {hint}{where} takes {listed(valid)}"
 
 
@@ -522,9 +524,12 @@ def holding(rule: Callable[[Any], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _all_differ(values: Any) -> bool:
+def _all_differ(values: Any) -> Any:
     listing = (values + 0.0).tolist() if isinstance(values, np.ndarray) else values
-    return len(set(map(str, listing))) == len(listing)
+    names = [str(value) for value in listing]
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise PydanticCustomError("repeated", f", with {listed(twice)} more than once")  # type: ignore[arg-type]
+    return values
 
 
 def _direction(value: object) -> Array:
@@ -556,7 +561,7 @@ Numbers = Annotated[Array, numbers()]
 Positives = Annotated[Array, numbers(above=0)]
 Vector2 = Annotated[Array, numbers(2)]
 Vector3 = Annotated[Array, numbers(3)]
-DISTINCT = holding(_all_differ)
+DISTINCT = AfterValidator(_all_differ)
 RISING = holding(lambda ends: bool(np.less(ends[0], ends[-1]).all()))
 TUPLE = BeforeValidator(_as_tuple)
 AnyFloat = Annotated[float, AllowInfNan(True)]
