@@ -528,7 +528,7 @@ def _all_differ(values: Any) -> Any:
     listing = (values + 0.0).tolist() if isinstance(values, np.ndarray) else values
     names = [str(value) for value in listing]
     if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
-        raise PydanticCustomError("repeated", f", with {listed(twice)} more than once")  # type: ignore[arg-type]
+        raise PydanticCustomError("repeated", f", with {listed(twice)} more than once")
     return values
 
 

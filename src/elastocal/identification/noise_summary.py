@@ -431,8 +431,8 @@ def simultaneous_level(n: int) -> float:
 
 
 def groupings(
-    observed: Observations, chosen: BoolArray
-) -> Iterator[tuple[str, IntArray, NDArray[np.object_]]]:
+    observed: Observations, chosen: BoolArray | slice
+) -> Iterator[tuple[str, NDArray[np.integer], NDArray[np.object_]]]:
     """By what the `chosen` rows (rows,) fall into more than one group, the number of each row's
     group and the groups' names, in the table's order."""
     table, size = observed.table, observed.size
@@ -450,7 +450,7 @@ def groupings(
         used, first = np.unique(code, return_index=True)
         order = used[np.argsort(first)]
         if len(order) > 1:
-            place = np.empty(len(names), dtype=np.int64)
+            place = np.empty(len(names), dtype=np.int32)  # of a million readings three times
             place[order] = np.arange(len(order))
             yield by, place[code], np.array(names, dtype=object)[order]
 
@@ -556,8 +556,9 @@ def summarise_residuals(
     `absolute` False: the noise is known up to a common factor only, which the residuals tell.
     None where fewer than 8 rows have a residual, or all residuals are zero.
     """
-    spare = np.ones(len(whitened)) if leverage is None else 1 - leverage
-    free = spare > ALONE
+    spare = np.broadcast_to(1.0, whitened.shape) if leverage is None else 1 - leverage
+    alone = spare <= ALONE
+    free: BoolArray | slice = ~alone if alone.any() else slice(None)  # of a large table no copies
     e, spare = whitened[free], spare[free]
     f = float(spare.sum())
     if len(e) < FEWEST_VALUES or not e @ e > 0:
@@ -574,23 +575,23 @@ def summarise_residuals(
         found.append(table.grouping(*group, adjusted))
     edges = table.edges(len(table.z))
     whole = table.summary("all", slice(None), edges, None)
-    return ResidualSummary(whole, edges, tuple(found), absolute, int((~free).sum()))
+    return ResidualSummary(whole, edges, tuple(found), absolute, int(alone.sum()))
 
 
 class _Table:
     """Rows with a residual e, 1 − h, held out, and f where the residuals told the size."""
 
     def __init__(self, e: Array, spare: Array, held: Array, dof: float | None) -> None:
-        self.z, self.squared, self.spare = e / np.sqrt(spare), e**2, spare
+        self.e, self.z, self.spare = e, e / np.sqrt(spare), spare
         self.held, self.dof = held, dof
 
-    def judged(self, code: IntArray, names: NDArray[np.object_]) -> Array:
+    def judged(self, code: NDArray[np.integer], names: NDArray[np.object_]) -> Array:
         """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
-        total, f = (np.bincount(code, v, len(names)) for v in (self.squared, self.spare))
+        total, f = (np.bincount(code, v, len(names)) for v in (self.e**2, self.spare))
         return np.where(np.bincount(code) >= FEWEST_VALUES, _two_sided(total, f), np.nan)
 
     def grouping(
-        self, by: str, code: IntArray, names: NDArray[np.object_], holm: Array
+        self, by: str, code: NDArray[np.integer], names: NDArray[np.object_], holm: Array
     ) -> Grouping:
         count = np.bincount(code)
         large = np.flatnonzero(count >= FEWEST_VALUES)
@@ -623,7 +624,7 @@ class _Table:
         if self.dof is not None and self.dof > 1:  # of a ratio to s from these rows: Thompson's τ
             share = np.minimum(edges**2 / self.dof, 1.0)
             below = 0.5 + 0.5 * np.sign(edges) * special.betainc(0.5, (self.dof - 1) / 2, share)
-        total, f = float(self.squared[rows].sum()), float(self.spare[rows].sum())
+        total, f = float((self.e[rows] ** 2).sum()), float(self.spare[rows].sum())
         p = float(_two_sided(total, f))
         unit = z / (np.abs(z).max() or 1.0)  # no power of it overflows
         same = np.ptp(unit) < 1e-10
