@@ -73,6 +73,13 @@ PAGES: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/real_arms/diagnosis.md",
             tables=1,
         ),
+        Part(
+            "Planned",
+            "Error in mm at poses not fitted: poses that `design` chose among those measured, and twenty times as many "
+            "at random.",
+            "python experiment_design/real_arms/planned.py",
+            f"{STUDIES}/real_arms/planned.md",
+        ),
     ),
     "Intervals and noise": (
         Part(
