@@ -289,7 +289,7 @@ IN_PYTHON = {
     "choice": (lambda: ModelSpec(observe="positon"), r"observe takes .* \(did you mean 'position'"),
     "spring": (
         lambda: Nominal(gravity_compensator={"joint": "joint2", "arm": 1.0}),
-        "gravity_compensator: unknown key arm; did you mean arm_m",
+        "gravity_compensator: unknown key arm; missing unit: did you mean arm_m",
     ),
     "not a part": (lambda: Cell("a", robot="arm.urdf"), "Cell: robot takes an instance of Robot"),
     "no marker": (
