@@ -251,10 +251,12 @@ class SupportedFloor:
     def told(self) -> NoiseFloor:
         (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
         variance = np.diagonal(data.covariance, axis1=1, axis2=2)
-        ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
         # Those left out have their error against the fit to the others.
         e, stated = _left_over(data, self.at), data.blocks.unpack(variance[..., None])[:, :, 0]
         sigma, variance = noise.factor * np.sqrt(stated), variance[~data.left_out]
+        # What visits of a configuration have in common shows where there are several.
+        several = data.blocks.in_visit.shape[2] > 1
+        joint = noise.joint if several else noise.joint * np.hypot(1.0, noise.shared)
         table, gone = dataset.table, np.flatnonzero(data.faulty)
         faulty = tuple(
             FaultyReading(
@@ -265,10 +267,10 @@ class SupportedFloor:
             for k, row in zip(gone, dataset.lead[gone], strict=True)
         )  # fmt: skip
         return NoiseFloor(
-            data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
-            tuple(noise.joint.tolist()), noise.shared_by_all,
-            float(np.sqrt(square / dof)) if dof else None,
-            tuple(noise.shared.tolist()), faulty, self.near_repeats, dataset.drift,
+            data.stated, noise.factor, ratio_to_stated(data, noise),
+            float(noise.factor * np.sqrt(variance.mean())), tuple(joint.tolist()),
+            noise.shared_by_all * several, float(np.sqrt(square / dof)) if dof else None,
+            tuple((noise.shared * several).tolist()), faulty, self.near_repeats, dataset.drift,
             dataset.common,
         )  # fmt: skip
 
@@ -293,6 +295,12 @@ def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
     """3-D rms in m that the noise alone gives a reading."""
     variance = np.diagonal(data.V(noise), axis1=1, axis2=2)
     return float(np.sqrt(mean_square(data, np.sqrt(variance))))
+
+
+def ratio_to_stated(data: NoisyData, noise: NoiseValues) -> float:
+    """The noise of a reading, scatter of the joints included, over what is stated."""
+    stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
+    return noise_rms(data, noise) / float(np.sqrt(mean_square(data, stated)))
 
 
 def mean_square(data: NoisyData, packed: Array) -> float:

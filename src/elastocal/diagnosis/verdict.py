@@ -33,7 +33,7 @@ from elastocal.diagnosis.effect_search import (
 )
 from elastocal.diagnosis.evidence import Grams, Item, Scan, exceedance
 from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_between, times_of
-from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
+from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square, ratio_to_stated
 from elastocal.identification import noise_summary
 from elastocal.identification.solve import FAR, far_off
 from elastocal.messages import listed, rounded
@@ -357,7 +357,7 @@ def warnings(
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
     out, data = list[str](), found.chosen.data
     if data.stated:
-        out += _stated_wrong(dataset, data, noise.factor)
+        out += _stated_wrong(dataset, data, noise)
     faulty = (data.left_out & ~dataset.blocks.absent).sum() / max((~dataset.blocks.absent).sum(), 1)
     if faulty > FAULTY_SHARE:
         out.append(
@@ -412,18 +412,21 @@ def confirm(far: Mapping[str, tuple[str, float]]) -> Iterator[str]:
         )
 
 
-def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Iterator[str]:
+def _stated_wrong(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> Iterator[str]:
     """Where the tracker's noise is beyond what chance makes of the stated one, and repeats or
-    markers of one pose, where they tell, say so too; or what is stated is far too large."""
+    markers of one pose, where they tell, say so too; or what is stated is far too large, where
+    nothing tells the tracker from the joints for both together."""
     base, good, dof = dataset.base, ~data.faulty, max(data.n_rows - data.X.shape[2], 1)
     readings = subset(base.observed, good), base.residual.reshape(len(good), -1)[good].ravel()
     common = noise_summary.less_in_common(*readings, base.model.cell, len(base.x))
     if common is not None:
         yield noise_summary.TOO_LARGE_IN_COMMON.format(common)
         return
-    wrong, beyond = factor < STATED_LOW, special.chdtri(dof, noise_summary.BEYOND)
-    if base.stated is not None and factor**2 * dof >= beyond:
-        single = noise_summary.single_readings(*readings, base.stated[good], len(base.x))
+    assert base.stated is not None
+    single = noise_summary.single_readings(*readings, base.stated[good], len(base.x))
+    factor = noise.factor
+    wrong = (ratio_to_stated(data, noise) if single is None else factor) < STATED_LOW
+    if factor**2 * dof >= special.chdtri(dof, noise_summary.BEYOND):
         positions = base.observed.kind == "position"
         wrong = single is None or single.above if positions else factor > STATED_HIGH
     if wrong:

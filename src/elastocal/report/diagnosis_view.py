@@ -136,7 +136,10 @@ def noise_floor_lines(
             told = f"The {what} of {say.length(size)} that [noise] of the cell states"
             yield f"{told} counts as noise."
     if noise.pure_error is None:
-        yield "No repeats: the noise is estimated from residuals only."
+        yield (
+            "No repeats: the noise is estimated from residuals only; with one marker they hardly "
+            "tell scatter of the joints from that of readings."
+        )
     else:
         yield f"Repeats scatter by {say.length(noise.pure_error)} rms{along}."
     if (near := noise.near_repeats) is not None:

@@ -15,6 +15,7 @@ from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.messages import listed, option, printable, some
+from elastocal.model.calibrated import mostly_prior
 from elastocal.model.chain import names_told
 from elastocal.model.effects.base import Parameter
 from elastocal.report import blocks as say
@@ -190,9 +191,10 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
 
 def what_was_identified(result: Calibration) -> str:
     alone, n = names_of(result, findings.ALONE), len(result.combinations)
-    text = f"{len(alone)} of {say.counted(len(result.ordinary), 'parameter')}"
-    if mostly := [p for p in alone if result.prior_share.get(p, 0.0) > findings.MOSTLY]:
-        text += f", {len(mostly)} of them mostly by their prior"
+    mostly = len({*alone} & {*mostly_prior(result.prior_share)})
+    text = f"{len(alone) - mostly} of {say.counted(len(result.ordinary), 'parameter')}"
+    if mostly:
+        text += f", and {mostly} mostly by a prior"
     if n:
         absorbed = len(names_of(result, findings.ABSORBED))
         text += (
@@ -504,8 +506,10 @@ def parameter_table(
         given = [(published.get(e.name), e.unit) for e in own]
         after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])
                               for v, unit in given]  # fmt: skip
-    if any(e.note for e in own):
-        after["note"] = [printable(e.note) for e in own]
+    mostly = mostly_prior(result.prior_share)
+    notes = [printable(e.note) or "mostly prior" * (e.name in mostly) for e in own]
+    if any(notes):
+        after["note"] = notes
     true = None if truth is None else [truth.get(e.name) for e in own]
     table = _numbers("Parameters", [printable(e.name) for e in own], own, true, after)
     of = [known[e.name].effect.replace("_", " ") for e in own]

@@ -121,8 +121,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         "missing effect"
     ),
     "new_poses_not_shown": lambda f: (
-        f"{_length(f, 'open_um')} of the error at new poses come from parameters that the measured "
-        f"poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
+        f"{_length(f, 'open_um')} of the error at new poses comes from parameters that the "
+        f"measured poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
     ),
     "new_poses_no_gain": lambda f: (
         f"the error expected at new poses ({_length(f, 'rms_um')}) is "
@@ -297,7 +297,8 @@ def prior_line(result: Calibration) -> str | None:
     mostly = found.numbers["parameters"]
     told = (f"{printable(name)} {percent(shares[name])}" for name in mostly)
     named = some(told, MOST_NAMED, more=", and {} more")
-    return f"Mostly prior, share of the information: {named}. Measure poses that load them more."
+    why = "Beside smooth functions typical sizes are a prior." if result.smooth else found.remedy
+    return f"Mostly prior, share of the information: {named}. {why}"
 
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes

@@ -54,10 +54,13 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     yield say.Fold("", lambda: [say.KeyFigures(f"moved by {rms} (noise {noise})", figures)])
     steps = [
         "Use the new calibration (elastocal compensate, elastocal export).",
-        "Look for the cause at the joints and links named. A missing effect can look like a change "
-        "if poses or loads differ (elastocal diagnose with the new data).",
-    ]
+        ("Look for the cause at the joints and links named. " if c.changed else
+         "Measure more poses to see which parameter has changed. ")
+        + "A missing effect can look like a change if poses or loads differ (elastocal diagnose "
+        "with the new data).",
+    ]  # fmt: skip
     tone: say.Tone = "warn"
+    mostly = dict.fromkeys((*c.old.by_prior, *c.new.by_prior))
     if c.one_result:
         verdict = (
             f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
@@ -67,6 +70,11 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     elif c.verdict == "no_change_shown":
         tone, verdict = "good", "No significant change: the differences are within the noise."
         steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
+        if mostly:
+            steps = [
+                "Compare results without smooth functions and without knowledge: beside their "
+                "priors a change of these parameters is hardly seen."
+            ]
     elif c.changed:
         names = some((printable(change.name) for change in c.changed), MOST_NAMED)
         verdict = f"The arm has changed: {names}."
@@ -92,7 +100,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
             "The sessions determined different parameters; what both show is compared, to first "
             "order."
         )
-    if mostly := dict.fromkeys((*c.old.by_prior, *c.new.by_prior)):
+    if mostly:
         compared.append(
             "A change of what is determined mostly by a prior is hardly seen, and its part of the "
             f"noise is that of the prior: {some(mostly, 8)}."
