@@ -190,6 +190,13 @@ def prior_deviations(base: Baseline) -> Array:
     return np.where(is_placed(base.model), PLACED, wide)
 
 
+def typical_precisions(base: Baseline) -> Array:
+    """Of typical sizes (parameters,), or of how far the fit has moved each, in units of
+    `prior_deviations`."""
+    wide, away = prior_deviations(base), np.abs(from_centre(base))
+    return (wide / np.where(is_placed(base.model), wide, np.maximum(base.sizes, away))) ** 2
+
+
 # Evidence grows with the readings, and an effect worth finding has hundreds of nats in so many.
 MOST_ROWS = 12_000
 # The same of poses: curves and fields have a thousand columns.  Identified from all poses, a cell

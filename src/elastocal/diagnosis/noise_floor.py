@@ -22,6 +22,7 @@ from elastocal.diagnosis.baseline import (
     NoisyData,
     Projection,
     project,
+    typical_precisions,
 )
 from elastocal.diagnosis.diagnosis import (
     FaultyReading,
@@ -361,16 +362,19 @@ def first_steps(
 ) -> list[BudgetStep]:
     """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
     the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
-    effect is that effect, and weights by it would spare it."""
+    effect is that effect, and weights by it would spare it.  So are typical sizes: what a few poses
+    leave open deviates by no more."""
     placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
     # Stage by stage, effects of the later step held at nominal.
     data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
     stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
+    typical = dict(zip(effects, typical_precisions(dataset.base).tolist(), strict=True))
+    precision = data.precision * [typical.get(name, 1.0) for name in dataset.fitted]
     for k, name in ((1, "geometry"), (2, "compliance")):
         if (stage == k).any():
             free = stage <= k
-            part = replace(data, X=data.X[:, :, free], precision=data.precision[free])
+            part = replace(data, X=data.X[:, :, free], precision=precision[free])
             left = left_out_residual(project(part, noise.of_instrument()))
             steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
     return steps
