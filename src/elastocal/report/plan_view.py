@@ -150,6 +150,8 @@ def plan_headline(plan: Plan) -> str:
     if plan.of_test_poses:
         error = say.length(_rho(plan) * 1e-6)
         text += f"position error ρ₀ = {error} rms at the test poses after compensation"
+        if (g := plan.gain) is not None and g.model_after > 1.01e-6 * _rho(plan):
+            text += f", {say.length(g.model_after)} with the cell's smooth functions"
     else:
         text += f"{plan.criterion} = {_value(plan, plan.reported)}"
     better = plan.certificate.better_pool
@@ -377,7 +379,7 @@ def _execution_lines(plan: Plan) -> Told:
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
-    text += f", {say.counted(via, 'via point')} around obstacles" if via else ""
+    text += f", {say.counted(via, 'via point')}" if via else ""
     if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
         checked = "every move checked"
     elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
