@@ -248,9 +248,10 @@ def _lacking(result: Calibration) -> str:
     ask = "Ask what the model lacks: elastocal diagnose with the same cell and data."
     if result.excess is None:  # no noise is known that the residual could exceed
         return ask
+    stated = result.noise.ratio_to_stated is not None
     return (
-        f"{ask} Where it finds nothing, the excess is the robot's repeatability, or noise larger "
-        "than stated ([tracker])."
+        f"{ask} Where it finds nothing, the excess is the robot's repeatability"
+        f"{', or noise larger than stated ([tracker])' * stated}."
     )
 
 

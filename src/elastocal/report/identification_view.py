@@ -194,7 +194,7 @@ def what_was_identified(result: Calibration) -> str:
     mostly = len({*alone} & {*mostly_prior(result.prior_share)})
     text = f"{len(alone) - mostly} of {say.counted(len(result.ordinary), 'parameter')}"
     if mostly:
-        text += f", and {mostly} mostly by a prior"
+        text += f", {mostly} more mostly by a prior"
     if n:
         absorbed = len(names_of(result, findings.ABSORBED))
         text += (

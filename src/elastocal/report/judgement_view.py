@@ -328,7 +328,9 @@ def does_noise_explain_it(result: Calibration) -> str:
         stated = available_noise(observed.table, tracker) != "none"
         if observed.kind == "distance":
             stated = tracker.distance_sigma is not None
-        text = "No noise was stated, so the residual cannot be judged"
+        by_repeats = result.finding("lack_of_fit", "repeats_agree") is not None
+        text = "No noise was stated, "
+        text += "repeats judge the residual" if by_repeats else "so the residual cannot be judged"
         if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
             which = "positions" if stated else "rotations"
             text = f"Noise was stated for {which} only, so the residual cannot be judged"
