@@ -21,8 +21,8 @@ from elastocal.diagnosis.baseline import (
     NoiseValues,
     NoisyData,
     Projection,
+    prior_deviations,
     project,
-    typical_precisions,
 )
 from elastocal.diagnosis.diagnosis import (
     FaultyReading,
@@ -252,6 +252,7 @@ class SupportedFloor:
     def told(self) -> NoiseFloor:
         (square, dof), (dataset, data, noise) = repeats(self.of[0]), self.of
         variance = np.diagonal(data.covariance, axis1=1, axis2=2)
+        ratio = noise_rms(data, noise) / np.sqrt(mean_square(data, np.sqrt(variance)))
         # Those left out have their error against the fit to the others.
         e, stated = _left_over(data, self.at), data.blocks.unpack(variance[..., None])[:, :, 0]
         sigma, variance = noise.factor * np.sqrt(stated), variance[~data.left_out]
@@ -268,9 +269,9 @@ class SupportedFloor:
             for k, row in zip(gone, dataset.lead[gone], strict=True)
         )  # fmt: skip
         return NoiseFloor(
-            data.stated, noise.factor, ratio_to_stated(data, noise),
-            float(noise.factor * np.sqrt(variance.mean())), tuple(joint.tolist()),
-            noise.shared_by_all * several, float(np.sqrt(square / dof)) if dof else None,
+            data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
+            tuple(joint.tolist()), noise.shared_by_all * several,
+            float(np.sqrt(square / dof)) if dof else None,
             tuple((noise.shared * several).tolist()), faulty, self.near_repeats, dataset.drift,
             dataset.common,
         )  # fmt: skip
@@ -296,12 +297,6 @@ def noise_rms(data: NoisyData, noise: NoiseValues) -> float:
     """3-D rms in m that the noise alone gives a reading."""
     variance = np.diagonal(data.V(noise), axis1=1, axis2=2)
     return float(np.sqrt(mean_square(data, np.sqrt(variance))))
-
-
-def ratio_to_stated(data: NoisyData, noise: NoiseValues) -> float:
-    """The noise of a reading, scatter of the joints included, over what is stated."""
-    stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))
-    return noise_rms(data, noise) / float(np.sqrt(mean_square(data, stated)))
 
 
 def mean_square(data: NoisyData, packed: Array) -> float:
@@ -369,7 +364,8 @@ def first_steps(
     # Stage by stage, effects of the later step held at nominal.
     data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
     stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
-    typical = dict(zip(effects, typical_precisions(dataset.base).tolist(), strict=True))
+    wider = prior_deviations(dataset.base) / prior_deviations(dataset.base, 1.0)
+    typical = dict(zip(effects, wider**2, strict=True))
     precision = data.precision * [typical.get(name, 1.0) for name in dataset.fitted]
     for k, name in ((1, "geometry"), (2, "compliance")):
         if (stage == k).any():

@@ -665,8 +665,8 @@ def _runs(lines: Iterable[int]) -> str:
     return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
 
 
-# Of these the warning, or the line on the prior, says what to do.
-TOLD_ELSEWHERE = {"mostly_prior"} | {k for k, text in SENTENCES.items() if "{remedy}" in text}
+# Of these the warning says what to do.
+TOLD_ELSEWHERE = {kind for kind, text in SENTENCES.items() if "{remedy}" in text}
 
 
 SLIGHT = 0.1  # of the error at new poses: what is open by less raises it by half a percent

@@ -117,8 +117,7 @@ def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]
 
 
 def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
-    """Open parameters by the `harm` (D,) they do, the worst first; those that no pose tells from
-    others, whose harm theirs is, where there is none besides."""
+    """Open parameters by the `harm` (D,) they do, of those that poses can show where any does."""
     if (apart := ~np.isin(left.names, left.redundant))[harm > 0].any():
         harm = np.where(apart, harm, 0.0)
     size = np.round(harm / max(float(harm.max(initial=0.0)), 1e-300), 9)

@@ -193,8 +193,7 @@ def what_was_identified(result: Calibration) -> str:
     alone, n = names_of(result, findings.ALONE), len(result.combinations)
     mostly = len({*alone} & {*mostly_prior(result.prior_share)})
     text = f"{len(alone) - mostly} of {say.counted(len(result.ordinary), 'parameter')}"
-    if mostly:
-        text += f", {mostly} more mostly by a prior"
+    text += f", {mostly} more mostly by a prior" * bool(mostly)
     if n:
         absorbed = len(names_of(result, findings.ABSORBED))
         text += (
@@ -419,7 +418,7 @@ def nominal_text(e: Estimate, parameter: Parameter) -> str:
     return say.plain(say.display(e.nominal, e.unit)[0]) if stated(parameter) else "–"
 
 
-def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
+def undetermined_lines(result: Calibration, most: int | None = None) -> Iterator[str]:
     """Which parameters have no number of their own, and why; `most` names a line."""
     standing, known = findings.standings(result), {p.name: p for p in result.model.parameters}
     redundant = result.left.redundant if result.left else ()
@@ -428,7 +427,6 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         kind = standing[e.name]
         extra = kind in HELD and e.name in redundant
         groups.setdefault(REDUNDANT if extra else kind, []).append(e)
-    lines = []
     for kind in (*NO_VALUE, *HELD, findings.UNREAD, findings.FIXED):
         found = groups.get(kind, [])
         at_nominal = all(e.held == e.nominal and stated(known[e.name]) for e in found)
@@ -441,8 +439,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         if kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}, so without a value (95 %)"
             names = [f"{n} ({limits(result, e)})" for n, e in zip(names, found, strict=True)]
-        lines += [f"{why}: {listed(names, most or len(names))}"] if names else []
-    return lines
+        yield from [f"{why}: {listed(names, most or len(names))}"] * bool(names)
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:

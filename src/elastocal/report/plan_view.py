@@ -179,27 +179,26 @@ def _criterion(plan: Plan) -> str:
     return "ρ₀" if plan.of_test_poses else plan.criterion
 
 
-def plan_steps(plan: Plan) -> list[str]:
-    steps = [
+def plan_steps(plan: Plan) -> Iterator[str]:
+    yield (
         "Measure the poses in the given order, which limits the effect of drift, and record the "
         "time of each reading."
-    ]
+    )
     if plan.of_test_poses:
-        steps.append(
+        yield (
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses for a value, "
             f"{option('curve')} compares numbers of poses."
         )
     ends = plan.certificate.starts
     if ends and max(ends) - min(ends) > 0.02 * max(map(abs, ends)):
-        steps.append(f"For a better plan: {option('effort', 'thorough')}, which has more starts.")
-    together = sum(bool(p.combined_with) for p in plan.predicted)
-    if together:
-        steps.append(
+        yield f"For a better plan: {option('effort', 'thorough')}, which has more starts."
+    if together := sum(bool(p.combined_with) for p in plan.predicted):
+        yield (
             f"{say.counted(together, 'parameter')} will be determined only in sums, which more "
             "poses like these do not separate: as expected where they describe the same motion; "
             "other loads separate compliances, three markers the turn of the tool."
         )
-    return [*steps, "Then: elastocal identify with the same cell and the measurements."]
+    yield "Then: elastocal identify with the same cell and the measurements."
 
 
 Told = Iterator[tuple[str, str]]  # label, sentence
@@ -380,18 +379,14 @@ def _execution_lines(plan: Plan) -> Told:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
     text += f", {say.counted(via, 'via point')}" if via else ""
-    if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
-        checked = "every move checked"
-    elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
-        checked = (
-            "every move checked against the mounting plane (z = 0 of the base; [workspace] "
-            "mounting_plane = false disables it) only, as [workspace] states no bodies"
-        )
-    else:
-        checked = (
-            "no move was checked, as [workspace] states no bodies, and poses may reach below the "
-            "mounting plane"
-        )
+    checked = "every move checked"
+    if not (len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0):
+        if mounting_plane(plan.model.cell, plan.model.chain) is None:
+            checked = "no move was checked, and poses may reach below the mounting plane"
+        else:
+            checked += " against the mounting plane only (z = 0 of the base; [workspace] "
+            checked += "mounting_plane = false disables it)"
+        checked += ", as [workspace] states no bodies"
     yield "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
     if (d := e.drift) is None:
         return

@@ -69,12 +69,12 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         steps = ["Give the results of two sessions: this is one of them and its copy."]
     elif c.verdict == "no_change_shown":
         tone, verdict = "good", "No significant change: the differences are within the noise."
-        steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
-        if mostly:
-            steps = [
-                "Compare results without smooth functions and without knowledge: beside their "
-                "priors a change of these parameters is hardly seen."
-            ]
+        steps = [
+            "Compare results without smooth functions and without knowledge: beside their priors a "
+            "change of these parameters is hardly seen."
+            if mostly
+            else "Nothing: the old calibration still holds within the noise of both sessions."
+        ]
     elif c.changed:
         names = some((printable(change.name) for change in c.changed), MOST_NAMED)
         verdict = f"The arm has changed: {names}."
@@ -317,17 +317,15 @@ MOST_COLUMNS = 14  # of the first rows, on a wide terminal
 ROLES = {"points": "points", "joints": "joint values", "both": "points and joint values"}
 
 
-def left_out(found: Imported) -> list[str]:
-    lines = []
+def left_out(found: Imported) -> Iterator[str]:
     for observed in found.understood:
         if n := len(observed["ignored"]):
             rows = listed((f"line {line} ({reason})" for line, reason in observed["ignored"]), 8)
-            lines.append(f"{observed['file']}: passed over {say.counted(n, 'line')}: {rows}")
+            yield f"{observed['file']}: passed over {say.counted(n, 'line')}: {rows}"
     if (joined := found.joined) is not None:
         for told, names in (("left out, without joint values: %d points", joined.left_out),
                             ("poses without a point: %d", joined.unused)):  # fmt: skip
-            lines += [f"{told % len(names)}: {listed(names, 12)}"] if names else []
-    return lines
+            yield from [f"{told % len(names)}: {listed(names, 12)}"] * bool(names)
 
 
 def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
