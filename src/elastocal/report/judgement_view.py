@@ -130,6 +130,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         + f" than that of the nominal arm at measured poses ({_length(f, 'nominal_rms_um')})"
     ),
     "many_faulty_readings": "{faulty} of the {fitted} fitted readings are outliers",
+    "many_left_out": "{left_out} readings are excluded as outliers, and {fitted} are fitted",
     "drift": "base or tracker drift by {sigma_um} during the measurement session",
     "test_data_worse": "the test error ({test_rms_um} rms) is larger than chance explains",
     "test_data_far": (
