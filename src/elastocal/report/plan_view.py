@@ -156,7 +156,7 @@ def plan_headline(plan: Plan) -> str:
         text += f"{plan.criterion} = {_value(plan, plan.reported)}"
     better = plan.certificate.better_pool
     if better is None or plan.certificate.vain:
-        return f"{text}; no bound on the best plan is known."
+        return f"{text}; no useful bound on the best plan is known."
     text += "; no other plan from these candidates is "
     text += f"more than {100 * better:.1f} % better" if better else "better"
     text += " by the weighted error" if _weighted(plan) else ""
@@ -423,11 +423,9 @@ def next_lines(found: NextPoses) -> Told:
 
     yield "Next", f"{verdicts[found.verdict]}."
     yield "Error now", f"{now}."
-    yield (
-        "Gain",
-        f"{n} lower the expected rms error at the test poses from {both(g.before, g.after)} with "
-        f"what the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
-    )
+    gain, if_right = both(g.before, g.after), both(g.model_before, g.model_after)
+    gain += f" with what the model may lack; from {if_right} if it is right" * (gain != if_right)
+    yield "Gain", f"{n} lower the expected rms error at the test poses from {gain}."
     named = [f"{say.effect_at(f)} ({say.probability(f.probability)})" for f in found.found]
     if named:
         text = f"{', '.join(named)}, added to the model here; write the cell with it"
