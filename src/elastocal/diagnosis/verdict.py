@@ -344,7 +344,8 @@ def too_small(dataset: DiagnosisData, found: ForwardSelection) -> tuple[Untested
         "at its typical size it does not show in these poses: the fitted parameters follow it, or "
         "it is smaller than the noise"
     )
-    advice = "spread the poses over more of the work space, or raise the load"
+    loaded = bool(dataset.table.force.any())
+    advice = f"spread the poses over more of the work space{', or raise the load' * loaded}"
     return tuple(
         Untested(*h.key, reason, advice)
         for h, d in zip(dataset.hypotheses, found.alone.distance, strict=False)
