@@ -133,8 +133,7 @@ def noise_floor_lines(
     common = "deviation common to a configuration"
     for what, size in (("drift", noise.drift), (common, noise.configuration)):
         if size > 0:
-            told = f"The {what} of {say.length(size)} that [noise] of the cell states"
-            yield f"{told} counts as noise."
+            yield f"The {what} of {say.length(size)} that [noise] of the cell states counts as noise."
     if noise.pure_error is None:
         yield "No repeats: residuals alone tell the noise, with one marker hardly that of joints."
     else:
@@ -208,7 +207,9 @@ def diagnosis_headline(d: Diagnosis) -> str:
 
 def location_text(location: Location) -> str:
     at, stage = say.place(location.where), say.STAGES[location.stage]
-    where = f"at {at}, in the {stage}" if at != stage else f"at the {at}"
+    where = f"at {'the ' * (at in say.SINGLE)}{at}"
+    if stage not in at and not stage.startswith(at.split()[0]):  # not "at link 2, in the links"
+        where += f", in the {stage}"
     return f"{where} (probability {say.probability(location.probability)})"
 
 
