@@ -522,8 +522,9 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
         yield (
             f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
             f"this point depends: typical deviations of them would move it by {length(rms)} rms, "
-            "which within95_um counts and std_um leaves out; choose a marker that was fitted "
-            f"({option('point')}), or measure what is missing"
+            "which within95_um counts and std_um leaves out; "
+            + f"choose a marker that was fitted ({option('point')}), or " * (not c.point.marker)
+            + "measure what is missing"
         )
     known = np.isin(arm.model.names, arm.determined)
     for group in smooth_groups(arm.model):

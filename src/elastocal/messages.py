@@ -86,8 +86,8 @@ def size_of(p: float) -> str:
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
-# A length or residual below this, in m, is rounding: no instrument resolves it.
-EXACT = 1e-11
+# A length or residual below this, in m, is rounding: no atom is as small.
+EXACT = 1e-10
 
 
 def length(metres: float, digits: int = 3) -> str:

@@ -34,6 +34,7 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found():
     result = identify(model, replace(table, distance=distance), Options(faulty="drop"))
     found = rows_of(result.excluded)
     assert set(block) <= set(found) and len(found) <= len(block) + 1
+    assert result.finding("many_left_out") in result.verdict.missing
     assert blocks([o.line for o in result.excluded])[0] == (block[0] + 2, block[-1] + 2)
     offset = result["tracker.length_offset"].held
     assert abs(offset - truth[model.names.index("tracker.length_offset")]) < 0.03 / 4

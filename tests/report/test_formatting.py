@@ -55,7 +55,7 @@ def test_other_numbers() -> None:
     assert estimate(5.0, 0.3, "kg*m^2") == ("5.0", "0.3", "kg·m²")
     for metres, text in (
         (84.3e-6, "84.3 µm"), (999.4e-6, "999 µm"), (999.9e-6, "1.00 mm"), (4.705e-3, "4.71 mm"),
-        (1.5, "1.50 m"), (2e-16, "0 µm"), (math.inf, "not available"),
+        (1.5, "1.50 m"), (2e-11, "0 µm"), (math.inf, "not available"),
     ):  # fmt: skip
         assert length(metres) == text
     assert [*map(significant, (0.99996, 0.00062449, 4e-9))] == ["1.00", "0.000624", "4e-09"]

@@ -258,7 +258,7 @@ def _diagnosed(
         warnings=(
             *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
-            *warnings(dataset, found, suspects, answer.found.noise),
+            *warnings(dataset, found, suspects, answers["noise"]),
             *confirm(unheard_of(answers["effects"], base.model)),
         ),
         n_readings=dataset.blocks.n,

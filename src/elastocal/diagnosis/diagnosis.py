@@ -485,7 +485,7 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         d.doubtful or not any(c.visible for c in d.candidates)
     )
     settled = d.verdict in ("explained", "nothing_significant") and not unseen
-    remedy = UNSEEN if unseen else _remedy(d.verdict)
+    remedy = UNSEEN if unseen else _remedy(d.verdict) * (not (settled and d.fields))
     yield Finding(d.verdict, "good" if settled else "care", numbers, remedy)
     if d.groups:
         shares = tuple(g.share for g in d.groups)

@@ -78,7 +78,9 @@ class NextPoses(Result):
     def doubts(self) -> tuple[tuple[str, str, float], ...]:
         """What it may lack besides, or instead: effect, place and probability, likeliest first."""
         found = {(f.effect, f.where) for f in self.found}
-        every = () if self.diagnosis is None else self.diagnosis.candidates
+        # Candidates are judged one at a time: where many causes are found together, beside none.
+        why = self.diagnosis
+        every = () if why is None or why.groups else why.candidates
         likely = ((c.effect, c.where, c.probability) for c in every if c.probability > DOUBT)
         return tuple(sorted((c for c in likely if c[:2] not in found), key=lambda c: -c[2]))
 

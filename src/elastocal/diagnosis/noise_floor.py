@@ -21,6 +21,7 @@ from elastocal.diagnosis.baseline import (
     NoiseValues,
     NoisyData,
     Projection,
+    prior_deviations,
     project,
 )
 from elastocal.diagnosis.diagnosis import (
@@ -255,6 +256,9 @@ class SupportedFloor:
         # Those left out have their error against the fit to the others.
         e, stated = _left_over(data, self.at), data.blocks.unpack(variance[..., None])[:, :, 0]
         sigma, variance = noise.factor * np.sqrt(stated), variance[~data.left_out]
+        # What visits of a configuration have in common shows where there are several.
+        several = data.blocks.in_visit.shape[2] > 1
+        joint = noise.joint if several else noise.joint * np.hypot(1.0, noise.shared)
         table, gone = dataset.table, np.flatnonzero(data.faulty)
         faulty = tuple(
             FaultyReading(
@@ -266,9 +270,9 @@ class SupportedFloor:
         )  # fmt: skip
         return NoiseFloor(
             data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
-            tuple(noise.joint.tolist()), noise.shared_by_all,
+            tuple(joint.tolist()), noise.shared_by_all * several,
             float(np.sqrt(square / dof)) if dof else None,
-            tuple(noise.shared.tolist()), faulty, self.near_repeats, dataset.drift,
+            tuple((noise.shared * several).tolist()), faulty, self.near_repeats, dataset.drift,
             dataset.common,
         )  # fmt: skip
 
@@ -353,16 +357,20 @@ def first_steps(
 ) -> list[BudgetStep]:
     """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
     the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
-    effect is that effect, and weights by it would spare it."""
+    effect is that effect, and weights by it would spare it.  So are typical sizes: what a few poses
+    leave open deviates by no more."""
     placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
     # Stage by stage, effects of the later step held at nominal.
     data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
     stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
+    wider = prior_deviations(dataset.base) / prior_deviations(dataset.base, 1.0)
+    typical = dict(zip(effects, wider**2, strict=True))
+    precision = data.precision * [typical.get(name, 1.0) for name in dataset.fitted]
     for k, name in ((1, "geometry"), (2, "compliance")):
         if (stage == k).any():
             free = stage <= k
-            part = replace(data, X=data.X[:, :, free], precision=data.precision[free])
+            part = replace(data, X=data.X[:, :, free], precision=precision[free])
             left = left_out_residual(project(part, noise.of_instrument()))
             steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
     return steps

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.diagnosis.baseline import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.baseline import NoisyData, Projection, project
 from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer
 from elastocal.diagnosis.diagnosis import (
     Candidate,
@@ -19,6 +19,7 @@ from elastocal.diagnosis.diagnosis import (
     FittedParameter,
     FoundEffect,
     Location,
+    NoiseFloor,
     StructureTest,
     Untested,
     Verdict,
@@ -343,7 +344,8 @@ def too_small(dataset: DiagnosisData, found: ForwardSelection) -> tuple[Untested
         "at its typical size it does not show in these poses: the fitted parameters follow it, or "
         "it is smaller than the noise"
     )
-    advice = "spread the poses over more of the work space, or raise the load"
+    loaded = bool(dataset.table.force.any())
+    advice = f"spread the poses over more of the work space{', or raise the load' * loaded}"
     return tuple(
         Untested(*h.key, reason, advice)
         for h, d in zip(dataset.hypotheses, found.alone.distance, strict=False)
@@ -352,22 +354,21 @@ def too_small(dataset: DiagnosisData, found: ForwardSelection) -> tuple[Untested
 
 
 def warnings(
-    dataset: DiagnosisData, found: ForwardSelection, suspects: BoolArray, noise: NoiseValues
-) -> tuple[str, ...]:
+    dataset: DiagnosisData, found: ForwardSelection, suspects: BoolArray, noise: NoiseFloor
+) -> Iterator[str]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
-    out, data = list[str](), found.chosen.data
+    data = found.chosen.data
     if data.stated:
-        out += _stated_wrong(dataset, data, noise.factor)
-    faulty = (data.left_out & ~dataset.blocks.absent).sum() / max((~dataset.blocks.absent).sum(), 1)
-    if faulty > FAULTY_SHARE:
-        out.append(
-            f"{faulty:.0%} of the readings disagree with all others and were left out; look for "
-            "the cause before trusting the rest"
+        yield from _stated_wrong(dataset, data, noise)
+    if (faulty := data.faulty.mean()) > FAULTY_SHARE:
+        yield (
+            f"{100 * faulty:.0f} % of the readings disagree with all others and were excluded; "
+            "look for the cause before trusting the rest"
         )
     kept = np.flatnonzero(suspects)
     if len(kept) > SUSPECT_SHARE * len(suspects):
         lines = dataset.table.row[dataset.lead[kept]]
-        out.append(
+        yield (
             f"{len(kept)} of {len(suspects)} readings (lines {lines.min()} to "
             f"{lines.max()}) lie far beyond the scatter of the others, too many or too near each "
             "other to be accidents; they were kept: look at them with `elastocal identify` first"
@@ -376,17 +377,16 @@ def warnings(
              and i.what.name == Backlash.name]  # fmt: skip
     if named and found.dataset.other_backlash > OPEN_BACKLASH:
         places = " and ".join(named)
-        out.append(
+        yield (
             f"hardly any reading shows whether the play of {places} follows the load alone or also "
             "the last motion, so the error left at new poses is uncertain: measure poses in which "
             f"the load hardly turns {places}, approached from both sides"
         )
     if dataset.table.time is None:
-        out.append(
+        yield (
             "without times no drift can be seen, and a jump only by the order of the rows: "
             "record time_s"
         )
-    return tuple(out)
 
 
 def unheard_of(found: Sequence[FoundEffect], model: Model) -> dict[str, tuple[str, float]]:
@@ -412,18 +412,21 @@ def confirm(far: Mapping[str, tuple[str, float]]) -> Iterator[str]:
         )
 
 
-def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> Iterator[str]:
+def _stated_wrong(dataset: DiagnosisData, data: NoisyData, noise: NoiseFloor) -> Iterator[str]:
     """Where the tracker's noise is beyond what chance makes of the stated one, and repeats or
-    markers of one pose, where they tell, say so too; or what is stated is far too large."""
+    markers of one pose, where they tell, say so too; or what is stated is far too large, where
+    nothing tells the tracker from the joints for both together."""
     base, good, dof = dataset.base, ~data.faulty, max(data.n_rows - data.X.shape[2], 1)
     readings = subset(base.observed, good), base.residual.reshape(len(good), -1)[good].ravel()
     common = noise_summary.less_in_common(*readings, base.model.cell, len(base.x))
     if common is not None:
         yield noise_summary.TOO_LARGE_IN_COMMON.format(common)
         return
-    wrong, beyond = factor < STATED_LOW, special.chdtri(dof, noise_summary.BEYOND)
-    if base.stated is not None and factor**2 * dof >= beyond:
-        single = noise_summary.single_readings(*readings, base.stated[good], len(base.x))
+    assert base.stated is not None
+    single = noise_summary.single_readings(*readings, base.stated[good], len(base.x))
+    factor = noise.stated_factor
+    wrong = (noise.ratio_to_stated if single is None else factor) < STATED_LOW
+    if factor**2 * dof >= special.chdtri(dof, noise_summary.BEYOND):
         positions = base.observed.kind == "position"
         wrong = single is None or single.above if positions else factor > STATED_HIGH
     if wrong:

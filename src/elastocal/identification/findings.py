@@ -22,7 +22,7 @@ from elastocal.identification.mistakes import (
 )
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import ResidualSummary
-from elastocal.identification.outliers import kept_of, named_runs
+from elastocal.identification.outliers import FEW, kept_of, named_runs
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.result import (
     Calibration,
@@ -249,8 +249,8 @@ def _lacking(result: Calibration) -> str:
     if result.excess is None:  # no noise is known that the residual could exceed
         return ask
     return (
-        f"{ask} Where it finds nothing, the excess is the robot's repeatability, or noise larger "
-        "than stated ([tracker])."
+        f"{ask} Where it finds nothing, the excess is the robot's repeatability"
+        f"{', or noise larger than stated ([tracker])' * bool(result.noise.ratio_to_stated)}."
     )
 
 
@@ -389,8 +389,8 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
 
 
 def _faulty(result: Calibration) -> Iterator[Finding]:
-    n, fitted, kept = len(result.faulty), len(result.observations.lead), len(result.outliers)
-    if n:
+    fitted, kept = len(result.observations.lead), len(result.outliers)
+    if n := kept + (gone := len(result.excluded)):
         remedy = f"Check the {counted(n, 'reading')} beyond the noise."
         shifted = result.faulty_report.shifted if result.faulty_report else []
         if shifted:
@@ -399,11 +399,13 @@ def _faulty(result: Calibration) -> Iterator[Finding]:
                 f"{listed(map(str, shifted), 4)}: look for what "
                 "moved there, a marker or the tracker."
             )
-        numbers = {"left_out": len(result.excluded), "heldout_all_rms_um": result.heldout_all_rms}
+        numbers = {"left_out": gone, "heldout_all_rms_um": result.heldout_all_rms}
         numbers["shifted"] = sum(len(f.readings) for f in shifted)
         yield _note("faulty_readings", remedy, fitted=kept, **numbers)
     if kept > MANY * fitted:
         yield _care("many_faulty_readings", faulty=kept, fitted=fitted)
+    if gone > FEW * (fitted + gone):
+        yield _care("many_left_out", left_out=gone, fitted=fitted)
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
@@ -413,13 +415,12 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
     shown = tuple(name for name in lacking if name not in redundant)
     if n := len(lacking) - len(shown):
         yield _good("redundant", parameters=n)
-    unread = tuple(name for name, standing in all_of_them.items() if standing == UNREAD)
-    if unread:
+    if unread := tuple(name for name, standing in all_of_them.items() if standing == UNREAD):
         remedy = f"There is {no_reading(result)}: measure it, or delete it from [tool.markers_m]."
         yield _note("markers_not_read", remedy, parameters=unread)
     if n := len(shown):
         remedy = (
-            f"{n} parameter{'' if n == 1 else 's'} cannot be determined from these data "
+            f"{counted(n, 'parameter')} cannot be determined from these data "
             f"({listed(shown, 4)}). Predictions hold for poses and loads like those measured; for "
             "others, measure what shows them."
         )
@@ -428,8 +429,7 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
 
 def _unread(result: Calibration) -> list[str]:
     excluded = {f"marker:{o.marker}" for o in result.excluded}
-    places = unread_markers(result.model, result.observations.table)
-    return [place for place in places if place not in excluded]
+    return [p for p in unread_markers(result.model, result.observations.table) if p not in excluded]
 
 
 def no_reading(result: Calibration) -> str:
@@ -664,8 +664,8 @@ def _runs(lines: Iterable[int]) -> str:
     return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
 
 
-# Of these the warning, or the line on the prior, says what to do.
-TOLD_ELSEWHERE = {"mostly_prior"} | {k for k, text in SENTENCES.items() if "{remedy}" in text}
+# Of these the warning says what to do.
+TOLD_ELSEWHERE = {kind for kind, text in SENTENCES.items() if "{remedy}" in text}
 
 
 SLIGHT = 0.1  # of the error at new poses: what is open by less raises it by half a percent

@@ -117,6 +117,9 @@ def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]
 
 
 def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
+    """Open parameters by the `harm` (D,) they do, of those that poses can show where any does."""
+    if (apart := ~np.isin(left.names, left.redundant))[harm > 0].any():
+        harm = np.where(apart, harm, 0.0)
     size = np.round(harm / max(float(harm.max(initial=0.0)), 1e-300), 9)
     return tuple(left.names[int(i)] for i in np.argsort(-size, kind="stable") if harm[i] > 0)
 

@@ -246,7 +246,6 @@ REMEDIES: dict[str, str | Callable[[], str]] = {
     "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
     "parameters.",
     "many_faulty_readings": "Check where they lie before excluding any.",
-    "mostly_prior": "Measure poses that load them more.",
     "new_poses_no_gain": more_poses,
     "new_poses_not_shown": lambda: (
         f"{more_poses()} For a part of the joint ranges alone, state test poses in the cell."

@@ -23,7 +23,6 @@ from elastocal.messages import (
     InputError,
     InsufficientDataError,
     check_known,
-    length,
     listed,
     option,
     quoted,
@@ -333,13 +332,7 @@ class _Design:
             M = setup.gathered(setup.information.blocks(q, readings))
         if done is None or setup.target_rows is None:
             return None
-        gain = Gain.of(setup.target_rows, setup.prior, M, options.seed)
-        if whole is not None:
-            self.warnings.append(
-                "with the smooth functions, which stay uncertain, the error at the test poses is "
-                f"{length(gain.after)} rms"
-            )
-        return gain
+        return Gain.of(setup.target_rows, setup.prior, M, options.seed)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""

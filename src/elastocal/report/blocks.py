@@ -368,17 +368,6 @@ def probability(p: float) -> str:
     return "< 0.01" if p < 0.005 else f"{p:.2f}"
 
 
-def percent(fraction: float) -> str:
-    return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
-
-
-def reduction(f: FoundEffect) -> str:
-    low, high = f.gap_reduction_ci95
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return percent(f.gap_reduction)
-    return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
-
-
 def settings_text(settings: Mapping[str, float], lines: Sequence[float] = ()) -> str:
     """Searched constants with their units: "jump time 12.0 min, ripple order 101"; for want of
     times a moment is one between the `lines` of the table at which visits begin."""

@@ -133,10 +133,9 @@ def noise_floor_lines(
     common = "deviation common to a configuration"
     for what, size in (("drift", noise.drift), (common, noise.configuration)):
         if size > 0:
-            told = f"The {what} of {say.length(size)} that [noise] of the cell states"
-            yield f"{told} counts as noise."
+            yield f"The {what} of {say.length(size)} that [noise] of the cell states counts as noise."
     if noise.pure_error is None:
-        yield "No repeats: the noise is estimated from residuals only."
+        yield "No repeats: residuals alone tell the noise, with one marker hardly that of joints."
     else:
         yield f"Repeats scatter by {say.length(noise.pure_error)} rms{along}."
     if (near := noise.near_repeats) is not None:
@@ -208,7 +207,9 @@ def diagnosis_headline(d: Diagnosis) -> str:
 
 def location_text(location: Location) -> str:
     at, stage = say.place(location.where), say.STAGES[location.stage]
-    where = f"at {at}, in the {stage}" if at != stage else f"at the {at}"
+    where = f"at {'the ' * (at in say.SINGLE)}{at}"
+    if stage not in at and not stage.startswith(at.split()[0]):  # not "at link 2, in the links"
+        where += f", in the {stage}"
     return f"{where} (probability {say.probability(location.probability)})"
 
 
@@ -224,11 +225,9 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
     unknown = d.verdict == "unknown_effect"
     if unknown:
         told = [f"{say.driver_name(t.driver)} ({say.size_of(t.p_family)})" for t in d.dependences]
-        more = len(told) - MOST_NAMED
-        named = say.together(told[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
         shape = "; see the curves for its shape" if d.curves else ""
-        named = named or f"no single driver that was tested shows it{shape}"
-        yield "Depends on", f"{named}."
+        none = f"no single driver that was tested shows it{shape}"
+        yield "Depends on", f"{some(told, MOST_NAMED) or none}."
     chance = " after correction for all candidates."
     if not d.effects and d.p_value > STRUCTURE:
         chance = " for the strongest candidate, corrected for all candidates."
@@ -253,8 +252,7 @@ def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
             text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
             yield "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
         if d.verdict == "nothing_significant":
-            for text in sensitivity(d):
-                yield "Sensitivity", text
+            yield from (("Sensitivity", text) for text in sensitivity(d))
         elif d.verdict == "ambiguous" and d.location is not None:
             yield "Location", f"{location_text(d.location)}."
     yield "Chance", f"{say.size_of(d.p_value)}{chance}"
@@ -270,11 +268,14 @@ def _error_line(d: Diagnosis) -> str:
     )
     if d.groups:  # the table of causes says what each takes away
         nameless = [say.length(s.heldout_rms) for s in d.budget if s.step.startswith("unknown:")]
-        told = [f"With unnamed smooth corrections: {left}." for left in nameless[-1:]]
-        return " ".join([text, *told])
-    if len(d.effects) == 1:
-        return f"{text} The noise-free error at new poses falls by {say.reduction(d.effects[0])}."
-    each = [f"{say.effect_at(f)} removes {say.reduction(f)}" for f in d.effects]
+        return text + f" With unnamed smooth corrections: {nameless[-1]}." if nameless else text
+    falls = [
+        f"{share_text(f.gap_reduction)} ({span_text(f.gap_reduction_ci95, f.gap_reduction)})"
+        for f in d.effects
+    ]
+    if len(falls) == 1:
+        return f"{text} The noise-free error at new poses falls by {falls[0]}."
+    each = [f"{say.effect_at(f)} removes {fall}" for f, fall in zip(d.effects, falls, strict=True)]
     return f"{text} Added last, {say.together(each)} of the noise-free error at new poses."
 
 
@@ -284,33 +285,31 @@ def settings_of(d: Diagnosis, settings: Mapping[str, float]) -> str:
     return say.settings_text(settings, lines)
 
 
-def sensitivity(d: Diagnosis) -> list[str]:
+def sensitivity(d: Diagnosis) -> Iterator[str]:
     if not d.candidates:
-        return []
-    lines = []
+        return
     if math.isfinite(d.smallest_seen):
-        lines.append(
+        yield (
             f"effects above about {say.length(d.smallest_seen, 2)} rms at the "
             "markers, not absorbed by fitted parameters, would have been found."
         )
-    visible = [c for c in d.candidates if c.visible]
-    faint = [c for c in d.candidates if c.hidden]
-    text = f"of {len(d.candidates)} candidates {len(visible)} would have been found at typical size"
-    if faint:
+    visible = sum(c.visible for c in d.candidates)
+    text = f"of {len(d.candidates)} candidates {visible} would have been found at typical size"
+    if faint := [c for c in d.candidates if c.hidden]:
         kinds = dict.fromkeys(say.plain_name(c.effect) for c in faint)
         names = some(kinds, MOST_NAMED, more=" and {} more kinds")
         text += f"; below the noise even then: {len(faint)} ({names})"
-    return [*lines, f"{text}."]
+    yield f"{text}."
 
 
-def diagnosis_steps(d: Diagnosis) -> list[str]:
-    steps = [f.remedy for f in d.findings if f.remedy]
+def diagnosis_steps(d: Diagnosis) -> Iterator[str]:
+    yield from (f.remedy for f in d.findings if f.remedy)
     if (extra := d.extra) is not None:
         rivals, n = say.together([say.name_of(name) for name in extra.rivals], "or"), extra.n_poses
         if not extra.separable:
-            steps.append(f"No pose that this cell allows separates {rivals}.")
+            yield f"No pose that this cell allows separates {rivals}."
         else:
-            steps.append(
+            yield (
                 f"{say.counted(n, 'more pose')} to separate {rivals}: the probability of the right "
                 f"answer rises from {say.probability(extra.probability_before)} to "
                 f"{say.probability(extra.probability_after)} (as many random poses: "
@@ -318,10 +317,10 @@ def diagnosis_steps(d: Diagnosis) -> list[str]:
             )
             for group in extra.inseparable:
                 names = say.together([say.name_of(name) for name in group])
-                steps.append(f"{say.capital(names)} count as one.")
-        steps += [say.sentence(printable(text)) for text in extra.advice]
+                yield f"{say.capital(names)} count as one."
+        yield from (say.sentence(printable(text)) for text in extra.advice)
     # One piece of advice serves many effects.
-    return steps + list(dict.fromkeys(say.sentence(printable(u.advice)) for u in d.untested))
+    yield from dict.fromkeys(say.sentence(printable(u.advice)) for u in d.untested)
 
 
 def alike(d: Diagnosis) -> list[str]:

@@ -15,6 +15,7 @@ from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import LOPSIDED, Calibration, Combination, Estimate, deviation
 from elastocal.identification.scrutiny import ErrorBudget, gap_budget, stage_of
 from elastocal.messages import listed, option, printable, some
+from elastocal.model.calibrated import mostly_prior
 from elastocal.model.chain import names_told
 from elastocal.model.effects.base import Parameter
 from elastocal.report import blocks as say
@@ -190,9 +191,9 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
 
 def what_was_identified(result: Calibration) -> str:
     alone, n = names_of(result, findings.ALONE), len(result.combinations)
-    text = f"{len(alone)} of {say.counted(len(result.ordinary), 'parameter')}"
-    if mostly := [p for p in alone if result.prior_share.get(p, 0.0) > findings.MOSTLY]:
-        text += f", {len(mostly)} of them mostly by their prior"
+    mostly = len({*alone} & {*mostly_prior(result.prior_share)})
+    text = f"{len(alone) - mostly} of {say.counted(len(result.ordinary), 'parameter')}"
+    text += f", {mostly} more mostly by a prior" * bool(mostly)
     if n:
         absorbed = len(names_of(result, findings.ABSORBED))
         text += (
@@ -417,7 +418,7 @@ def nominal_text(e: Estimate, parameter: Parameter) -> str:
     return say.plain(say.display(e.nominal, e.unit)[0]) if stated(parameter) else "–"
 
 
-def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
+def undetermined_lines(result: Calibration, most: int | None = None) -> Iterator[str]:
     """Which parameters have no number of their own, and why; `most` names a line."""
     standing, known = findings.standings(result), {p.name: p for p in result.model.parameters}
     redundant = result.left.redundant if result.left else ()
@@ -426,7 +427,6 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         kind = standing[e.name]
         extra = kind in HELD and e.name in redundant
         groups.setdefault(REDUNDANT if extra else kind, []).append(e)
-    lines = []
     for kind in (*NO_VALUE, *HELD, findings.UNREAD, findings.FIXED):
         found = groups.get(kind, [])
         at_nominal = all(e.held == e.nominal and stated(known[e.name]) for e in found)
@@ -439,8 +439,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         if kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}, so without a value (95 %)"
             names = [f"{n} ({limits(result, e)})" for n, e in zip(names, found, strict=True)]
-        lines += [f"{why}: {listed(names, most or len(names))}"] if names else []
-    return lines
+        yield from [f"{why}: {listed(names, most or len(names))}"] * bool(names)
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
@@ -504,8 +503,10 @@ def parameter_table(
         given = [(published.get(e.name), e.unit) for e in own]
         after["published"] = ["–" if v is None else " ± ".join(say.estimate(*v, unit)[:2])
                               for v, unit in given]  # fmt: skip
-    if any(e.note for e in own):
-        after["note"] = [printable(e.note) for e in own]
+    mostly = mostly_prior(result.prior_share)
+    notes = [printable(e.note) or "mostly prior" * (e.name in mostly) for e in own]
+    if any(notes):
+        after["note"] = notes
     true = None if truth is None else [truth.get(e.name) for e in own]
     table = _numbers("Parameters", [printable(e.name) for e in own], own, true, after)
     of = [known[e.name].effect.replace("_", " ") for e in own]

@@ -121,8 +121,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         "missing effect"
     ),
     "new_poses_not_shown": lambda f: (
-        f"{_length(f, 'open_um')} of the error at new poses come from parameters that the measured "
-        f"poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
+        f"{_length(f, 'open_um')} of the error at new poses comes from parameters that the "
+        f"measured poses do not show ({listed(map(printable, f.numbers['parameters']), 3)})"
     ),
     "new_poses_no_gain": lambda f: (
         f"the error expected at new poses ({_length(f, 'rms_um')}) is "
@@ -130,6 +130,7 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         + f" than that of the nominal arm at measured poses ({_length(f, 'nominal_rms_um')})"
     ),
     "many_faulty_readings": "{faulty} of the {fitted} fitted readings are outliers",
+    "many_left_out": "{left_out} readings are excluded as outliers, and {fitted} are fitted",
     "drift": "base or tracker drift by {sigma_um} during the measurement session",
     "test_data_worse": "the test error ({test_rms_um} rms) is larger than chance explains",
     "test_data_far": (
@@ -152,14 +153,14 @@ def _impossible(f: Finding) -> str:
 
 def _unheard_of(f: Finding) -> str:
     """ "implausible values (link6.dx 32.1 mm, 32 typical sizes): …" """
-    each = (f.numbers[key] for key in ("parameters", "values", "units", "typical_sizes"))
-    shown = []
-    for name, value, unit, sizes in zip(*each, strict=True):
-        number, shown_unit = say.display(value, unit)
-        shown.append(
-            f"{printable(name)} at {say.significant(number)} {shown_unit}, "
-            f"{say.significant(sizes, 2)} typical deviations from nominal"
+    told = map(say.display, f.numbers["values"], f.numbers["units"])
+    shown = [
+        f"{printable(name)} at {say.significant(number)} {unit}, {say.significant(sizes, 2)} "
+        "typical deviations from nominal"
+        for name, (number, unit), sizes in zip(
+            f.numbers["parameters"], told, f.numbers["typical_sizes"], strict=True
         )
+    ]
     return (
         f"implausible values ({listed(shown, 3)}): most likely an effect is missing, or these "
         "poses hardly determine them"
@@ -294,10 +295,10 @@ def prior_line(result: Calibration) -> str | None:
     if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
         return f"No estimate is mostly prior (largest share {percent(largest)})."
-    mostly = found.numbers["parameters"]
-    told = (f"{printable(name)} {percent(shares[name])}" for name in mostly)
+    told = (f"{printable(n)} {percent(shares[n])}" for n in found.numbers["parameters"])
     named = some(told, MOST_NAMED, more=", and {} more")
-    return f"Mostly prior, share of the information: {named}. Measure poses that load them more."
+    beside = " Beside smooth functions typical sizes are a prior." * bool(result.smooth)
+    return f"Mostly prior, share of the information: {named}.{beside}"
 
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes
@@ -327,7 +328,9 @@ def does_noise_explain_it(result: Calibration) -> str:
         stated = available_noise(observed.table, tracker) != "none"
         if observed.kind == "distance":
             stated = tracker.distance_sigma is not None
-        text = "No noise was stated, so the residual cannot be judged"
+        by_repeats = result.finding("lack_of_fit", "repeats_agree") is not None
+        text = "No noise was stated, "
+        text += "repeats judge the residual" if by_repeats else "so the residual cannot be judged"
         if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
             which = "positions" if stated else "rotations"
             text = f"Noise was stated for {which} only, so the residual cannot be judged"
@@ -336,8 +339,7 @@ def does_noise_explain_it(result: Calibration) -> str:
         if result.noise.sigma is not None and method_of(result) == "ols":
             of = "reading" if observed.kind == "distance" else "coordinate"
             return f"{text}; the residual amounts to {say.length(result.noise.sigma)} per {of}."
-        level = "; the noise level was estimated from the readings"
-        return f"{text}{level * estimated}."
+        return f"{text}{'; the noise level was estimated from the readings' * estimated}."
     size = (
         f"{say.significant(f.number('ratio'))} times the stated noise; chance alone gives "
         f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
@@ -385,14 +387,13 @@ def _sizes(noise: Noise) -> list[str]:
             return say.significant(number(s))
         return f"{say.significant(s.sigma * 1e6)} µrad" if s.turns else say.length(s.sigma)
 
-    sizes = noise.sizes or ()
-    shared = [s for s in sizes if s.part]
-    own = sorted((s for s in sizes if s not in shared), key=number)
-    named = [(s.name, s) for s in sizes if s in own]
+    sizes = sorted(noise.sizes or (), key=lambda s: bool(s.part))
+    own = sorted((s for s in sizes if not s.part), key=number)
+    named = [(s.name, s) for s in sizes]
     if len(own) > FEW:
-        named = [(f"median of {len(own)}", own[len(own) // 2])]
-        named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
-    return [f"{printable(n)} {size(s)}" for n, s in [*named, *((s.name, s) for s in shared)]]
+        named[: len(own)] = [(f"median of {len(own)}", own[len(own) // 2])]
+        named[1:1] = [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
+    return [f"{printable(n)} {size(s)}" for n, s in named]
 
 
 def candidate_table(noise: Noise) -> say.ShownTable:

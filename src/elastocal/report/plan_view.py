@@ -150,11 +150,13 @@ def plan_headline(plan: Plan) -> str:
     if plan.of_test_poses:
         error = say.length(_rho(plan) * 1e-6)
         text += f"position error ρ₀ = {error} rms at the test poses after compensation"
+        if (g := plan.gain) is not None and g.model_after > 1.01e-6 * _rho(plan):
+            text += f", {say.length(g.model_after)} with the cell's smooth functions"
     else:
         text += f"{plan.criterion} = {_value(plan, plan.reported)}"
     better = plan.certificate.better_pool
     if better is None or plan.certificate.vain:
-        return f"{text}; no bound on the best plan is known."
+        return f"{text}; no useful bound on the best plan is known."
     text += "; no other plan from these candidates is "
     text += f"more than {100 * better:.1f} % better" if better else "better"
     text += " by the weighted error" if _weighted(plan) else ""
@@ -177,27 +179,26 @@ def _criterion(plan: Plan) -> str:
     return "ρ₀" if plan.of_test_poses else plan.criterion
 
 
-def plan_steps(plan: Plan) -> list[str]:
-    steps = [
+def plan_steps(plan: Plan) -> Iterator[str]:
+    yield (
         "Measure the poses in the given order, which limits the effect of drift, and record the "
         "time of each reading."
-    ]
+    )
     if plan.of_test_poses:
-        steps.append(
+        yield (
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses for a value, "
             f"{option('curve')} compares numbers of poses."
         )
     ends = plan.certificate.starts
     if ends and max(ends) - min(ends) > 0.02 * max(map(abs, ends)):
-        steps.append(f"For a better plan: {option('effort', 'thorough')}, which has more starts.")
-    together = sum(bool(p.combined_with) for p in plan.predicted)
-    if together:
-        steps.append(
+        yield f"For a better plan: {option('effort', 'thorough')}, which has more starts."
+    if together := sum(bool(p.combined_with) for p in plan.predicted):
+        yield (
             f"{say.counted(together, 'parameter')} will be determined only in sums, which more "
             "poses like these do not separate: as expected where they describe the same motion; "
             "other loads separate compliances, three markers the turn of the tool."
         )
-    return [*steps, "Then: elastocal identify with the same cell and the measurements."]
+    yield "Then: elastocal identify with the same cell and the measurements."
 
 
 Told = Iterator[tuple[str, str]]  # label, sentence
@@ -377,19 +378,15 @@ def _execution_lines(plan: Plan) -> Told:
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
-    text += f", {say.counted(via, 'via point')} around obstacles" if via else ""
-    if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
-        checked = "every move checked"
-    elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
-        checked = (
-            "every move checked against the mounting plane (z = 0 of the base; [workspace] "
-            "mounting_plane = false disables it) only, as [workspace] states no bodies"
-        )
-    else:
-        checked = (
-            "no move was checked, as [workspace] states no bodies, and poses may reach below the "
-            "mounting plane"
-        )
+    text += f", {say.counted(via, 'via point')}" if via else ""
+    checked = "every move checked"
+    if not (len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0):
+        if mounting_plane(plan.model.cell, plan.model.chain) is None:
+            checked = "no move was checked, and poses may reach below the mounting plane"
+        else:
+            checked += " against the mounting plane only (z = 0 of the base; [workspace] "
+            checked += "mounting_plane = false disables it)"
+        checked += ", as [workspace] states no bodies"
     yield "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
     if (d := e.drift) is None:
         return
@@ -426,11 +423,9 @@ def next_lines(found: NextPoses) -> Told:
 
     yield "Next", f"{verdicts[found.verdict]}."
     yield "Error now", f"{now}."
-    yield (
-        "Gain",
-        f"{n} lower the expected rms error at the test poses from {both(g.before, g.after)} with "
-        f"what the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
-    )
+    gain, if_right = both(g.before, g.after), both(g.model_before, g.model_after)
+    gain += f" with what the model may lack; from {if_right} if it is right" * (gain != if_right)
+    yield "Gain", f"{n} lower the expected rms error at the test poses from {gain}."
     named = [f"{say.effect_at(f)} ({say.probability(f.probability)})" for f in found.found]
     if named:
         text = f"{', '.join(named)}, added to the model here; write the cell with it"

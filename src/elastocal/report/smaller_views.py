@@ -54,10 +54,13 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
     yield say.Fold("", lambda: [say.KeyFigures(f"moved by {rms} (noise {noise})", figures)])
     steps = [
         "Use the new calibration (elastocal compensate, elastocal export).",
-        "Look for the cause at the joints and links named. A missing effect can look like a change "
-        "if poses or loads differ (elastocal diagnose with the new data).",
-    ]
+        ("Look for the cause at the joints and links named. " if c.changed else
+         "Measure more poses to see which parameter has changed. ")
+        + "A missing effect can look like a change if poses or loads differ (elastocal diagnose "
+        "with the new data).",
+    ]  # fmt: skip
     tone: say.Tone = "warn"
+    mostly = dict.fromkeys((*c.old.by_prior, *c.new.by_prior))
     if c.one_result:
         verdict = (
             f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
@@ -66,7 +69,12 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
         steps = ["Give the results of two sessions: this is one of them and its copy."]
     elif c.verdict == "no_change_shown":
         tone, verdict = "good", "No significant change: the differences are within the noise."
-        steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
+        steps = [
+            "Compare results without smooth functions and without knowledge: beside their priors a "
+            "change of these parameters is hardly seen."
+            if mostly
+            else "Nothing: the old calibration still holds within the noise of both sessions."
+        ]
     elif c.changed:
         names = some((printable(change.name) for change in c.changed), MOST_NAMED)
         verdict = f"The arm has changed: {names}."
@@ -92,7 +100,7 @@ def changes_blocks(c: Comparison) -> Iterator[say.Block]:
             "The sessions determined different parameters; what both show is compared, to first "
             "order."
         )
-    if mostly := dict.fromkeys((*c.old.by_prior, *c.new.by_prior)):
+    if mostly:
         compared.append(
             "A change of what is determined mostly by a prior is hardly seen, and its part of the "
             f"noise is that of the prior: {some(mostly, 8)}."
@@ -309,17 +317,15 @@ MOST_COLUMNS = 14  # of the first rows, on a wide terminal
 ROLES = {"points": "points", "joints": "joint values", "both": "points and joint values"}
 
 
-def left_out(found: Imported) -> list[str]:
-    lines = []
+def left_out(found: Imported) -> Iterator[str]:
     for observed in found.understood:
         if n := len(observed["ignored"]):
             rows = listed((f"line {line} ({reason})" for line, reason in observed["ignored"]), 8)
-            lines.append(f"{observed['file']}: passed over {say.counted(n, 'line')}: {rows}")
+            yield f"{observed['file']}: passed over {say.counted(n, 'line')}: {rows}"
     if (joined := found.joined) is not None:
         for told, names in (("left out, without joint values: %d points", joined.left_out),
                             ("poses without a point: %d", joined.unused)):  # fmt: skip
-            lines += [f"{told % len(names)}: {listed(names, 12)}"] if names else []
-    return lines
+            yield from [f"{told % len(names)}: {listed(names, 12)}"] * bool(names)
 
 
 def import_blocks(found: Imported, width: int) -> Iterator[say.Block]:
