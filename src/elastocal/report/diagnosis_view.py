@@ -133,7 +133,7 @@ def noise_floor_lines(
     common = "deviation common to a configuration"
     for what, size in (("drift", noise.drift), (common, noise.configuration)):
         if size > 0:
-            yield f"The {what} of {say.length(size)} that [noise] of the cell states counts as noise."
+            yield f"The {what} of {say.length(size)} that [noise] states counts as noise."
     if noise.pure_error is None:
         yield "No repeats: residuals alone tell the noise, with one marker hardly that of joints."
     else:

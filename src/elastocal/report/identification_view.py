@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -190,22 +191,23 @@ def _correlation_table(result: Calibration) -> say.ShownTable:
 
 
 def what_was_identified(result: Calibration) -> str:
-    alone, n = names_of(result, findings.ALONE), len(result.combinations)
-    mostly = len({*alone} & {*mostly_prior(result.prior_share)})
-    text = f"{len(alone) - mostly} of {say.counted(len(result.ordinary), 'parameter')}"
+    standing, n = findings.standings(result), len(result.combinations)
+    count = Counter(standing[e.name] for e in result.ordinary)
+    mostly = [standing.get(p) for p in mostly_prior(result.prior_share)].count(findings.ALONE)
+    alone = count[findings.ALONE] - mostly
+    text = f"{alone} of {say.counted(len(result.ordinary), 'parameter')}"
     text += f", {mostly} more mostly by a prior" * bool(mostly)
     if n:
-        absorbed = len(names_of(result, findings.ABSORBED))
         text += (
             f", and {say.counted(n, 'combination')} of parameters that these readings cannot "
-            f"separate ({absorbed} held in exchange)"
+            f"separate ({count[findings.ABSORBED]} held in exchange)"
         )
     told = {
         **NO_VALUE, findings.INVISIBLE: "not visible in these data",
         findings.UNREAD: "of markers without a reading", findings.FIXED: "fixed by the user",
     }  # fmt: skip
-    for standing, why in told.items():
-        if found := len(names_of(result, standing)):
+    for kind, why in told.items():
+        if found := count[kind]:
             text += f"; {found} {why}"
     if (far := result.finding("unheard_of")) is not None:
         text += f"; {len(far.numbers['parameters'])} with implausible values"
@@ -336,11 +338,6 @@ def _influence_table(result: Calibration) -> say.ShownTable:
     return say.ShownTable(heads, rows, (0, 4), note=note)
 
 
-def names_of(result: Calibration, standing: str) -> list[str]:
-    found = findings.standings(result)
-    return [printable(e.name) for e in result.ordinary if found[e.name] == standing]
-
-
 def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     """The first member and the largest other terms by factor, "+ n more" for the rest."""
     (first, _), *rest = combination.terms.items()
@@ -365,7 +362,6 @@ HELD = {
 }
 WITHOUT = {
     findings.UNREAD: "held: no reading of this marker",
-    findings.INVISIBLE: "held: not visible in these data",
     findings.FIXED: "fixed by the user",
 }
 
@@ -445,6 +441,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> Iterator
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:
     heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
     rows, standing = list[tuple[str, ...]](), findings.standings(result)
+    redundant = result.left.redundant if result.left else ()
     known = {p.name: p for p in result.model.parameters}
     for e in result.ordinary:
         if e.identifiable:
@@ -456,6 +453,8 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.S
             why = f"held: absorbed in {some(map(printable, e.combined_with), 3, more=' + {} more')}"
         elif kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}: {limits(result, e)}"
+        elif kind == findings.INVISIBLE:
+            why = f"held{HELD[REDUNDANT if e.name in redundant else kind]}"
         else:
             why = WITHOUT.get(kind, why)
         nominal = nominal_text(e, known[e.name])
