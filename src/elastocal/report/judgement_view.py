@@ -88,7 +88,8 @@ DOUBTS: dict[str, str | Callable[[Finding], str]] = {
         "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
     ),
-    "autocorrelated": "residuals of successive visits are correlated, as under a drift",
+    "autocorrelated": "residuals of successive visits are correlated, as under a drift or where "
+    "successive poses are alike",
     "exchanged_markers": lambda f: (
         f"the names of markers {listed(f.numbers['markers'])} are exchanged"
     ),
