@@ -23,7 +23,12 @@ from elastocal.engine import (
 )
 from elastocal.identification.solve import PLACING, is_placed, posed, tied_fit, with_placed
 from elastocal.identification.start import start_values
-from elastocal.identification.weighted_problem import TOLERANCE, stated_by_observation, weights_for
+from elastocal.identification.weighted_problem import (
+    TOLERANCE,
+    Problem,
+    stated_by_observation,
+    weights_for,
+)
 from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.evaluate import thread_count
@@ -115,6 +120,7 @@ class Baseline:
     `x` (parameters,) is the fit, `sizes` typical deviations, `nominal` (rows,) the residual of
     the nominal arm with only base and markers placed, NaN where the fit began elsewhere.
     `stated` (N, size, size) is the noise that cell or table state, None where they state none.
+    `problem` is what was solved.
     The last `planned` of the N observations are candidates not yet measured: their residual is
     zero and says nothing about what may be at work."""
 
@@ -126,6 +132,7 @@ class Baseline:
     nominal: Array
     stated: Array | None
     planned: int = 0
+    problem: Problem | None = None
 
     @property
     def covariance(self) -> Array:
@@ -162,7 +169,9 @@ def fit_baseline(
         problem, nominal = with_placed(problem, PLACING)
     found = tied_fit(problem, TOLERANCE)
     stated = stated_by_observation(observed, model.cell.tracker)
-    return Baseline(model, observed, found.x, problem.sizes, found.residual, nominal, stated)
+    return Baseline(
+        model, observed, found.x, problem.sizes, found.residual, nominal, stated, problem=problem
+    )
 
 
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough

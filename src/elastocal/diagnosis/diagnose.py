@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from elastocal.cell import Cell, read_cell
 from elastocal.config import read_toml
-from elastocal.diagnosis.baseline import NoiseValues, fit_baseline, thinned
+from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import (
     CLEARLY,
@@ -53,7 +53,10 @@ from elastocal.diagnosis.verdict import (
     warnings,
 )
 from elastocal.files import atomic_writer, is_plugin_file
+from elastocal.identification.faulty_readings import FaultyGroup
+from elastocal.identification.identify import misread_for_a_while
 from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.outliers import FEW, find_faulty
 from elastocal.identification.scrutiny import BudgetStep
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
@@ -222,6 +225,11 @@ def _diagnosed(
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
+    if blocks := _misread(base, table, options.seed):
+        gone = np.isin(table.row, np.concatenate([g.lines for g in blocks]))
+        told = (*told, MISREAD.format(listed(map(str, blocks), 4), int(gone.sum()), len(gone)))
+        table = table.take(~gone)
+        base = fit_baseline(model, table, options.seed)
     refuse_nonsense(model, base.observed, base.x, base.residual, table)
     if disordered := order_contradicted(table):
         told = (*told, disordered + OUT_OF_ORDER)
@@ -268,6 +276,20 @@ def _diagnosed(
         data=source,
         calibrated=base,
     )
+
+
+# What stands for a while and goes again has no effect of the catalogue; what stays has.
+MISREAD = (
+    "one common shift explains {0}: {1} of {2} readings were left out, as by identify; look for "
+    "what moved there, a marker or the instrument"
+)
+
+
+def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup]:
+    """A few faulty readings are accidents, and screened; of more `identify` is asked."""
+    assert base.problem is not None
+    many = find_faulty(base.problem, base.x).mean() > FEW
+    return misread_for_a_while(base.model, table, seed) if many else []
 
 
 def _sum_of_all(

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
 from scipy import sparse
 
-from elastocal.identification.faulty_readings import report_faulty
+from elastocal.identification.faulty_readings import FaultyGroup, report_faulty
 from elastocal.identification.findings import KNOWN_NOISE, judged, warning_sentences
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
@@ -179,7 +179,7 @@ def _course(
     every = refit(np.ones(len(observed.lead), dtype=bool))
     progress("looking for outliers")
     none = np.zeros(len(observed.lead), dtype=bool)
-    faulty, sound = none if every.exact else find_faulty(every), every
+    faulty, sound = none if every.exact else find_faulty(every.problem, every.fit.x), every
     if faulty.any():
         try:
             sound = refit(~faulty)
@@ -189,7 +189,8 @@ def _course(
         model, sound.problem.observations, sound.fit.x, sound.fit.residual, table,
         subset(observed, faulty) if faulty.any() and sound is not every else None,
     )  # fmt: skip
-    return Course(every, sound, faulty, free, refit, options, progress)
+    explained = cache(partial(_explained, every, sound, None, ~faulty))
+    return Course(every, sound, faulty, free, refit, explained, options, progress)
 
 
 def _of_readings(covariance: Array | None, good: BoolArray, size: int) -> Array | None:
@@ -220,6 +221,17 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
         errors, std=float(np.sqrt(np.mean(here**2))), most_fitted=result.shown.most, far=far,
         configurations=len(here), p_far=result.shown.chance(far, len(here)),
     )  # fmt: skip
+
+
+def misread_for_a_while(model: Model, table: Measurements, seed: int) -> list[FaultyGroup]:
+    """Blocks of lines that `identify` sets apart, one common shift explaining each, before and
+    after which readings are sound: no jump of arm or instrument, after which all are shifted."""
+    found = identify(model, table, Options(seed=seed))
+    if found.faulty_report is None or not found.excluded:
+        return []
+    sound = np.setdiff1d(table.row, [o.line for o in found.excluded])
+    blocks = (g for g in found.faulty_report.shifted if g.level == "block")
+    return [g for g in blocks if sound[0] < min(g.lines) and max(g.lines) < sound[-1]]
 
 
 CORRELATED = 0.9
@@ -541,8 +553,7 @@ def _by_method(course: Course) -> MethodResult:
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
-    explained = partial(_explained, every, sound, None, ~faulty)
-    drop = drops(options, every.problem.observations, faulty, explained)
+    drop = drops(options, every.problem.observations, faulty, course.explained)
     drop = drop and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):

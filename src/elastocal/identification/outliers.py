@@ -277,16 +277,17 @@ STEPS = 4  # to a set's values, from those of the set before
 SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at the end
 
 
-def find_faulty(solution: Solution) -> BoolArray:
+def find_faulty(problem: Problem, found: Array) -> BoolArray:
     """Which observations (N,) are faulty, by all free parameters, tied weakly to the start, and
     noise of one variance; at a Bonferroni limit for the whole table, of which, where it is large, a
-    sample is judged so, and its fit judges the others."""
-    problem, n = solution.problem, len(solution.problem.observations.lead)
+    sample is judged so, and its fit judges the others.  B is of the values `found` (parameters,)
+    where base and markers are known."""
+    n = len(problem.observations.lead)
     part = problem.sample(SAMPLE) if problem.large else problem.part(np.arange(n))
     width = prior_widths(problem)[problem.free]
     x0, free = problem.x0, problem.free
     placed = is_placed(problem.model)[free]
-    x = (x0 if placed.any() else solution.fit.x).copy()
+    x = (x0 if placed.any() else found).copy()
     B, y = _whitened(part, x)
     B, y = B * width, y + B @ (x - x0)[free]
     starts = [majority(B[:, :, placed], y)]

@@ -24,7 +24,7 @@ from elastocal.identification.knowledge import share_of_prior
 from elastocal.identification.least_squares import ALONE, Covariance, held_out_by_parts, rms_3d
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.outliers import FALSE_ALARM, drops, settle
+from elastocal.identification.outliers import FALSE_ALARM, FEW, drops, settle
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Course,
@@ -293,6 +293,12 @@ def fit_smooth(course: Course) -> MethodResult:
 class _Search:
     def __init__(self, course: Course) -> None:
         self.every, self.options, self.progress = course.every, course.options, course.progress
+        self.explained, faulty = course.explained, course.faulty
+        # Functions could follow a shifted block as well, which is no reason to take it back.
+        many = faulty.mean() > FEW and drops(
+            self.options, self.every.problem.observations, faulty, self.explained
+        )
+        self.shifted = self.explained() if many else np.zeros_like(faulty)
         every, sound = course.every, course.sound
         self.model, self.observed = every.problem.model, every.problem.observations
         self.functions, self.harmful = Functions(self.model, course.free), list[str]()
@@ -370,7 +376,7 @@ class _Search:
         noise: NoiseFit | None = None
         x, reduction, scales, level = self.sound.fit.x, self.sound.reduction, None, np.inf
         for k in range(ROUNDS):
-            fitted = good | (not drops(self.options, self.observed, ~good))
+            fitted = good | (not drops(self.options, self.observed, ~good, self.explained))
             part = self.chosen(noise, fitted)
             problem = replace(
                 self.sound.problem, observations=part.observations, weights=part.weights
@@ -383,7 +389,7 @@ class _Search:
                 self.standard[~fitted] = fit.standardised(self.chosen(noise, ~fitted))
             before, kind = good, None if noise is None else noise.kind
             noise, good = self.judged(noise, good, k)
-            good = self.corroborated(fit, noise, fitted, good)
+            good = self.corroborated(fit, noise, fitted, good) & ~self.shifted
             same = noise is None or noise.kind == kind
             if still and same and np.array_equal(before, good):
                 break

@@ -708,14 +708,16 @@ class MethodResult:
 
 @dataclass(frozen=True)
 class Course:
-    """What a method starts from: fits to all observations, and to those that are not `faulty` (N,);
-    `refit` makes another such, of those it is given.  They know nothing of smooth functions among
-    the parameters `free`."""
+    """What a method starts from: fits to all observations, and to those that are not `faulty` (N,),
+    of which one common shift for each block or marker has `explained` some; `refit` makes another
+    such, of those it is given.  They know nothing of smooth functions among the parameters
+    `free`."""
 
     every: Solution
     sound: Solution
     faulty: BoolArray
     free: IntArray
     refit: Callable[[BoolArray], Solution]
+    explained: Callable[[], BoolArray]
     options: Options
     progress: Progress
