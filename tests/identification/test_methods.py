@@ -17,6 +17,7 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell_tables import CartesianNoise, Tracker
+from elastocal.diagnosis.diagnose import diagnose
 from elastocal.identification import published
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import lack_of_fit
@@ -207,3 +208,14 @@ def test_a_third_of_the_table_that_one_shift_explains_is_set_apart_and_named():
         assert {o.line for o in told} == set(table.row[rows]) and len(result.faulty) == len(told)
         lines = {line for f in result.faulty_report.findings for line in f.lines}
         assert lines == {int(r) for r in table.row[rows]}
+
+
+def test_diagnose_leaves_out_as_identify_does_what_was_shifted_for_a_while_but_no_jump():
+    model, table, _ = campaign(3, poses=24)
+    for rows, out in ((slice(8, 14), True), (slice(16, 24), False)):
+        rows = np.flatnonzero(np.isin(table.configuration, np.arange(24)[rows]))
+        wrong = shifted(table, rows, [0.0, 0.0, 4e-3])
+        found = diagnose(model, wrong)
+        assert found.n_readings == len(table) - out * len(rows)
+        assert any("one common shift" in text for text in found.warnings) == out
+        assert {o.line for o in identify(model, wrong).excluded} == set(table.row[rows])

@@ -56,8 +56,8 @@ from elastocal.files import atomic_writer, is_plugin_file
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.identify import misread_for_a_while
 from elastocal.identification.mistakes import refuse_nonsense
-from elastocal.identification.outliers import FEW, find_faulty
-from elastocal.identification.scrutiny import BudgetStep
+from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty
+from elastocal.identification.scrutiny import BudgetStep, autocorrelation
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
 from elastocal.messages import (
@@ -286,8 +286,11 @@ MISREAD = (
 
 
 def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup]:
-    """A few faulty readings are accidents, and screened; of more `identify` is asked."""
-    assert base.problem is not None
+    """A block that one shift explains leaves residuals that follow each other alike.  A few faulty
+    readings are accidents, and screened; of more `identify` is asked."""
+    alike = autocorrelation(base.residual, base.observed)
+    if alike is None or alike.p >= FALSE_ALARM or base.problem is None:
+        return []
     many = find_faulty(base.problem, base.x).mean() > FEW
     return misread_for_a_while(base.model, table, seed) if many else []
 
