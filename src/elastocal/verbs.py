@@ -467,6 +467,7 @@ def identify(
     from elastocal.identification.identify import identify as run
     from elastocal.identification.start import Options
     from elastocal.measurements import read_matrix
+    from elastocal.planning.poses import used_poses
 
     if isinstance(covariance, str | Path):
         covariance = read_matrix(covariance, "noise covariance")
@@ -496,12 +497,7 @@ def identify(
         )
         prior = prior or known_prior
     options = replace(options, constraints=constraints, prior=prior)
-    used = None
-    if made.cell.design.states_test_poses:
-        from elastocal.planning.poses import test_poses
-
-        used = test_poses(made.cell, made.chain)
-    return run(made, table, options, kept_back, tell, used)
+    return run(made, table, options, kept_back, tell, used_poses(made.cell, made.chain))
 
 
 @checked_arguments

@@ -26,7 +26,7 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.messages import InputError, listed, require, said_of
+from elastocal.messages import InputError, counted, listed, require, said_of
 from elastocal.screen import interrupts, say
 
 if TYPE_CHECKING:
@@ -264,13 +264,15 @@ def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan)
         carried += f" --repeats {readings}"
     added = "" if augment is None else f" (add them to {augment})"
     read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
-    return (
+    text = (
         f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
         "then\n"
-        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
-        f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
-        f"{carried}"
+        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html"
     )
+    if augment is None:  # an arm that was measured is not the one that --draw takes
+        text += f"\nTo try it without an arm: elastocal simulate {cell} {output} -o data.csv"
+        text += f" --draw 1{carried}"
+    return text
 
 
 def _check_names(programs: list[Path], picture: Path | None) -> None:
@@ -339,8 +341,9 @@ def simulate(
         )
     named = dict(zip(model.names, x.tolist(), strict=True))
     run.write((output, table.save), (truth, lambda path: write_json(path, named)))
-    summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
-    told = f"wrote {len(table)} readings of {len(poses)} poses to {output}"
+    n = len(poses.configuration_labels)
+    summary = {"output": str(output), "readings": len(table), "poses": n}
+    told = f"wrote {len(table)} readings of {counted(n, 'pose')} to {output}"
     run.answer(
         lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
     )

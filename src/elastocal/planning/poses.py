@@ -469,6 +469,11 @@ def test_poses(
     )
 
 
+def used_poses(cell: Cell, chain: Chain) -> TargetPoses | None:
+    """Where the cell says that the arm will be used: its test poses; None where it states none."""
+    return test_poses(cell, chain) if cell.design.states_test_poses else None
+
+
 def everywhere(
     cell: Cell, chain: Chain, feasibility: Feasibility | None = None, seed: int = 0
 ) -> TargetPoses | None:

@@ -373,7 +373,8 @@ def _execution_lines(plan: Plan) -> Told:
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
         are = f"{say.counted(parts, 'pose')} {'is' if parts == 1 else 'are'}"
-        text += f"; {are} measured unloaded at start and end (half the readings each)"
+        up = ", rounded up" * (plan.model.cell.design.repeats % 2)
+        text += f"; {are} measured unloaded at start and end (half the readings each{up})"
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
