@@ -226,7 +226,7 @@ def design(
         of = cell if plan.chosen is None else cell_out or "chosen.toml"
         if plan.chosen is not None and cell_out is None:
             say("Run it again with --cell-out chosen.toml for the cell that the plan is of.")
-        say(_what_next(of, output, asked.get("augment"), plan))
+        say(_what_next(of, output, asked.get("augment"), plan, " --plugins" * run.plugins))
 
 
 def _resumed(
@@ -251,7 +251,10 @@ def _resumed(
         raise
 
 
-def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan) -> str:
+def _what_next(
+    cell: Path | str, output: Path, augment: Path | None, plan: Plan, allowed: str
+) -> str:  # fmt: skip
+    """`allowed` is what lets the cell's Python code run."""
     from elastocal.planning.plan import load_name
 
     loads = plan.forces[(plan.forces != 0).any(axis=1)]
@@ -267,11 +270,11 @@ def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan)
     text = (
         f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
         "then\n"
-        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html"
+        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html{allowed}"
     )
     if augment is None:  # an arm that was measured is not the one that --draw takes
         text += f"\nTo try it without an arm: elastocal simulate {cell} {output} -o data.csv"
-        text += f" --draw 1{carried}"
+        text += f" --draw 1{carried}{allowed}"
     return text
 
 

@@ -89,8 +89,8 @@ def _key(plan: Plan) -> say.KeyFigures:
     return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
 
 
-def _value(plan: Plan, value: float, digits: int = 4) -> str:
-    return f"{rounded(value, digits)} {plan.unit}".rstrip()
+def _value(plan: Plan, value: float) -> str:
+    return f"{rounded(value, 4)} {plan.unit}".rstrip()
 
 
 TOLD = 2  # parameters that a pose serves, in the table
@@ -206,7 +206,7 @@ Told = Iterator[tuple[str, str]]  # label, sentence
 def plan_lines(plan: Plan) -> Told:
     yield from _chosen_lines(plan)
     if not plan.of_test_poses:
-        yield "Criterion", f"{plan.criterion} = {_value(plan, plan.reported, 6)}."
+        yield "Criterion", f"{plan.criterion} = {_value(plan, plan.reported)}."
     else:
         yield (
             "Criterion",
@@ -378,7 +378,7 @@ def _execution_lines(plan: Plan) -> Told:
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
-    text += f", {say.counted(via, 'via point')} around obstacles" if via else ""
+    text += f", {say.counted(via, 'via point')}" if via else ""
     if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
         checked = "every move checked"
     elif mounting_plane(plan.model.cell, plan.model.chain) is not None:

@@ -190,7 +190,7 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
         rows = {"without the table": table["error_without_um"]}
         rows["with it, interpolated"] = table["error_with_um"]
         yield _spreads(
-            f"Position of the tool at {table['checked_between']} points between the grid's", rows
+            f"Position of the tool at {table['checked_between']} points between grid points", rows
         )
         yield say.Sentence(
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
@@ -281,7 +281,8 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         nominal = say.length(refit.nominal)
         yield say.Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
         if refit.taken or refit.correction is not None:
-            yield say.Sentence(f"The file is fitted {done.base_told}: place it there.")
+            there = ", which the file has" if done.framed else ": place it there"
+            yield say.Sentence(f"The file is fitted {done.base_told}{there}.")
     if done.checked is not None:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
