@@ -586,20 +586,18 @@ SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
 DIGITS = 9
 
-REMEDIES = {
-    "limit": "joint limits prevent it: widen [limits], move the target, or start from another "
-    "posture ({near})",
-    "not reached": "out of reach, or beside a singular posture: move the target, or start from "
-    "another posture ({near})",
-    "no equilibrium": "no static equilibrium under this load: check force_*_N",
-}
 NAMED = 8  # rows that a message names
 
 
 def check_reached(result: Compensation) -> None:
     table = result.targets.table
-    rows, near = [f"line {line}" for line in table.row], option("near")
-    remedies = {status: told.format(near=near) for status, told in REMEDIES.items()}
+    rows, other = [f"line {line}" for line in table.row], f"another posture ({option('near')})"
+    remedies = {
+        "limit": f"joint limits prevent it: widen [limits], move the target, or start from {other}",
+        "not reached": "out of reach, or beside a singular posture: move the target, or start from "
+        f"{other}",
+        "no equilibrium": "no static equilibrium under this load: check force_*_N",
+    }
     check_status(f"{table.source}: %d of %d targets", rows, result.status, REACHED, remedies)
 
 

@@ -275,8 +275,8 @@ def execute(sources: Sources, task: Row) -> Row:
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
         rows = _checked_rows(found, sources.stated.columns, task["values"])
     except (Exception, SystemExit) as caught:
-        told = " ".join(f"{type(caught).__name__}: {caught}".split())
-        error, trace = told, traceback.format_exc()
+        error = " ".join([f"{type(caught).__name__}:", *str(caught).split()])
+        trace = traceback.format_exc()
     return line_of(task, rows, time.perf_counter() - begun, error, trace)
 
 
@@ -549,9 +549,8 @@ def connect(address: str, **way: Any) -> Any:
     try:
         return distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        told = f"no scheduler answers ({error}); check the address, or start one here"
-        here = "dask scheduler --host 127.0.0.1"
-        raise InputError(f"{option('cluster', where)}: {told}: {here}") from None
+        told = f"no scheduler answers ({error}); check the address, or start one here: dask"
+        raise InputError(f"{option('cluster', where)}: {told} scheduler --host 127.0.0.1") from None
 
 
 @dataclass(frozen=True)

@@ -226,7 +226,8 @@ def design(
         of = cell if plan.chosen is None else cell_out or "chosen.toml"
         if plan.chosen is not None and cell_out is None:
             say("Run it again with --cell-out chosen.toml for the cell that the plan is of.")
-        say(_what_next(of, output, asked.get("augment"), plan, " --plugins" * run.plugins))
+        named = f"{of}{' --plugins' * run.plugins}"
+        say(_what_next(named, output, asked.get("augment"), plan))
 
 
 def _resumed(
@@ -251,10 +252,7 @@ def _resumed(
         raise
 
 
-def _what_next(
-    cell: Path | str, output: Path, augment: Path | None, plan: Plan, allowed: str
-) -> str:  # fmt: skip
-    """`allowed` is what lets the cell's Python code run."""
+def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str:
     from elastocal.planning.plan import load_name
 
     loads = plan.forces[(plan.forces != 0).any(axis=1)]
@@ -270,11 +268,11 @@ def _what_next(
     text = (
         f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
         "then\n"
-        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html{allowed}"
+        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html"
     )
     if augment is None:  # an arm that was measured is not the one that --draw takes
         text += f"\nTo try it without an arm: elastocal simulate {cell} {output} -o data.csv"
-        text += f" --draw 1{carried}{allowed}"
+        text += f" --draw 1{carried}"
     return text
 
 
@@ -345,11 +343,9 @@ def simulate(
     named = dict(zip(model.names, x.tolist(), strict=True))
     run.write((output, table.save), (truth, lambda path: write_json(path, named)))
     n = len(poses.configuration_labels)
-    summary = {"output": str(output), "readings": len(table), "poses": n}
+    answer = {"output": str(output), "readings": len(table), "poses": n, "seed": asked["seed"]}
     told = f"wrote {len(table)} readings of {counted(n, 'pose')} to {output}"
-    run.answer(
-        lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
-    )
+    run.answer(lambda: answer | {"truth": named}, lambda _: say(told), files=False)
 
 
 @command(

@@ -32,7 +32,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
-from elastocal.planning.poses import TargetPoses, shares_of, used_poses
+from elastocal.planning.poses import shares_of, used_poses
 from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.
@@ -169,9 +169,8 @@ def next_poses(
         model = with_effects_of(model, why)
     tell("identifying")
     with suppress(InsufficientDataError):  # then these are not enough
-        used = used_poses(model.cell, model.chain)
-        fit = identify(model, table, new_poses=used)
-        sure, lacking = _error_now(fit, used, 1.0 if why is None else why.probability_unknown)
+        fit = identify(model, table, new_poses=used_poses(model.cell, model.chain))
+        sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
     cell = replace(model.cell, design=asked.design)
     cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
     options = DesignOptions("batch", seed, jobs, done=table, notes=notes, hold=True)
@@ -199,7 +198,7 @@ def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell
     ))  # fmt: skip
 
 
-def _error_now(fit: Calibration, used: TargetPoses | None, unknown: float) -> tuple[float, float]:
+def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
     """The error at new poses that is kept with 95 %, and what the model lacks of it, in m; 0 and
     that of distances, of which no position follows: the plan's own figures say it.  That
     configurations scatter beyond their noise is lack of fit with the probability that something
@@ -208,7 +207,8 @@ def _error_now(fit: Calibration, used: TargetPoses | None, unknown: float) -> tu
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
     if observed.kind == "distance":
         return 0.0, math.sqrt(3 * excess.squared.mean()) if excess else 0.0
-    poses = used or over_the_workspace(model.cell, model, observed.table)
+    cell, table = model.cell, observed.table
+    poses = used_poses(cell, model.chain) or over_the_workspace(cell, model, table)
     error = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
     return (math.inf, 0.0) if error is None else (error.sure, error.lacking or 0.0)
 

@@ -205,14 +205,11 @@ Told = Iterator[tuple[str, str]]  # label, sentence
 
 def plan_lines(plan: Plan) -> Told:
     yield from _chosen_lines(plan)
-    if not plan.of_test_poses:
-        yield "Criterion", f"{plan.criterion} = {_value(plan, plan.reported)}."
-    else:
-        yield (
-            "Criterion",
-            f"ρ₀ = {rounded(_rho(plan), 4)} µm rms position error at the test poses after "
-            f"compensation ({printable(plan.targets)}).",
-        )
+    text = f"{plan.criterion} = {_value(plan, plan.reported)}"
+    if plan.of_test_poses:
+        text = f"ρ₀ = {rounded(_rho(plan), 4)} µm rms position error at the test poses after "
+        text += f"compensation ({printable(plan.targets)})"
+    yield "Criterion", f"{text}."
     if plan.made_for:
         yield "Made for", f"{printable(plan.made_for)}."
     yield from _everywhere_lines(plan)
