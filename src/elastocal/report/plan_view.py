@@ -284,28 +284,21 @@ def _everywhere_lines(plan: Plan) -> Told:
         return
 
     def shown(error: float | None) -> str:
-        return "none" if error is None else rounded(error * 1e6, 4)
+        return "none" if error is None else f"{rounded(error * 1e6, 4)} µm"
 
     own = "" if plan.of_test_poses else f"; at the test poses {shown(e.test_poses)}"
-    text = (
-        f"{shown(e.elsewhere)} µm rms over the joint ranges{own}; a random plan gives "
-        f"{shown(e.random_elsewhere)} there and {shown(e.random_test_poses)} at the test poses"
-    )
+    text = f"{shown(e.elsewhere)} rms over the joint ranges{own}; a random plan gives "
+    text += f"{shown(e.random_elsewhere)} there and {shown(e.random_test_poses)} at the test poses"
     if drift := plan.model.cell.noise.drift:
-        text += (
-            f"; with the drift of {say.length(drift)} that [noise] states "
-            f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
-        )
+        text += f"; with the drift of {say.length(drift)} that [noise] states "
+        text += f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)}"
     if e.share:
-        text += (
-            f"; minimised is the weighted error, {rounded(plan.reported, 4)} µm, in which the "
-            f"joint ranges count {100 * e.share:.0f} %"
-        )
+        text += f"; minimised is the weighted error, {rounded(plan.reported, 4)} µm, in which the "
+        text += f"joint ranges count {100 * e.share:.0f} %"
         text += f", with ρ₀ at most {100 * e.cap:g} % above its minimum" if e.cap else ""
     elif plan.of_test_poses:
-        text += (
-            f"; {option('elsewhere_cap', 0.05)} minimises it, allowing 5 % more at the test poses"
-        )
+        cap = option("elsewhere_cap", 0.05)
+        text += f"; {cap} minimises it, allowing 5 % more at the test poses"
     yield "Elsewhere", f"{text}."
 
 

@@ -270,17 +270,16 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         told = f"the markers are {say.length(refit.after)} rms off"
         if refit.correction is not None:
             told += f", with its joint correction {say.length(refit.correction)}"
-        if refit.taken or refit.correction is not None:
-            told = (
-                f"Refitted to the calibrated arm at {refit.visits} measured visits: {told}, with "
-                f"the values identified {say.length(refit.before)}"
-            )
-        else:
-            told = f"Values as identified; no refit is better: {told}"
+        fitted = refit.taken or refit.correction is not None
+        how = "Values as identified; no refit is better"
+        if fitted:
+            how = f"Refitted to the calibrated arm at {refit.visits} measured visits"
+            told += f", with the values identified {say.length(refit.before)}"
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
         nominal = say.length(refit.nominal)
-        yield say.Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
-        if refit.taken or refit.correction is not None:
+        told += f", the nominal file with base and tool placed {nominal}{worse}"
+        yield say.Sentence(f"{how}: {told}.")
+        if fitted:
             there = ", which the file has" if done.framed else ": place it there"
             yield say.Sentence(f"The file is fitted {done.base_told}{there}.")
     if done.checked is not None:
