@@ -594,8 +594,7 @@ def check_reached(result: Compensation) -> None:
     rows, other = [f"line {line}" for line in table.row], f"another posture ({option('near')})"
     remedies = {
         "limit": f"joint limits prevent it: widen [limits], move the target, or start from {other}",
-        "not reached": "out of reach, or beside a singular posture: move the target, or start from "
-        f"{other}",
+        "not reached": f"out of reach, or near a singular posture: move it, or start from {other}",
         "no equilibrium": "no static equilibrium under this load: check force_*_N",
     }
     check_status(f"{table.source}: %d of %d targets", rows, result.status, REACHED, remedies)
