@@ -325,7 +325,7 @@ def simulate(
         plan: The poses: a `Plan`, its file, a table, or joints (n, joints) in rad or m.
         values: True parameter values in SI units, by name (the others are nominal) or all of them
             (parameters,).
-        draw: Draw true values: typical sizes times this, at random; `values` win over them.
+        draw: Draw true values: typical sizes times this, at random; `values` comes first.
         load: Measure every pose without and with this force (3,) in N at the load point.
         repeats: Readings per pose and load state.
         noise: Whether the readings have the noise that plan or cell state; else they are exact.
