@@ -30,7 +30,7 @@ LAYERS = (
 # A file holds one idea whole: above the ceiling it holds several, and more files hold parts of one.
 MOST_LINES, MOST_FILES = 800, 110
 
-ELSEWHERE = ("--install", "--version")  # flags of other programs
+ELSEWHERE = ("--host", "--install", "--version")  # flags of other programs
 
 # In two halves, so that this file does not mention them either.
 NEVER_MENTIONED = ("/wo" + "rk/", "py" + "pi", "files.python" + "hosted", "index" + "-url",

@@ -587,20 +587,18 @@ SCHEMA = "elastocal/compensation/1"
 # Of degrees and mm: 9e-12 rad and 5e-13 m.
 DIGITS = 9
 
-REMEDIES = {
-    "limit": "joint limits prevent it: widen [limits], move the target, or give q1_deg … of "
-    "another posture",
-    "not reached": "out of reach, or beside a singular posture: move the target, or give q1_deg … "
-    "of another posture",
-    "no equilibrium": "no static equilibrium under this load: check force_*_N",
-}
 NAMED = 8  # rows that a message names
 
 
 def check_reached(result: Compensation) -> None:
     table = result.targets.table
-    rows = [f"line {line}" for line in table.row]
-    check_status(f"{table.source}: %d of %d targets", rows, result.status, REACHED, REMEDIES)
+    rows, other = [f"line {line}" for line in table.row], f"another posture ({option('near')})"
+    remedies = {
+        "limit": f"joint limits prevent it: widen [limits], move the target, or start from {other}",
+        "not reached": f"out of reach, or near a singular posture: move it, or start from {other}",
+        "no equilibrium": "no static equilibrium under this load: check force_*_N",
+    }
+    check_status(f"{table.source}: %d of %d targets", rows, result.status, REACHED, remedies)
 
 
 def check_status(
@@ -614,9 +612,10 @@ def check_status(
     same = len(kinds) == 1
     named = some((row if same else f"{row} ({s})" for row, s in lost), NAMED)
     why = "; ".join(remedies[k] if same else f"{k}: {remedies[k]}" for k in kinds)
+    others = f"; {option('partial', True)} writes the others" * (len(lost) < len(status))
     raise messages.InsufficientDataError(
         f"{what % (len(lost), len(status))} are not reached: {named}{': ' if same else '. '}{why}. "
-        f"Nothing was written; {option('partial', True)} writes the others"
+        f"Nothing was written{others}"
     )
 
 
@@ -655,7 +654,7 @@ def table_csv(
     rows = []
     for i, told in enumerate(status):
         both = [(value, form) for _, values, form in blocks for value in values[i]]
-        cells = (format(v + 0.0, form) if np.isfinite(v) else "" for v, form in both)
+        cells = (format(v, f"z{form}") if np.isfinite(v) else "" for v, form in both)
         rows.append([*(text[i] for text in texts.values()), *cells, told])
     return csv_text(header, rows)
 

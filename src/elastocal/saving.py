@@ -415,7 +415,7 @@ def robot_program(
     language = LANGUAGES[suffix.lower()]
     check_six_axes(chain, language.title)
     steps = driven(steps_of(execution, configurations, forces), *limits)
-    told = f"elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}"
+    told = f"elastocal: {len(execution.stops)} stops of robot {plain(chain.name)}"
     ranges = [f"{rounded(low, 4)} to {rounded(high, 4)}" for low, high in np.degrees(limits).T]
     inside = ", ".join(f"J{i} {told}" for i, told in enumerate(ranges, 1))
     of_all = {"name": program_name(name), "told": told, "limits": inside}

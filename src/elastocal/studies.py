@@ -275,7 +275,8 @@ def execute(sources: Sources, task: Row) -> Row:
         found = load(sources).run(deepcopy(task["values"]), np.random.default_rng(draws))
         rows = _checked_rows(found, sources.stated.columns, task["values"])
     except (Exception, SystemExit) as caught:
-        error, trace = f"{type(caught).__name__}: {caught}", traceback.format_exc()
+        error = " ".join([f"{type(caught).__name__}:", *str(caught).split()])
+        trace = traceback.format_exc()
     return line_of(task, rows, time.perf_counter() - begun, error, trace)
 
 
@@ -548,8 +549,8 @@ def connect(address: str, **way: Any) -> Any:
     try:
         return distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
-        told = f"no scheduler answers ({error}); check the address, or start one for this host"
-        raise InputError(f"{option('cluster', where)}: {told} alone: dask scheduler") from None
+        told = f"no scheduler answers ({error}); check the address, or start one here: dask"
+        raise InputError(f"{option('cluster', where)}: {told} scheduler --host 127.0.0.1") from None
 
 
 @dataclass(frozen=True)

@@ -325,7 +325,7 @@ def simulate(
         plan: The poses: a `Plan`, its file, a table, or joints (n, joints) in rad or m.
         values: True parameter values in SI units, by name (the others are nominal) or all of them
             (parameters,).
-        draw: Draw true values: typical sizes times this, at random; `values` win over them.
+        draw: Draw true values: typical sizes times this, at random; `values` comes first.
         load: Measure every pose without and with this force (3,) in N at the load point.
         repeats: Readings per pose and load state.
         noise: Whether the readings have the noise that plan or cell state; else they are exact.
@@ -467,6 +467,7 @@ def identify(
     from elastocal.identification.identify import identify as run
     from elastocal.identification.start import Options
     from elastocal.measurements import read_matrix
+    from elastocal.planning.poses import used_poses
 
     if isinstance(covariance, str | Path):
         covariance = read_matrix(covariance, "noise covariance")
@@ -496,12 +497,7 @@ def identify(
         )
         prior = prior or known_prior
     options = replace(options, constraints=constraints, prior=prior)
-    used = None
-    if made.cell.design.states_test_poses:
-        from elastocal.planning.poses import test_poses
-
-        used = test_poses(made.cell, made.chain)
-    return run(made, table, options, kept_back, tell, used)
+    return run(made, table, options, kept_back, tell, used_poses(made.cell, made.chain))
 
 
 @checked_arguments

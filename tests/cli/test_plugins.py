@@ -233,6 +233,9 @@ def test_a_cells_code_does_not_run_unasked(words: str, strange: Path) -> None:
     assert done.exit_code == 2 and done.stderr.count("elastocal:") == 1
     assert all(word in done.stderr for word in ("helper.py", "--plugins", "cell.toml"))
     assert not (strange / "ran").exists() and not (strange / "out.csv").exists()
+    if words.startswith("design"):  # what is proposed then runs it too
+        told = run(*words.split(), "--candidates", "60", "--poses", "8", "-q").stdout
+        assert told.count(" cell.toml --plugins ") == 2, told
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import pytest
 from golden.door import curved
 from support.design_commands import elastocal
 
+import elastocal as ec
 from elastocal.diagnosis.next_poses import verdict_of
 from elastocal.planning.plan import Gain
 from elastocal.simulation import run_demo
@@ -80,3 +81,6 @@ def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:
         answer = json.loads(elastocal(*words, "-o", plan, "--json", *FEW).output)
         (told,) = (w for w in answer.get("plan", answer)["warnings"] if "states no" in w)
         assert 30 < float(told.split("takes the ")[1].split()[0]) < 50, told
+    cell.write_text(text + "[[design.test_pose]]\nq_deg = [0, 20, -60, 0, 40, 0]\n")
+    fit, more = ec.identify(cell, data), ec.next_poses(cell, data, batch=2, candidates=60)
+    assert more.calibration.verdict.at == fit.verdict.at  # both of the pose that is stated

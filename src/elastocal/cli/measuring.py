@@ -26,7 +26,7 @@ from elastocal.cli.app import (
     repeated,
     whole_numbers,
 )
-from elastocal.messages import InputError, listed, require, said_of
+from elastocal.messages import InputError, counted, listed, require, said_of
 from elastocal.screen import interrupts, say
 
 if TYPE_CHECKING:
@@ -226,7 +226,8 @@ def design(
         of = cell if plan.chosen is None else cell_out or "chosen.toml"
         if plan.chosen is not None and cell_out is None:
             say("Run it again with --cell-out chosen.toml for the cell that the plan is of.")
-        say(_what_next(of, output, asked.get("augment"), plan))
+        named = f"{of}{' --plugins' * run.plugins}"
+        say(_what_next(named, output, asked.get("augment"), plan))
 
 
 def _resumed(
@@ -251,7 +252,7 @@ def _resumed(
         raise
 
 
-def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan) -> str:
+def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str:
     from elastocal.planning.plan import load_name
 
     loads = plan.forces[(plan.forces != 0).any(axis=1)]
@@ -264,13 +265,15 @@ def _what_next(cell: Path | str, output: Path, augment: Path | None, plan: Plan)
         carried += f" --repeats {readings}"
     added = "" if augment is None else f" (add them to {augment})"
     read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
-    return (
+    text = (
         f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
         "then\n"
-        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
-        f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
-        f"{carried}"
+        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html"
     )
+    if augment is None:  # an arm that was measured is not the one that --draw takes
+        text += f"\nTo try it without an arm: elastocal simulate {cell} {output} -o data.csv"
+        text += f" --draw 1{carried}"
+    return text
 
 
 def _check_names(programs: list[Path], picture: Path | None) -> None:
@@ -339,11 +342,10 @@ def simulate(
         )
     named = dict(zip(model.names, x.tolist(), strict=True))
     run.write((output, table.save), (truth, lambda path: write_json(path, named)))
-    summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
-    told = f"wrote {len(table)} readings of {len(poses)} poses to {output}"
-    run.answer(
-        lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
-    )
+    n = len(poses.configuration_labels)
+    answer = {"output": str(output), "readings": len(table), "poses": n, "seed": asked["seed"]}
+    told = f"wrote {len(table)} readings of {counted(n, 'pose')} to {output}"
+    run.answer(lambda: answer | {"truth": named}, lambda _: say(told), files=False)
 
 
 @command(

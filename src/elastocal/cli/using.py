@@ -460,7 +460,7 @@ def study(
         restart: Discard the results that are there.
         retry_failed: Run tasks that failed again.
     """
-    require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
+    require(cluster is None or jobs is None, "--jobs is for this machine; drop it with --cluster")
     from elastocal.studies import PAGE, StudyStop, read_study, run_study, summarise
 
     results = folder / "results" if output is None else output

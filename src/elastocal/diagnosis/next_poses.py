@@ -32,7 +32,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
-from elastocal.planning.poses import shares_of, test_poses
+from elastocal.planning.poses import shares_of, used_poses
 from elastocal.units import Progress
 
 # A hundred candidates that are less likely are together a doubt of a tenth at most.
@@ -171,7 +171,7 @@ def next_poses(
         model = with_effects_of(model, why)
     tell("identifying")
     with suppress(InsufficientDataError):  # then these are not enough
-        fit = identify(model, table)
+        fit = identify(model, table, new_poses=used_poses(model.cell, model.chain))
         sure, lacking = _error_now(fit, 1.0 if why is None else why.probability_unknown)
     cell = replace(model.cell, design=asked.design)
     cell, notes = with_noise_of(cell, fit) if unstated and fit is not None else (cell, ())
@@ -210,8 +210,7 @@ def _error_now(fit: Calibration, unknown: float) -> tuple[float, float]:
     if observed.kind == "distance":
         return 0.0, math.sqrt(3 * excess.squared.mean()) if excess else 0.0
     cell, table = model.cell, observed.table
-    stated = cell.design.states_test_poses
-    poses = test_poses(cell, model.chain) if stated else over_the_workspace(cell, model, table)
+    poses = used_poses(cell, model.chain) or over_the_workspace(cell, model, table)
     error = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
     return (math.inf, 0.0) if error is None else (error.sure, error.lacking or 0.0)
 

@@ -96,13 +96,13 @@ class Wish:
 class Exported:
     """What was written, and at which cost.
 
-    `held`: parameters that the data did not determine, with the values used; `by_prior`:
-    those that owe more to a prior; `refit`: how far the
-    file is from the arm before and after what it holds was fitted to it; `correction`: where its
-    joints are to be commanded besides, empty where nothing was asked for; `T_tracker_base` (4, 4)
-    goes with what the file holds, though it may have no place for it; `checked`: the largest
-    distance in m when it was read back with `checked_with`, None where it was not; `without_beta`:
-    of a DH table with a column beta_rad that in m for who reads four columns only.
+    `held`: parameters that the data did not determine, with the values used; `by_prior`: those that
+    owe more to a prior; `refit`: how far the file is from the arm before and after what it holds
+    was fitted to it; `correction`: where its joints are to be commanded besides, empty where
+    nothing was asked for; `T_tracker_base` (4, 4) goes with what the file holds, which has a place
+    for it where it is `framed`; `checked`: the largest distance in m when it was read back with
+    `checked_with`, None where it was not; `without_beta`: of a DH table with a column beta_rad that
+    in m for who reads four columns only.
     """
 
     format: str
@@ -113,6 +113,7 @@ class Exported:
     refit: exportable.Refit | None
     correction: exportable.JointCorrection
     T_tracker_base: Array
+    framed: bool
     warnings: tuple[str, ...]
     text: str = ""
     checked: float | None = None
@@ -127,9 +128,8 @@ class Exported:
 
     @property
     def base_told(self) -> str:
-        xyz, rpy = (
-            " ".join(f"{v:.9g}" for v in each) for each in placed(self.T_tracker_base).values()
-        )
+        at = placed(self.T_tracker_base).values()
+        xyz, rpy = (" ".join(str(round(v, 9) + 0.0) for v in each) for each in at)
         return f"with its base at xyz {xyz} m, rpy {rpy} rad in the tracker's frame"
 
     def to_json(self) -> dict[str, Any]:
@@ -202,7 +202,7 @@ def export(
     told = tuple(text for so, text in doubts if so)
     done = Exported(
         wish.kind, cost, held, calibrated.by_prior, kept.of_the_measurement, refit, correction,
-        pieces.T_tracker_base, told,
+        pieces.T_tracker_base, wish.base_frame, told,
     )  # fmt: skip
     format = {"mdh": "dh", "yaml": "parameters", "json": "parameters"}.get(wish.kind, wish.kind)
     written: Exported = getattr(_Writing(calibrated, wish, kept, pieces, done), format)()

@@ -565,6 +565,6 @@ def seconds_of(
         else:
             raise InputError(
                 f"{source}, line {line}: {quoted(text)} is no time of the form "
-                f"{' or '.join(chosen)}; set time_format in [[source]]"
+                f"{' or '.join(chosen)}; set time_format in [[source]], or name it time_s (seconds)"
             )
     return found

@@ -22,7 +22,7 @@ import numpy as np
 
 from elastocal.cell_tables import TEST_POSE
 from elastocal.files import same_class
-from elastocal.messages import InputError, check_known, is_label, listed, quoted, require
+from elastocal.messages import InputError, check_known, is_label, listed, quoted, require, rounded
 from elastocal.units import Array, BoolArray, IntArray
 
 Need = Literal["test_poses", "combination"]
@@ -195,6 +195,10 @@ class ScenarioCriterion(ABC):
         root = self.scale * float(np.sqrt(value))
         return 1 / root if self.better == "larger" else root
 
+    def told(self, value: float) -> str:
+        """The figure of Φ, in its unit."""
+        return f"{rounded(self.figure(value), 4)} {self.unit}".rstrip()
+
     def of_information(self, M: Array) -> Array:
         """Φ (...,) of M (..., p, p); inf where M is singular."""
         V, ok = covariance(M)
@@ -225,7 +229,7 @@ class Turned(ScenarioCriterion):
     """Φ(T V Tᵀ): `base` of the parameters y = T z, as a function of the covariance V of z."""
 
     def __init__(self, base: ScenarioCriterion, T: Array) -> None:
-        self.base, self.T, self.name = base, T, base.name
+        self.base, self.T, self.name, self.unit = base, T, base.name, base.unit
         self.certifiable, self.without_bound = base.certifiable, base.without_bound
 
     def value(self, V: Array) -> Array:

@@ -453,12 +453,10 @@ class _Design:
             n = min(max(int(np.ceil(n * found.value / target)), low), high - 1)
         if best is None:
             last = tried[max(tried)]
-            raise InsufficientDataError(
-                f"{self.cell.source}: no plan of up to {last.poses} poses meets "
-                f"the target of {rounded(wanted * 1e6)} µm; the best found reaches "
-                f"{rounded(last.value, 4)} µm: ask for less, measure more repeats, or take a "
-                "better tracker"
-            )
+            told = f"{self.cell.source}: no plan of up to {last.poses} poses meets the target of "
+            told += f"{rounded(wanted * 1e6)} µm; the best found reaches {rounded(last.value, 4)}"
+            told += " µm: ask for less, measure more repeats, or take a better tracker"
+            raise InsufficientDataError(told)
         return best, tuple(tried.values())
 
     def _plan(
@@ -480,9 +478,13 @@ class _Design:
         numbers += 0 if done is None else done.numbers
         gain = self._gain(setup, M, q, readings)
         figure, bound = setup.criterion.figure, found.certificate.bound_pool
+        reported, asked = figure(found.value), np.inf if spec.target is None else spec.target * 1e6
+        if reported > asked:  # `ordered` has put others in the place of some
+            lost = f"no free move reaches some better poses, so the plan misses {rounded(asked)} µm"
+            self.warnings.append(f"{lost}; ask for more ({option('poses')})")
         return Plan(
             model=self.model, criterion=spec.criterion, value=found.value,
-            reported=figure(found.value), unit=setup.criterion.unit, q=q, forces=self.forces,
+            reported=reported, unit=setup.criterion.unit, q=q, forces=self.forces,
             group=pool.group[chosen], levels=self.space.levels,
             level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
             execution=execution, candidates=counts, certificate=found.certificate,

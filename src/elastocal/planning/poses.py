@@ -350,7 +350,7 @@ def read_pins(
         require(bool(named) or stays, f"{option('strike')} takes poses, as in plan.csv:3,7")
         left = [name for name in own if not named or (name in named) == stays]
         clash = [name for name in left if name in kept]
-        require(not clash, f"{table.source}: pose {listed(clash)} is to be kept twice")
+        require(not clash, f"{table.source}: kept twice: pose {listed(clash)}")
         kept |= {name: own[name] for name in left}
         taken |= dict.fromkeys(own)
         if not stays:
@@ -467,6 +467,11 @@ def test_poses(
     return TargetPoses.together(
         groups, ", ".join([*sources, *(g.source for g in groups if g.source)])
     )
+
+
+def used_poses(cell: Cell, chain: Chain) -> TargetPoses | None:
+    """Where the cell says that the arm will be used: its test poses; None where it states none."""
+    return test_poses(cell, chain) if cell.design.states_test_poses else None
 
 
 def everywhere(

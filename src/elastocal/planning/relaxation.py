@@ -485,5 +485,5 @@ def sized_plans(
         value, weights = whole.value(chosen), relaxed.weights
         whole.check_determined(value)
         found[n] = value, relaxed.bound if problem.criterion.certifiable else np.nan
-        progress(f"{n} poses: {value:.6g}")
+        progress(f"{n} poses: {problem.criterion.told(value)}")
     return found

@@ -463,7 +463,8 @@ class Search:
                 begun = problem.random(rng) if k % 2 else problem.rounded(relaxed.weights, rng)
             end = self.polished(begun, f"start{k}")
             ends.append(self.value_of(end))
-            self.progress(f"start {k + 1} of {effort.starts}: {min(ends):.6g}")
+            so_far = f"best so far {problem.criterion.told(min(ends))}"
+            self.progress(f"start {k + 1} of {effort.starts}: {so_far}")
             if ends[-1] < least * (1 - SAME):
                 best, least = end, ends[-1]
         return best, ends

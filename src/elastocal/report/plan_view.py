@@ -89,8 +89,8 @@ def _key(plan: Plan) -> say.KeyFigures:
     return say.KeyFigures(f"{n} → {worth[1]}, {minutes}", figures)
 
 
-def _value(plan: Plan, value: float, digits: int = 4) -> str:
-    return f"{rounded(value, digits)} {plan.unit}".rstrip()
+def _value(plan: Plan, value: float) -> str:
+    return f"{rounded(value, 4)} {plan.unit}".rstrip()
 
 
 TOLD = 2  # parameters that a pose serves, in the table
@@ -206,14 +206,11 @@ Told = Iterator[tuple[str, str]]  # label, sentence
 
 def plan_lines(plan: Plan) -> Told:
     yield from _chosen_lines(plan)
-    if not plan.of_test_poses:
-        yield "Criterion", f"{plan.criterion} = {_value(plan, plan.reported, 6)}."
-    else:
-        yield (
-            "Criterion",
-            f"ρ₀ = {rounded(_rho(plan), 4)} µm rms position error at the test poses after "
-            f"compensation ({printable(plan.targets)}).",
-        )
+    text = f"{plan.criterion} = {_value(plan, plan.reported)}"
+    if plan.of_test_poses:
+        text = f"ρ₀ = {rounded(_rho(plan), 4)} µm rms position error at the test poses after "
+        text += f"compensation ({printable(plan.targets)})"
+    yield "Criterion", f"{text}."
     if plan.made_for:
         yield "Made for", f"{printable(plan.made_for)}."
     yield from _everywhere_lines(plan)
@@ -288,28 +285,21 @@ def _everywhere_lines(plan: Plan) -> Told:
         return
 
     def shown(error: float | None) -> str:
-        return "none" if error is None else rounded(error * 1e6, 4)
+        return "none" if error is None else f"{rounded(error * 1e6, 4)} µm"
 
     own = "" if plan.of_test_poses else f"; at the test poses {shown(e.test_poses)}"
-    text = (
-        f"{shown(e.elsewhere)} µm rms over the joint ranges{own}; a random plan gives "
-        f"{shown(e.random_elsewhere)} there and {shown(e.random_test_poses)} at the test poses"
-    )
+    text = f"{shown(e.elsewhere)} rms over the joint ranges{own}; a random plan gives "
+    text += f"{shown(e.random_elsewhere)} there and {shown(e.random_test_poses)} at the test poses"
     if drift := plan.model.cell.noise.drift:
-        text += (
-            f"; with the drift of {say.length(drift)} that [noise] states "
-            f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)} µm"
-        )
+        text += f"; with the drift of {say.length(drift)} that [noise] states "
+        text += f"{shown(e.drifting_test_poses)} and {shown(e.drifting_elsewhere)}"
     if e.share:
-        text += (
-            f"; minimised is the weighted error, {rounded(plan.reported, 4)} µm, in which the "
-            f"joint ranges count {100 * e.share:.0f} %"
-        )
+        text += f"; minimised is the weighted error, {rounded(plan.reported, 4)} µm, in which the "
+        text += f"joint ranges count {100 * e.share:.0f} %"
         text += f", with ρ₀ at most {100 * e.cap:g} % above its minimum" if e.cap else ""
     elif plan.of_test_poses:
-        text += (
-            f"; {option('elsewhere_cap', 0.05)} minimises it, allowing 5 % more at the test poses"
-        )
+        cap = option("elsewhere_cap", 0.05)
+        text += f"; {cap} minimises it, allowing 5 % more at the test poses"
     yield "Elsewhere", f"{text}."
 
 
@@ -374,7 +364,8 @@ def _execution_lines(plan: Plan) -> Told:
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
         are = f"{say.counted(parts, 'pose')} {'is' if parts == 1 else 'are'}"
-        text += f"; {are} measured unloaded at start and end (half the readings each)"
+        up = ", rounded up" * (plan.model.cell.design.repeats % 2)
+        text += f"; {are} measured unloaded at start and end (half the readings each{up})"
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)

@@ -198,7 +198,7 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[say.Block]:
         rows = {"without the table": table["error_without_um"]}
         rows["with it, interpolated"] = table["error_with_um"]
         yield _spreads(
-            f"Position of the tool at {table['checked_between']} points between the grid's", rows
+            f"Position of the tool at {table['checked_between']} points between grid points", rows
         )
         yield say.Sentence(
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
@@ -278,18 +278,18 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         told = f"the markers are {say.length(refit.after)} rms off"
         if refit.correction is not None:
             told += f", with its joint correction {say.length(refit.correction)}"
-        if refit.taken or refit.correction is not None:
-            told = (
-                f"Refitted to the calibrated arm at {refit.visits} measured visits: {told}, with "
-                f"the values identified {say.length(refit.before)}"
-            )
-        else:
-            told = f"Values as identified; no refit is better: {told}"
+        fitted = refit.taken or refit.correction is not None
+        how = "Values as identified; no refit is better"
+        if fitted:
+            how = f"Refitted to the calibrated arm at {refit.visits} measured visits"
+            told += f", with the values identified {say.length(refit.before)}"
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
         nominal = say.length(refit.nominal)
-        yield say.Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
-        if refit.taken or refit.correction is not None:
-            yield say.Sentence(f"The file is fitted {done.base_told}: place it there.")
+        told += f", the nominal file with base and tool placed {nominal}{worse}"
+        yield say.Sentence(f"{how}: {told}.")
+        if fitted:
+            there = ", which the file has" if done.framed else ": place it there"
+            yield say.Sentence(f"The file is fitted {done.base_told}{there}.")
     if done.checked is not None:
         yield say.Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:

@@ -170,7 +170,7 @@ class SmoothEffect(DrivenEffect):
 
 
 class JointCurve(SmoothEffect):
-    """δq = f(q), f a smooth function of the commanded joint angle q (see the module).
+    """δq = f(q), f a smooth function of the commanded joint angle q.
 
     The transmission error of a real gear: eccentricities, tooth errors and encoder errors of all
     orders at once.  Settings: the standard deviation `curve_size_rad` and the length
