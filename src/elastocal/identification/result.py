@@ -33,7 +33,15 @@ from elastocal.identification.prediction import (
     position_at,
 )
 from elastocal.measurements import Measurements
-from elastocal.messages import ElastocalError, UnknownNameError, length, option, plain, rounded
+from elastocal.messages import (
+    EXACT,
+    ElastocalError,
+    UnknownNameError,
+    length,
+    option,
+    plain,
+    rounded,
+)
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -592,7 +600,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         except ElastocalError:
             return None
         rms = float(np.sqrt(np.nanmean(np.trace(found.covariance, axis1=1, axis2=2))))
-        return rms if rms > at else None
+        return rms if rms > max(at, EXACT) else None
 
     @cached_property
     def excess(self) -> Excess | None:
