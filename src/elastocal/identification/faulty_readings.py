@@ -24,6 +24,7 @@ from elastocal.identification.outliers import (
 )
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
+from elastocal.measurements import Measurements
 from elastocal.messages import length
 from elastocal.model.effects.geometry import MarkerPosition
 from elastocal.units import Array, BoolArray, IntArray
@@ -100,6 +101,13 @@ class OutlierReport:
         """Groups, most of them beyond the noise, whose errors one common shift accounts for."""
         common = (f for f in self.findings if f.pattern == "common" and f.p_left >= FALSE_ALARM)
         return [f for f in common if 2 * f.beyond >= len(f.readings)]
+
+    def blocks(self, table: Measurements) -> list[FaultyGroup]:
+        """Those of `shifted` that are lines of several configurations: what is common to the
+        readings of one may be an error of the arm there."""
+        visited = {f: table.configuration[np.isin(table.row, f.lines)] for f in self.shifted}
+        return [f for f, own in visited.items()
+                if f.level == "block" and len(np.unique(own)) >= SMALLEST_BLOCK]  # fmt: skip
 
     def to_json(self) -> dict[str, Any]:
         told = {k: v for k, v in vars(self).items() if k != "good"}

@@ -6,7 +6,7 @@ stated weights, the published ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from elastocal.identification.faulty_readings import FaultyGroup, report_faulty
+from elastocal.identification.faulty_readings import FaultyGroup, OutlierReport, report_faulty
 from elastocal.identification.findings import KNOWN_NOISE, judged, warning_sentences
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import (
@@ -189,8 +189,8 @@ def _course(
         model, sound.problem.observations, sound.fit.x, sound.fit.residual, table,
         subset(observed, faulty) if faulty.any() and sound is not every else None,
     )  # fmt: skip
-    explained = cache(partial(_explained, every, sound, None, ~faulty))
-    return Course(every, sound, faulty, free, refit, explained, options, progress)
+    report = cache(partial(report_faulty, every, sound, None, ~faulty))
+    return Course(every, sound, faulty, free, refit, report, options, progress)
 
 
 def _of_readings(covariance: Array | None, good: BoolArray, size: int) -> Array | None:
@@ -230,7 +230,7 @@ def misread_for_a_while(model: Model, table: Measurements, seed: int) -> list[Fa
     if found.faulty_report is None or not found.excluded:
         return []
     sound = np.setdiff1d(table.row, [o.line for o in found.excluded])
-    blocks = (g for g in found.faulty_report.shifted if g.level == "block")
+    blocks = found.faulty_report.blocks(table)
     return [g for g in blocks if sound[0] < min(g.lines) and max(g.lines) < sound[-1]]
 
 
@@ -553,7 +553,8 @@ def _by_method(course: Course) -> MethodResult:
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
-    drop = drops(options, every.problem.observations, faulty, course.explained)
+    explained = partial(_explained, course.report, ~faulty)
+    drop = drops(options, every.problem.observations, faulty, explained)
     drop = drop and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):
@@ -619,7 +620,8 @@ def _reml(course: Course) -> MethodResult:
 
     def found(start: Solution, good: BoolArray, visits: bool = True) -> Adapted:
         solution, noise, good = _adapted(course, start, good, options.noise, visits=visits)
-        explained = partial(_explained, every, solution, noise, good)
+        report = partial(report_faulty, every, solution, noise, good)
+        explained = partial(_explained, report, good)
         if not good.all() and not drops(options, every.problem.observations, ~good, explained):
             # So many faulty readings look like anything that scatters or drifts.
             everything, visits = np.ones_like(good), visits and options.noise != "auto"
@@ -644,11 +646,9 @@ def _reml(course: Course) -> MethodResult:
     return MethodResult("reml", solution, spread, noise, good)
 
 
-def _explained(
-    every: Solution, fitted: Solution, noise: NoiseFit | None, good: BoolArray
-) -> BoolArray:
+def _explained(reported: Callable[[], OutlierReport | None], good: BoolArray) -> BoolArray:
     """Readings (N,) that are not `good`, of groups which one common shift each explains."""
-    report = report_faulty(every, fitted, noise, good)
+    report = reported()
     known = [] if report is None else [f.readings for f in report.shifted]
     return ~good & np.isin(np.arange(len(good)), np.concatenate([[], *known]))
 

@@ -293,12 +293,11 @@ def fit_smooth(course: Course) -> MethodResult:
 class _Search:
     def __init__(self, course: Course) -> None:
         self.every, self.options, self.progress = course.every, course.options, course.progress
-        self.explained, faulty = course.explained, course.faulty
         # Functions could follow a shifted block as well, which is no reason to take it back.
-        many = faulty.mean() > FEW and drops(
-            self.options, self.every.problem.observations, faulty, self.explained
-        )
-        self.shifted = self.explained() if many else np.zeros_like(faulty)
+        report = course.report() if course.faulty.mean() > FEW else None
+        blocks = report.blocks(course.every.problem.observations.table) if report else []
+        lines = np.concatenate([[], *(g.readings for g in blocks)])
+        self.shifted = course.faulty & np.isin(np.arange(len(course.faulty)), lines)
         every, sound = course.every, course.sound
         self.model, self.observed = every.problem.model, every.problem.observations
         self.functions, self.harmful = Functions(self.model, course.free), list[str]()
@@ -376,7 +375,7 @@ class _Search:
         noise: NoiseFit | None = None
         x, reduction, scales, level = self.sound.fit.x, self.sound.reduction, None, np.inf
         for k in range(ROUNDS):
-            fitted = good | (not drops(self.options, self.observed, ~good, self.explained))
+            fitted = good | (not drops(self.options, self.observed, ~good, lambda: self.shifted))
             part = self.chosen(noise, fitted)
             problem = replace(
                 self.sound.problem, observations=part.observations, weights=part.weights

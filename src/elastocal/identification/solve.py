@@ -709,15 +709,14 @@ class MethodResult:
 @dataclass(frozen=True)
 class Course:
     """What a method starts from: fits to all observations, and to those that are not `faulty` (N,),
-    of which one common shift for each block or marker has `explained` some; `refit` makes another
-    such, of those it is given.  They know nothing of smooth functions among the parameters
-    `free`."""
+    and the `report` of these; `refit` makes another such fit, of those it is given.  They know
+    nothing of smooth functions among the parameters `free`."""
 
     every: Solution
     sound: Solution
     faulty: BoolArray
     free: IntArray
     refit: Callable[[BoolArray], Solution]
-    explained: Callable[[], BoolArray]
+    report: Callable[[], Any]  # an OutlierReport, or None
     options: Options
     progress: Progress
