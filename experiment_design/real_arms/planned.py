@@ -28,7 +28,8 @@ ARMS = {
 # hardly to be seen.
 NOISE = "\n[tracker]\nsigma_um = 30\n"
 HEAD = (
-    "| arm | poses | planned | random: median | least and largest of 20 | planned is better than |\n"
+    "| arm | poses | planned | random: median | least and largest of 20 "
+    "| planned is better than |\n"
     "|---|---|---|---|---|---|"
 )
 
@@ -47,6 +48,12 @@ def planned(cell: Path, candidates: Path, n: int) -> list[int]:
         return [int(row["configuration"]) - 1 for row in csv.DictReader(handle)]
 
 
+def error(cell: Path, header: str, chosen: list[str], test: Path) -> float:
+    """Rms error in µm at the poses of `test` of the cell identified on the `chosen` lines."""
+    fit = stored("fit", header, chosen)
+    return identified(cell, fit, "planned", "--test", test)["test"]["rms_um"]
+
+
 def main() -> None:
     data, rows = prepare(), [HEAD]
     OUT.mkdir(exist_ok=True)
@@ -57,15 +64,12 @@ def main() -> None:
         pool, test = lines[:some], stored("test", header, lines[some:])
         candidates, cell = stored("pool", header, pool), HERE / f"planned_{name}"
         cell.write_text((HERE / name).read_text(encoding="utf-8") + NOISE, encoding="utf-8")
-
-        def error(chosen: list[int]) -> float:
-            fit = stored("fit", header, [pool[k] for k in chosen])
-            return identified(HERE / name, fit, "planned", "--test", test)["test"]["rms_um"]
-
         for n in POSES:
-            own = error(planned(cell, candidates, n))
-            draw = random.Random(SEED)
-            others = sorted(error(draw.sample(range(some), n)) for _ in range(RANDOM))
+            chosen = [pool[k] for k in planned(cell, candidates, n)]
+            own, draw = error(HERE / name, header, chosen, test), random.Random(SEED)
+            others = sorted(
+                error(HERE / name, header, draw.sample(pool, n), test) for _ in range(RANDOM)
+            )
             rows.append(
                 f"| {arm} | {n} | {mm(own)} | {mm(median(others))} "
                 f"| {mm(others[0])} to {mm(others[-1])} "
