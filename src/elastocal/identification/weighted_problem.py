@@ -446,8 +446,8 @@ class PriorRows:
 @dataclass(frozen=True)
 class Fit:
     """Values x (parameters,), raw residual (rows,), R factor of whitened B and residual; `columns`
-    (fitted,) index the parameters; `known` is what the fit knew of them, `every` the R factor of
-    all free columns, where the fit came by it."""
+    (fitted,) index the parameters; `known` is what the fit knew of them, `every` the free columns
+    and their R factor, where the fit came by it."""
 
     x: Array
     residual: Array
@@ -457,7 +457,7 @@ class Fit:
     problem: Problem = field(repr=False)
     columns: NDArray[np.int64]
     known: PriorRows
-    every: RFactor | None = None
+    every: tuple[IntArray, RFactor] | None = None
 
     @cached_property
     def B(self) -> Array:
@@ -473,18 +473,20 @@ class Fit:
         problem = self.problem
         if np.array_equal(self.columns, problem.free):
             return self.r_factor
-        return self.every or problem.evaluate(self.x, problem.free)[1]
+        if self.every is not None and np.array_equal(self.every[0], problem.free):
+            return self.every[1]
+        return problem.evaluate(self.x, problem.free)[1]
 
 
 class Linearised(NamedTuple):
     """The residual, its R factor with B per unit of u, and the cost |b − A step|² about a u; that
-    of all free columns, raw, where they were asked for."""
+    of all free columns, raw, with these, where they were asked for."""
 
     residual: Array
     r_factor: RFactor
     A: Array
     b: Array
-    every: RFactor | None
+    every: tuple[IntArray, RFactor] | None
 
     @property
     def cost(self) -> float:
@@ -513,9 +515,10 @@ class Objective:
         free, own = self.problem.free, self.columns
         ahead = ahead and self.problem.large and bool(np.isin(own, free).all())
         residual, r_factor = self.problem.evaluate(self.values(u), free if ahead else own)
-        every = r_factor if ahead else None
-        if every is not None:
-            r_factor = every.of_columns(np.searchsorted(free, own))
+        every = (free, r_factor) if ahead else None
+        if ahead:
+            order = np.argsort(free)
+            r_factor = r_factor.of_columns(order[np.searchsorted(free, own, sorter=order)])
         if not np.isfinite(r_factor.rss):
             source = self.problem.observations.table.source
             raise ElastocalError(
