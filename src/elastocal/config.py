@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial, wraps
@@ -526,8 +527,7 @@ def holding(rule: Callable[[Any], object]) -> AfterValidator:
 
 def _all_differ(values: Any) -> Any:
     listing = (values + 0.0).tolist() if isinstance(values, np.ndarray) else values
-    names = [str(value) for value in listing]
-    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+    if twice := [name for name, n in Counter(map(str, listing)).items() if n > 1]:
         raise PydanticCustomError("repeated", f", with {listed(twice)} more than once")
     return values
 

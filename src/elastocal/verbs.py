@@ -467,7 +467,6 @@ def identify(
     from elastocal.identification.identify import identify as run
     from elastocal.identification.start import Options
     from elastocal.measurements import read_matrix
-    from elastocal.planning.poses import used_poses
 
     if isinstance(covariance, str | Path):
         covariance = read_matrix(covariance, "noise covariance")
@@ -497,7 +496,12 @@ def identify(
         )
         prior = prior or known_prior
     options = replace(options, constraints=constraints, prior=prior)
-    return run(made, table, options, kept_back, tell, used_poses(made.cell, made.chain))
+    used = None
+    if made.cell.design.states_test_poses:  # planning takes as long to load as a small fit
+        from elastocal.planning.poses import used_poses
+
+        used = used_poses(made.cell, made.chain)
+    return run(made, table, options, kept_back, tell, used)
 
 
 @checked_arguments

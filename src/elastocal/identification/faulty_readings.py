@@ -105,9 +105,9 @@ class OutlierReport:
     def blocks(self, table: Measurements) -> list[FaultyGroup]:
         """Those of `shifted` that are lines of several configurations: what is common to the
         readings of one may be an error of the arm there."""
-        visited = {f: table.configuration[np.isin(table.row, f.lines)] for f in self.shifted}
-        return [f for f, own in visited.items()
-                if f.level == "block" and len(np.unique(own)) >= SMALLEST_BLOCK]  # fmt: skip
+        runs = (f for f in self.shifted if f.level == "block")
+        visits = ((f, table.configuration[np.isin(table.row, f.lines)]) for f in runs)
+        return [f for f, visited in visits if len(np.unique(visited)) >= SMALLEST_BLOCK]
 
     def to_json(self) -> dict[str, Any]:
         told = {k: v for k, v in vars(self).items() if k != "good"}

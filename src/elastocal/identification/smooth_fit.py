@@ -293,13 +293,13 @@ def fit_smooth(course: Course) -> MethodResult:
 class _Search:
     def __init__(self, course: Course) -> None:
         self.every, self.options, self.progress = course.every, course.options, course.progress
-        # Functions could follow a shifted block as well, which is no reason to take it back.
-        report = course.report() if course.faulty.mean() > FEW else None
-        blocks = report.blocks(course.every.problem.observations.table) if report else []
-        lines = np.concatenate([[], *(g.readings for g in blocks)])
-        self.shifted = course.faulty & np.isin(np.arange(len(course.faulty)), lines)
         every, sound = course.every, course.sound
         self.model, self.observed = every.problem.model, every.problem.observations
+        # Functions could follow a shifted block as well, which is no reason to take it back.
+        report = course.report() if course.faulty.mean() > FEW else None
+        blocks = report.blocks(self.observed.table) if report else []
+        inside = np.concatenate([[], *(g.readings for g in blocks)])
+        self.shifted = course.faulty & np.isin(np.arange(len(course.faulty)), inside)
         self.functions, self.harmful = Functions(self.model, course.free), list[str]()
         own = np.setdiff1d(sound.problem.free, self.functions.columns)
         problem = replace(sound.problem, free=own, sizes=every.problem.sizes)

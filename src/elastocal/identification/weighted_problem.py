@@ -515,9 +515,9 @@ class Objective:
         free, own = self.problem.free, self.columns
         ahead = ahead and self.problem.large and bool(np.isin(own, free).all())
         residual, r_factor = self.problem.evaluate(self.values(u), free if ahead else own)
-        every = (free, r_factor) if ahead else None
+        every = None
         if ahead:
-            order = np.argsort(free)
+            every, order = (free, r_factor), np.argsort(free)
             r_factor = r_factor.of_columns(order[np.searchsorted(free, own, sorter=order)])
         if not np.isfinite(r_factor.rss):
             source = self.problem.observations.table.source

@@ -435,7 +435,8 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> Iterator
         if kind in NO_VALUE:
             why = f"{NO_VALUE[kind]}, so without a value (95 %)"
             names = [f"{n} ({limits(result, e)})" for n, e in zip(names, found, strict=True)]
-        yield from [f"{why}: {listed(names, most or len(names))}"] * bool(names)
+        if names:
+            yield f"{why}: {listed(names, most or len(names))}"
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> say.ShownTable:

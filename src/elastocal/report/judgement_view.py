@@ -388,13 +388,13 @@ def _sizes(noise: Noise) -> list[str]:
             return say.significant(number(s))
         return f"{say.significant(s.sigma * 1e6)} µrad" if s.turns else say.length(s.sigma)
 
-    sizes = sorted(noise.sizes or (), key=lambda s: bool(s.part))
-    own = sorted((s for s in sizes if not s.part), key=number)
-    named = [(s.name, s) for s in sizes]
+    sizes = noise.sizes or ()
+    shared, alone = ([s for s in sizes if bool(s.part) == whether] for whether in (True, False))
+    own, named = sorted(alone, key=number), [(s.name, s) for s in alone]
     if len(own) > FEW:
-        named[: len(own)] = [(f"median of {len(own)}", own[len(own) // 2])]
-        named[1:1] = [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
-    return [f"{printable(n)} {size(s)}" for n, s in named]
+        named = [(f"median of {len(own)}", own[len(own) // 2])]
+        named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
+    return [f"{printable(n)} {size(s)}" for n, s in [*named, *((s.name, s) for s in shared)]]
 
 
 def candidate_table(noise: Noise) -> say.ShownTable:
