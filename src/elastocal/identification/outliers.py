@@ -24,7 +24,7 @@ from elastocal.identification.least_squares import (
 )
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, own_noise, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.solve import PLACED, SAMPLE, MethodResult, Solution, is_placed
+from elastocal.identification.solve import MANY, PLACED, SAMPLE, MethodResult, Solution, is_placed
 from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import Problem, RFactor
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
@@ -86,7 +86,9 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
         if sweep == SWEEPS:
             best = np.argsort(cost, kind="stable")[:FINALISTS]
             q, variance, cost, nearest = q[best], variance[best], cost[best], nearest[best]
-        weight = (q <= nearest.max(axis=1)[:, None]).astype(float)
+        before, weight = weight, (q <= nearest.max(axis=1)[:, None]).astype(float)
+        if sweep > SWEEPS and np.array_equal(weight, before):
+            break
     k = int(np.argmin(cost))
     s2, good = float(variance[k]), np.isin(np.arange(n), some[weight[k] > 0])
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
@@ -279,11 +281,12 @@ SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at 
 
 def find_faulty(problem: Problem, found: Array) -> BoolArray:
     """Which observations (N,) are faulty, by all free parameters, tied weakly to the start, and
-    noise of one variance; at a Bonferroni limit for the whole table, of which, where it is large, a
-    sample is judged so, and its fit judges the others.  B is of the values `found` (parameters,)
-    where base and markers are known."""
+    noise of one variance; at a Bonferroni limit for the whole table, of which, where there are
+    MANY, a sample is judged so, and its fit judges the others.  B is of the values `found`
+    (parameters,) where base and markers are known."""
     n = len(problem.observations.lead)
-    part = problem.sample(SAMPLE) if problem.large else problem.part(np.arange(n))
+    some = min(SAMPLE, max(MANY, n // 4))
+    part = problem.part(np.arange(n)) if n <= MANY else problem.sample(some)
     width = prior_widths(problem)[problem.free]
     x0, free = problem.x0, problem.free
     placed = is_placed(problem.model)[free]
@@ -328,7 +331,7 @@ def find_faulty(problem: Problem, found: Array) -> BoolArray:
         good = min(sets, key=lambda one: _by_chance(part.observations, ~one))
         fit = FitToGood(B, y, good, fit.variance)
     faulty[part.index[~good]] = True
-    if problem.large:
+    if len(part.index) < n:
         faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
 

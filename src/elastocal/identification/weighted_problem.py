@@ -399,7 +399,7 @@ class Problem:
         return np.asarray(observed.value - self.model.predict(observed.table, x, observed))
 
     def regressor(self, x: Array, columns: NDArray[np.integer]) -> Regression:
-        return self.model.regressor(self.observations.table, x, columns, self.observations)
+        return self.model.kept_regressor(self.observations, x, columns)
 
     def whitened(self, x: Array, columns: NDArray[np.integer]) -> tuple[Array, Array]:
         """B (rows, columns) and residual (rows,) of a single part at x, whitened."""
