@@ -144,7 +144,7 @@ ROW = 0.27  # inches per line of a name
 LONGEST = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.
 WIDE_RANGE = 8.0
-DENSE = 25.0  # below which three ticks a decade have room
+DENSE, SPARSE = 25.0, 200.0  # below which three ticks a decade have room, and two
 NO_ENDS = (math.nan, math.nan)
 
 
@@ -195,10 +195,11 @@ def _scaled(axes: Axes, known: Sequence[float], lengths: bool) -> None:
 
     axes.margins(x=0.18)  # with room for texts
     axes.xaxis.set_major_locator(MaxNLocator(5))  # "1.25 mm" is long
-    if lengths and min(known, default=0) > 0 and max(known) > WIDE_RANGE * min(known):
+    span = max(known, default=0) / max(min(known, default=0), 1e-300)
+    if lengths and min(known, default=0) > 0 and span > WIDE_RANGE:
         axes.set_xscale("log")
-        dense = (1.0, 2.0, 5.0) if max(known) < DENSE * min(known) else (1.0, 3.0)
-        axes.xaxis.set_major_locator(LogLocator(subs=dense, numticks=9))
+        subs = (1.0, 2.0, 5.0) if span < DENSE else (1.0, 3.0)[: 1 + (span < SPARSE)]
+        axes.xaxis.set_major_locator(LogLocator(subs=subs, numticks=9))
     elif min(known, default=0) >= 0 and axes.get_xlim()[1] > 0:
         low = axes.dataLim.x0
         axes.set_xlim(left=min(0.0, low) if math.isfinite(low) else 0.0)
@@ -366,7 +367,7 @@ def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
         if table.approach is not None:
             came = np.sign(table.approach[lead, joint])
         each = model.chain.kinds[joint], table.q[lead, joint], came, seen, explained
-        panels.append(partial(_by_side, say.effect_at(f), *each))
+        panels.append(partial(_by_side, say.effect_at(f), joint + 1, *each))
     caption = (
         "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
         "each reading when all is fitted."
@@ -377,8 +378,9 @@ def effects_over_joints(d: Diagnosis) -> Iterator[say.Figure]:
 
 
 def _by_side(
-    title: str, kind: str, q: Array, came: Array, seen: Array, explained: Array, axes: Axes
-) -> None:
+    title: str, joint: int, kind: str, q: Array, came: Array, seen: Array, explained: Array,
+    axes: Axes,
+) -> None:  # fmt: skip
     level(axes, reach(np.concatenate([seen, explained])))
     (q, unit), sides = _in_unit(kind, q), np.unique(came)
     for k, one in enumerate(sides):
@@ -387,7 +389,7 @@ def _by_side(
         dots(axes, q[own], seen[own], SERIES[k], 1.8, f"readings{told}")
         stroke(axes, q[own], explained[own], "_", SERIES[k], markersize=9, label=f"effect{told}")
     motion = f"motion in {'µrad' if kind == 'revolute' else 'µm'}"
-    axes.set(xlabel=f"joint in {unit}", ylabel=motion)
+    axes.set(xlabel=f"joint {joint} in {unit}", ylabel=motion)
     axes.set_title(title)
 
 
