@@ -98,13 +98,11 @@ def test_what_another_choice_of_parameters_determined_is_told_in_that_of_the_old
     free = ec.identify(model, data)
     chosen = next(n for n in free.determined if n.startswith("link") and free[n].combined_with)
     held = ec.identify(model, data, fixed=[chosen])
-    assert set(held.determined) != set(free.determined)
     found = ec.compare(free, held)
     assert found.first_order and not found.changed and found.distance.max() < 1e-6
 
 
 def test_what_one_session_alone_shows_is_named_and_the_rest_compared(folder):
-    """No compliance shows without a load."""
     (folder / "both.toml").write_text(CELL.replace('"link_geometry"', '"joint_compliance"'))
     model = ec.Model("both.toml")
     q = np.random.default_rng(3).uniform(-1.4, 1.0, (2, 20, 6))
@@ -120,7 +118,6 @@ def test_what_one_session_alone_shows_is_named_and_the_rest_compared(folder):
 
 
 def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
-    """Without a load no compliance moves the tool."""
     soft = CELL.replace('"joint_offset", "link_geometry"', '"joint_compliance"')
     (folder / "soft.toml").write_text(soft)
     model = ec.Model("soft.toml")
@@ -131,14 +128,17 @@ def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
         data = ec.simulate(model, q, load=[0, 0, -300.0], values=values | {name: value}, seed=k)
         ec.identify(model, data).save(f"soft{k}.json")
     code, out, err = run("soft.toml", "soft0.json", "soft1.json", "-o", "c.json")
-    assert code == 0, err
-    assert "under (0, 0, -300) N, those of the earlier session" in " ".join(out.split())
+    assert code == 0 and "under (0, 0, -300) N, those of the earlier" in " ".join(out.split()), err
     found = json.loads(Path("c.json").read_text())
     assert found["changed"] == [name]
     assert found["tool"]["forces_N"] == [[0, 0, -300]] == [found["tool"]["force_N"]]
     assert found["tool"]["rms_um"] > 10 * found["tool"]["by_chance_rms_um"] > 0
     arms = [ec.read_calibrated("soft.toml", f"soft{k}.json") for k in (0, 1)]
     assert ec.compare(*arms, load=[0, 0, 0]).distance.max() < 1e-6
+    one = ec.simulate(model, q, load=[0, 0, -300.0], values={name: 4e-6}, seed=7)
+    stiff = {c.name: c.change for c in ec.compare(arms[1], ec.identify(model, one)).changed}
+    # Compared with limits of what now hardly shows.
+    assert len(stiff) > 2 and stiff == pytest.approx(dict.fromkeys(stiff, -2e-6), rel=0.2)
     with pytest.raises(ec.InputError, match=f"{name} is held in table at .* deviations away"):
         ec.compare(arms[0], ec.identify(model, data, fixed=[name]))
     tied = LinearEquality({"joint4.compliance": 1.0, "joint5.compliance": -1.0})

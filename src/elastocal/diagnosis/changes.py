@@ -38,6 +38,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
 from elastocal.above import Result, checked_arguments
+from elastocal.diagnosis.diagnosis import NORMAL_95
 from elastocal.identification.least_squares import correlations, variance_of
 from elastocal.identification.noise_summary import holm
 from elastocal.identification.result import Calibration
@@ -313,31 +314,45 @@ def _compared(
     )  # fmt: skip
 
 
-def _estimates(arm: CalibratedArm, own: list[str]) -> tuple[IntArray, Array, Array, Array, Array]:
-    """Which of the parameters `own` it determined (k,); y (k,) and A (k, own) with y = A X + ε; N
-    and V (2, k, k) of ε: noise, and what was left open of the set-up; and the typical sizes (own,)
-    of those left open, 0 where none is known, −∞ for the others.  Raises InputError where the
-    covariance has no numbers."""
+def _estimates(
+    arm: CalibratedArm, own: list[str], beside: CalibratedArm
+) -> tuple[IntArray, Array, Array, Array, Array]:
+    """Which of the parameters `own` it determined, or limited where the one `beside` determined
+    them (k,); y (k,) and A (k, own) with y = A X + ε; N and V (2, k, k) of ε: noise, and what was
+    left open of the set-up; and the typical sizes (own,) of those left open, 0 where none is known,
+    −∞ for the others.  Raises InputError where the covariance has no numbers."""
     # What constraints fix is held.
     place = {name: i for i, name in enumerate(arm.determined) if arm.covariance[i, i] != 0}
-    kept = np.array([k for k, name in enumerate(own) if name in place], dtype=np.int64)
-    at = [place[own[k]] for k in kept]
+    limits = {str(e["name"]): e["limits95"] for e in arm.entries
+              if e.get("limits95") and e["name"] in beside.determined}  # fmt: skip
+    known = [k for k, name in enumerate(own) if name in place]
+    held = [k for k, name in enumerate(own) if name in limits and name not in place]
+    at, ends = [place[own[k]] for k in known], np.reshape([limits[own[k]] for k in held], (-1, 2))
     V = np.stack([arm.covariance, arm.of_campaigns[0]])[:, at][..., at]
-    A, values = np.eye(len(own))[kept], arm.values
+    A, values = np.eye(len(own))[known], arm.values
     require(
         bool(np.isfinite(V).all() and (np.diagonal(V, axis1=1, axis2=2) > 0).all()),
         f"{arm.source}: its covariance has no numbers, or negative variances, for "
         f"{', '.join(own[:3])} …; identify anew",
     )
-    y, left = np.array([values[own[k]] for k in kept]), np.full(len(own), -np.inf)
+    y, left = np.array([values[own[k]] for k in known]), np.full(len(own), -np.inf)
+    # What it limits, and by how much the others would be another for each unit of that.
+    limited, off = ends.mean(axis=1), np.zeros((len(held), len(known)))
     open_ = arm.left and zip(arm.left.names, arm.left.mixing[at].T, arm.left.typical, strict=True)
     for name, share, typical in open_ or ():
-        if name in own:
-            A[:, own.index(name)], left[own.index(name)] = share, typical
+        k = own.index(name) if name in own else -1
+        if k in held:
+            off[held.index(k)] = share
+            y += share * (values[name] - limited[held.index(k)])
+        elif k >= 0:
+            A[:, k], left[k] = share, typical
             y += share * values[name]
         else:
             V = V + typical**2 * np.outer(share, share)
-    return kept, y, A, V, left
+    both = np.hstack([-off, np.eye(len(held))]).T * np.ptp(ends, axis=1) / (2 * NORMAL_95)
+    V = np.pad(V, ((0, 0), (0, len(held)), (0, len(held)))) + both @ both.T
+    A = np.vstack([A, np.eye(len(own))[held]])
+    return np.array([*known, *held], dtype=np.int64), np.append(y, limited), A, V, left
 
 
 def _difference(
@@ -346,7 +361,7 @@ def _difference(
     """Names, ẑ (p,), N and V of it (2, p, p), and which of `own` one campaign alone shows.  Raises
     InputError where a parameter is held at two values, or at one that the other campaign
     contradicts, or a covariance has no numbers."""
-    found = (_estimates(arm, own) for arm in (old, new))
+    found = (_estimates(arm, own, other) for arm, other in ((old, new), (new, old)))
     (first, y1, A1, V1, left1), (second, y2, A2, V2, left2) = found
     both, alone = np.intersect1d(first, second), np.setxor1d(first, second)
     # What both determined drops out of the differences, whatever it is: T of all estimates.
