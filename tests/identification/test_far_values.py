@@ -75,12 +75,14 @@ SCARA = (
 
 
 def test_no_zero_stands_for_links_that_move_the_markers_more(tmp_path):
-    """Heights of a SCARA are told apart by tilts alone: metres of a zero are a millimetre there."""
+    """Heights of a SCARA are told apart by tilts alone: metres of a zero are a millimetre there,
+    and so are those of its base, which stays where the cell says beside its markers."""
     path = cell(tmp_path, sigma=5)
     (tmp_path / "dh.csv").write_text(SCARA)
     q = poses(40, 3)[:, :4] * [1.5, 3, 0.08, 1] + [0, 0, 0.08, 0]
     fit = ec.identify(path, ec.simulate(path, q, draw=2, seed=2, repeats=2))
     assert fit.verdict.trusted and fit.finding("joint_zero") is None
+    assert abs(fit.params["base.z"]) < 0.02
 
 
 def test_what_one_anchor_does_not_show_of_a_scara_is_held_near_its_guess(tmp_path):
