@@ -36,13 +36,7 @@ from elastocal.identification.solve import (
     own_size,
 )
 from elastocal.identification.start import ordinary
-from elastocal.identification.weighted_problem import (
-    Fit,
-    PriorRows,
-    Problem,
-    RFactor,
-    same_size,
-)
+from elastocal.identification.weighted_problem import Fit, PriorRows, Problem, RFactor, same_size
 from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.messages import listed
 from elastocal.model.manipulator import Model, smooth_groups

@@ -130,8 +130,7 @@ def reduce(
     length = np.linalg.norm(R, axis=0)
     visible = length > max(threshold, STRUCTURAL * length.max(initial=0.0), 1e-300)
     basis, chosen = np.zeros((len(R), 0)), np.zeros(0, dtype=np.int64)
-    if ranks is None:
-        ranks = ranks_of(parameters)
+    ranks = ranks_of(parameters) if ranks is None else ranks
     for rank in np.unique(ranks[visible]):
         candidates = np.flatnonzero(visible & (ranks == rank))
         off = R[:, candidates]
@@ -207,9 +206,9 @@ def leaning(problem: Problem, sigma: float) -> IntArray:
     if not len(free):
         return free
     more = len(problem.observations.value) / len(few.observations.value)
-    R = few.evaluate(problem.x0, free)[1].R * np.sqrt(more)
-    parameters = tuple(problem.model.parameters[c] for c in free)
-    return np.delete(free, reduce(R, problem.sizes[free], parameters, sigma, WORTH_A_COLUMN).kept)
+    R, own = few.evaluate(problem.x0, free)[1].R, [problem.model.parameters[c] for c in free]
+    chosen = reduce(R, problem.sizes[free], own, sigma / np.sqrt(more), WORTH_A_COLUMN)
+    return np.delete(free, chosen.kept)
 
 
 def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:

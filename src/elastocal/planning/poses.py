@@ -448,19 +448,15 @@ class TargetPoses(NewPoses):
         return cls(q, force, weight / weight.sum(), source, point, stated)
 
     def rows(self, arm: CalibratedArm, observed: Observations) -> tuple[Array, Array]:
-        """As a plan for them counts: where a point is stated or the markers' places are known, that
-        of the flange or, where the readings cannot tell where that is, of the markers' body."""
+        """As a plan counts (`known_rows`), of what this arm was identified from."""
         if not self.stated.any() and fitted_markers(arm.model):
             return super().rows(arm, observed)
-        A = prediction_rows(arm.model, self, arm.x)
-        left = arm.left
+        A, left = prediction_rows(arm.model, self, arm.x), arm.left
         if left is not None and fitted_markers(arm.model):
-            lost = np.isin(left.names, left.redundant)
+            lost = moves(arm, A[self.stated])[1][..., np.isin(left.names, left.redundant)]
             with suppress(InsufficientDataError):  # fewer than three markers hold no point
-                if moves(arm, A[self.stated])[1][..., lost].any():
-                    A = prediction_rows(arm.model, self, arm.x, carried=True)
-        each = A.reshape(len(A), -1, 3, A.shape[-1])
-        return each.reshape(-1, 3, A.shape[-1]), np.repeat(self.weight, each.shape[1])
+                A = prediction_rows(arm.model, self, arm.x, carried=True) if lost.any() else A
+        return A.reshape(-1, 3, A.shape[-1]), np.repeat(self.weight, A.shape[1] // 3)
 
 
 def test_poses(
