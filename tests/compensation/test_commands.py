@@ -13,13 +13,7 @@ from support.cells import COMPENSATOR, COMPLIANCE, DOWN, SLANTED, kr270_cell, kr
 import elastocal as ec
 from elastocal.cell import Cell
 from elastocal.cell_tables import Nominal
-from elastocal.compensation import (
-    Compensation,
-    compensate,
-    nominal_path,
-    read_targets,
-    targets_at,
-)
+from elastocal.compensation import Compensation, compensate, nominal_path, read_targets, targets_at
 from elastocal.correction_table import EXACT, CorrectionGrid, correction_table
 from elastocal.messages import InputError
 from elastocal.model.calibrated import CalibratedArm, ShownPoses, tool_point

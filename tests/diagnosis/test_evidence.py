@@ -9,7 +9,8 @@ from scipy.special import logsumexp
 from support.noisy_data import dense_noise, random_data, used_rows
 
 from elastocal.diagnosis.baseline import NoiseValues, NoisyData, project
-from elastocal.diagnosis.evidence import SCALES, direct, exceedance
+from elastocal.diagnosis.effect_search import Slot
+from elastocal.diagnosis.evidence import SCALES, Item, direct, exceedance
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
 SEEDS = range(2)
@@ -26,10 +27,8 @@ def dense_evidence(data: NoisyData, C: np.ndarray, s: float) -> float:
     X, C = (a.reshape(-1, a.shape[2])[rows] * 1e5 for a in (data.X, C))
     r = data.r.ravel()[rows] * 1e5
     S = 1e10 * dense_noise(data, NOISE) + X / data.precision @ X.T
-    with_group, without = (
-        stats.multivariate_normal(cov=V).logpdf(r) for V in (S + s**2 * C @ C.T, S)
-    )
-    return float(with_group - without)
+    both = [stats.multivariate_normal(cov=V).logpdf(r) for V in (S + s**2 * C @ C.T, S)]
+    return float(both[0] - both[1])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -58,3 +57,10 @@ def test_p_values_from_the_tail_are_not_below_what_they_are(kind: str, true: flo
     observed = float(np.quantile(draw(rng, 100_000), 1 - true))
     told = [exceedance(draw(rng, 199), observed) for _ in range(200)]
     assert true < np.median(told) < 9 * true
+
+
+def test_an_effect_counts_in_its_slot_at_its_own_settings() -> None:
+    """Another round of its settings may not find them again, where it would count less."""
+    again, other, found = (Item(what, np.zeros(1), 0.0) for what in ("a", "b", "a"))
+    held = Slot((again, other), np.array([3.0, 98.5])).holding(found, 155.6)
+    assert held.items[0] is found and held.probabilities()[0][0] > 0.99

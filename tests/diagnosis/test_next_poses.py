@@ -18,9 +18,8 @@ FEW = ["--candidates", "60", "-q"]
 
 
 def next_of(cell: Path, data: Path) -> dict:
-    return json.loads(
-        elastocal("next", cell, data, "-o", cell.parent / "n.csv", "--json", *FEW).output
-    )
+    done = elastocal("next", cell, data, "-o", cell.parent / "n.csv", "--json", *FEW)
+    return json.loads(done.output)
 
 
 def test_measuring_ends_where_enough_is_kept_or_nothing_is_won() -> None:
@@ -82,5 +81,10 @@ def test_where_no_noise_is_stated_the_measurements_show_it(tmp_path) -> None:
         (told,) = (w for w in answer.get("plan", answer)["warnings"] if "states no" in w)
         assert 30 < float(told.split("takes the ")[1].split()[0]) < 50, told
     cell.write_text(text + "[[design.test_pose]]\nq_deg = [0, 20, -60, 0, 40, 0]\n")
-    fit, more = ec.identify(cell, data), ec.next_poses(cell, data, batch=2, candidates=60)
-    assert more.calibration.verdict.at == fit.verdict.at  # both of the pose that is stated
+    shares = []
+    for point in ("", "point_m = [0.6, 0.4, 0.9]\n"):  # away from the markers
+        cell.write_text(cell.read_text() + point)
+        fit, more = ec.identify(cell, data), ec.next_poses(cell, data, batch=2, candidates=60)
+        assert more.calibration.verdict.at == fit.verdict.at  # both of the pose that is stated
+        shares.append(more.gain.before / fit.predicted.parameters)
+    assert 0.8 < shares[0] / shares[1] < 1.25  # the plan is judged where the fit is

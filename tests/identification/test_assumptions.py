@@ -71,7 +71,7 @@ def test_copies_under_new_labels_are_counted_once(clean):
     assert result.copies == tuple(range(len(table) + 2, 2 * len(table) + 2))
     assert np.allclose(result.covariance, alone.covariance, rtol=1e-3, atol=0)
     assert result.finding("copied_readings").numbers["copies"] == len(table)
-    assert any("repeat others to the last digit (lines" in w for w in result.warnings)
+    assert any("the last digit were excluded (lines" in w for w in result.warnings)
     assert result.to_json()["copies"] == list(result.copies)
     with pytest.raises(InputError, match="the covariance is"):
         identify(model, twice, Options(covariance=np.eye(6 * len(twice))))

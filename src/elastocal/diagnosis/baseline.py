@@ -188,13 +188,13 @@ def from_centre(base: Baseline) -> Array:
     return np.where(is_placed(base.model), 0.0, base.x - base.model.nominal)
 
 
-def prior_deviations(base: Baseline, fitted: float = FITTED) -> Array:
+def prior_deviations(base: Baseline) -> Array:
     """Prior standard deviation (parameters,), at least how far the fit has moved each.  Where a
     prior is narrower than what the readings say, an addition with the same columns spares the
     fitted parameter a part of the way, and is believed for that alone: half of v in each of two
     columns costs v²/4w² less than v in one."""
     compliant = [effect_of(p.effect).sized_by_value for p in base.model.parameters]
-    wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, fitted)
+    wide = base.sizes * np.where(compliant, FITTED_COMPLIANCE, FITTED)
     wide = np.maximum(wide, np.abs(from_centre(base)))
     return np.where(is_placed(base.model), PLACED, wide)
 
@@ -228,8 +228,8 @@ def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measuremen
     if len(part) == len(table):
         return table, None
     return part, (
-        f"the table is large: {len(part)} of {len(table)} rows were looked at, from "
-        f"{min(len(order), wanted)} of {len(order)} configurations, evenly spaced"
+        f"of the table {len(part)} of {len(table)} rows were looked at, at most {MOST_IN_ONE} of a "
+        f"configuration, from {min(len(order), wanted)} of {len(order)} configurations"
     )
 
 

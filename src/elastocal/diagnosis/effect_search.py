@@ -331,6 +331,13 @@ class Slot:
         items = tuple(b if up else a for a, b, up in each)
         return Slot(items, np.maximum(self.scores, other.scores))
 
+    def holding(self, item: Item, score: float) -> Slot:
+        """With the item of the set at its own settings, which another round of them may not find
+        again, where it scores as much."""
+        own = [item if one.what is item.what else one for one in self.items]
+        scores = [score if one is item else -np.inf for one in own]
+        return self.best_of(Slot(tuple(own), np.array(scores)))
+
     def probabilities(self) -> tuple[Array, float]:
         """Of each option (K,), and of nothing."""
         total = float(logsumexp(np.append(self.scores, 0.0)))
@@ -568,7 +575,7 @@ class ForwardSelection:
                 others = ModelSet(self.dataset, current.without(k), current.noise)
                 scanned = self._scan(others, current.noise)
                 best, slot = self._best_addition(others, scanned, BEHIND_COMPLETE)
-                slots[k] = slot
+                slots[k] = slot.holding(current.items[k], current.score - others.score)
                 if best is None:  # no longer needed
                     current, changed = others, True
                     del slots[k]

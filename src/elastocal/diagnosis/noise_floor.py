@@ -21,7 +21,6 @@ from elastocal.diagnosis.baseline import (
     NoiseValues,
     NoisyData,
     Projection,
-    prior_deviations,
     project,
 )
 from elastocal.diagnosis.diagnosis import (
@@ -33,6 +32,7 @@ from elastocal.diagnosis.diagnosis import (
     StructureTest,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.identification.identify import left_out
 from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.outliers import settle
@@ -40,7 +40,7 @@ from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_o
 from elastocal.measurements import numbered
 from elastocal.messages import ElastocalError
 from elastocal.model.effects.geometry import BaseFrame
-from elastocal.model.observations import pure_error
+from elastocal.model.observations import pure_error, subset
 from elastocal.units import Array, BoolArray, IntArray
 
 
@@ -355,24 +355,28 @@ def rms_with_interval(
 def first_steps(
     dataset: DiagnosisData, noise: NoiseValues, rng: np.random.Generator
 ) -> list[BudgetStep]:
-    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
-    the weights of an ordinary calibration: the scatter of joints that is fitted beside a missing
-    effect is that effect, and weights by it would spare it.  So are typical sizes: what a few poses
-    leave open deviates by no more."""
-    placed = dataset.blocks.pack(dataset.base.nominal.reshape(-1, dataset.blocks.size, 1))[:, :, 0]
-    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
+    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects, as
+    `identify` predicts what it is not given.  Where it cannot, by the weights of an ordinary
+    calibration: scatter of joints that is fitted beside a missing effect is that effect, and
+    weights by it would spare it."""
+    base, data, blocks = dataset.base, dataset.data, dataset.blocks
+    rows, good = base.nominal.reshape(-1, blocks.size, 1).copy(), ~data.faulty
+    steps = [BudgetStep(BaseFrame.name, *rms_with_interval(data, blocks.pack(rows)[:, :, 0], rng))]
     # Stage by stage, effects of the later step held at nominal.
-    data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
+    effects = {p.name: p.effect for p in base.model.parameters}
     stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
-    wider = prior_deviations(dataset.base) / prior_deviations(dataset.base, 1.0)
-    typical = dict(zip(effects, wider**2, strict=True))
-    precision = data.precision * [typical.get(name, 1.0) for name in dataset.fitted]
     for k, name in ((1, "geometry"), (2, "compliance")):
-        if (stage == k).any():
-            free = stage <= k
-            part = replace(data, X=data.X[:, :, free], precision=precision[free])
-            left = left_out_residual(project(part, noise.of_instrument()))
-            steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
+        if not (stage == k).any():
+            continue
+        later = tuple(p for p, effect in effects.items() if stage_of(effect) > k)
+        part = replace(data, X=data.X[:, :, stage <= k], precision=data.precision[stage <= k])
+        left = left_out_residual(project(part, noise.of_instrument()))
+        with suppress(ElastocalError):
+            held = left_out(base.model, subset(base.observed, good), later)
+            if np.isfinite(held).all():
+                rows[good] = held.reshape(-1, blocks.size, 1)
+                left = blocks.pack(rows)[:, :, 0]
+        steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
     return steps
 
 

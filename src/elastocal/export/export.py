@@ -430,10 +430,14 @@ class _Writing:
         return self.done.written(text, *warnings, *told, read=read)
 
     def rigid_joints(self, how: str) -> list[str]:
-        springs, n = {s.site for s in self.pieces.springs}, self.pieces.chain.n_joints
-        rigid = ", ".join(j for i in range(n) if (j := f"joint{i + 1}") not in springs)
-        told = f"no compliance was identified for {rigid}: rigid in this file{how}"
-        return [told] if rigid else []
+        springs, model = {s.site for s in self.pieces.springs}, self.kept.exported.model
+        sites = (f"joint{i + 1}" for i in range(model.chain.n_joints))
+        rigid: dict[str, list[str]] = {}
+        for joint in (site for site in sites if site not in springs):
+            asked = f"{joint}.compliance" in model.names
+            why = "no compliance was identified for" if asked else "the cell fits no compliance of"
+            rigid.setdefault(why, []).append(joint)
+        return [f"{why} {', '.join(of)}: rigid in this file{how}" for why, of in rigid.items()]
 
     def at_rest(self, rest: MujocoRest, T_world_base: Array) -> tuple[float, str]:
         """Largest distance in m of flange and markers between MuJoCo at rest and the exported

@@ -24,13 +24,7 @@ from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME
 from elastocal.identification.noise_summary import ResidualSummary
 from elastocal.identification.outliers import FEW, kept_of, named_runs
 from elastocal.identification.prediction import unread_markers
-from elastocal.identification.result import (
-    Calibration,
-    Estimate,
-    Finding,
-    made,
-    more_poses,
-)
+from elastocal.identification.result import Calibration, Estimate, Finding, made, more_poses
 from elastocal.identification.solve import Solution
 from elastocal.measurements import Measurements, numbered
 from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of
@@ -416,7 +410,8 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
     if n := len(lacking) - len(shown):
         yield _good("redundant", parameters=n)
     if unread := tuple(name for name, standing in all_of_them.items() if standing == UNREAD):
-        remedy = f"There is {no_reading(result)}: measure it, or delete it from [tool.markers_m]."
+        it, none = "it" if len(unread) == 1 else "them", no_reading(result)
+        remedy = f"There is {none}: measure {it}, or delete {it} from [tool.markers_m]."
         yield _note("markers_not_read", remedy, parameters=unread)
     if n := len(shown):
         remedy = (
@@ -546,8 +541,8 @@ def only_placed(result: Calibration) -> bool:
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
     "copied_readings": (
-        "{copies} readings repeat others to the last digit (lines {lines}) and were excluded: "
-        "copies add no information and make intervals too narrow. {remedy}"
+        "Readings that repeat others to the last digit were excluded ({lines}): copies add no "
+        "information and make intervals too narrow. {remedy}"
     ),
     "impossible_values": (
         "Impossible values: {parameters} beyond a physical bound by more than 5 standard "
@@ -597,7 +592,7 @@ SENTENCES = {
 DIGITS = {"condition_number": 2, "sigma_um": 3}  # of numbers in them
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
-    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}",
+    "beyond_bound": "{named} lie beyond their physical bound {bound} {unit} ({values}): {remedy}"
 }
 
 
@@ -617,15 +612,14 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         if kept := result.outliers:
             yield (
                 f"{counted(len(kept), 'reading lies', 'readings lie')} beyond what the noise "
-                f"explains (lines {_runs(o.line for o in kept)}); they are in the fit. Check "
-                f"them; {option('outliers', 'drop')} excludes them."
+                f"explains ({_runs(o.line for o in kept)}), and in the fit. Check the table there; "
+                f"{option('outliers', 'drop')} excludes such readings."
             )
         if apart := result.excluded:
             yield (
-                f"{counted(len(apart), 'reading was', 'readings were')} excluded as outliers "
-                f"(lines {_runs(o.line for o in apart)}). They are mistakes, or signs of a missing "
-                "effect. All are listed in the result under 'excluded'; "
-                f"{option('outliers', 'keep')} keeps them."
+                f"{counted(len(apart), 'outlier was', 'outliers were')} excluded "
+                f"({_runs(o.line for o in apart)}): mistakes, or signs of a missing effect. All "
+                f"are listed in the result as 'excluded'; {option('outliers', 'keep')} keeps them."
             )
     elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
         words = {
@@ -660,8 +654,9 @@ def _shown(f: Finding) -> dict[str, str]:
 
 
 def _runs(lines: Iterable[int]) -> str:
-    runs = named_runs(list(lines))
-    return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
+    runs = named_runs(numbers := list(lines))
+    word = "line" if len(numbers) == 1 else "lines"
+    return f"{word} {', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
 
 
 # Of these the warning says what to do.

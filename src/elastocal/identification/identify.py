@@ -234,6 +234,13 @@ def misread_for_a_while(model: Model, table: Measurements, seed: int) -> list[Fa
     return [g for g in blocks if sound[0] < min(g.lines) and max(g.lines) < sound[-1]]
 
 
+def left_out(model: Model, observed: Observations, fixed: tuple[str, ...]) -> Array:
+    """Residual (rows,) of each configuration under an identification of the others."""
+    options = Options(fixed=fixed, faulty="keep")
+    course = _course(model, observed.table, observed, options, lambda message: None)
+    return run_method(course).solution.crossed[0]
+
+
 CORRELATED = 0.9
 NOT_SHOWN = "held: the readings do not show the smooth function that it is part of"
 

@@ -79,7 +79,7 @@ def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncer
     arm, known, off = tool.calibrated, [], []
     for first in range(0, len(q), SENSITIVITIES):
         some = slice(first, first + SENSITIVITIES)
-        at = _moves(arm, tool.sensitivity([values[some] for values in rows], q[some]))
+        at = moves(arm, tool.sensitivity([values[some] for values in rows], q[some]))
         known.append(at[0] @ arm.covariance @ at[0].transpose(0, 2, 1))
         off.append(at[1])
     if not off:
@@ -96,7 +96,7 @@ def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncer
     )
 
 
-def _moves(arm: CalibratedArm, A: Array) -> tuple[Array, Array]:
+def moves(arm: CalibratedArm, A: Array) -> tuple[Array, Array]:
     """A_K (n, r, K), and O S (n, r, D) of A (n, r, parameters) in m per unit; what vanishes but
     for rounding, as the tool's point moves as the measured ones do, is zero."""
     index, left = {name: i for i, name in enumerate(arm.model.names)}, arm.left or NONE_OPEN
@@ -111,7 +111,7 @@ def _moves(arm: CalibratedArm, A: Array) -> tuple[Array, Array]:
 def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]:
     """Mean squares in m² of the position error of readings of B (n·size, parameters): by what the
     estimates leave uncertain, and by typical deviations of parameters left open."""
-    known, off = _moves(arm, B.reshape(-1, size, B.shape[1])[:, :3])
+    known, off = moves(arm, B.reshape(-1, size, B.shape[1])[:, :3])
     own = variance_of(known, arm.covariance)
     return float(own.mean()), float((off**2).sum(axis=(1, 2)).mean())
 
@@ -278,6 +278,11 @@ class NewPoses:
     weight: Array
     source: str
 
+    def rows(self, arm: CalibratedArm, observed: Observations) -> tuple[Array, Array]:
+        """∂(position)/∂X (R, 3, parameters) there, at the markers, and weights (R,)."""
+        B, weight = readings_at(arm.model, arm.x, observed, self)
+        return B[:, :3], weight
+
 
 def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPoses:
     """Poses drawn over the joint limits with a fixed seed, under the loads that were measured."""
@@ -409,8 +414,7 @@ def predicted_error(
     arm: CalibratedArm, observed: Observations, excess: Excess | None, spread: Covariance,
     poses: NewPoses, rng: np.random.Generator, unchecked: Array | None = None,
 ) -> PredictedError | None:  # fmt: skip
-    """The error at new poses, at the markers, in the circumstances of the readings; P of
-    `told_by_one` says how much of it is `unchecked`.
+    """The error at new poses; P of `told_by_one` says how much of it is `unchecked`.
 
     e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
     by draws of z, normal, and t with the degrees of freedom of their mean square for what the
@@ -422,10 +426,10 @@ def predicted_error(
     if left is None or not told:
         return None
     try:
-        B, weight = readings_at(arm.model, arm.x, observed, poses)
+        B, weight = poses.rows(arm, observed)
     except ElastocalError:
         return None
-    known, off = _moves(arm, B[:, :3])
+    known, off = moves(arm, B)
     root = drawing_root(arm.covariance)
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each

@@ -36,13 +36,7 @@ from elastocal.identification.solve import (
     own_size,
 )
 from elastocal.identification.start import ordinary
-from elastocal.identification.weighted_problem import (
-    Fit,
-    PriorRows,
-    Problem,
-    RFactor,
-    same_size,
-)
+from elastocal.identification.weighted_problem import Fit, PriorRows, Problem, RFactor, same_size
 from elastocal.identification.weighted_problem import fit as least_squares
 from elastocal.messages import listed
 from elastocal.model.manipulator import Model, smooth_groups
@@ -509,8 +503,8 @@ class _Search:
         gone = [g.name for g, s in zip(self.functions.groups, scales, strict=True) if s == 0]
         if unseen := [name for name in gone if name not in self.harmful]:
             told.append(
-                f"The readings show nothing of the {listed(unseen, 6)}: held at zero. Leave "
-                f"{'it' if len(unseen) == 1 else 'them'} out of [model] effects."
+                f"Beside the rest of the model the readings need no {listed(unseen, 6)}: held at "
+                "zero, as if not in [model] effects. Where diagnose named it, the others stand in."
             )
         if self.harmful:
             told.append(

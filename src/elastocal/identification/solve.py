@@ -41,7 +41,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.measurements import numbered
 from elastocal.messages import EXACT, ElastocalError, InsufficientDataError
-from elastocal.model.effects.base import Parameter
+from elastocal.model.effects.base import LINK, Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model, SmoothGroup
 from elastocal.model.observations import Observations
@@ -130,8 +130,7 @@ def reduce(
     length = np.linalg.norm(R, axis=0)
     visible = length > max(threshold, STRUCTURAL * length.max(initial=0.0), 1e-300)
     basis, chosen = np.zeros((len(R), 0)), np.zeros(0, dtype=np.int64)
-    if by_effect := ranks is None:
-        ranks = np.array([effect_of(p.effect).rank for p in parameters])
+    ranks = ranks_of(parameters) if ranks is None else ranks
     for rank in np.unique(ranks[visible]):
         candidates = np.flatnonzero(visible & (ranks == rank))
         off = R[:, candidates]
@@ -152,12 +151,16 @@ def reduce(
             break
         kept = np.delete(kept, apart.argmin())
     dropped, mixing = _stood_for(R, kept)
-    while by_effect and np.abs(mixing).max(initial=0.0) > FAR:
+    while parameters and np.abs(mixing).max(initial=0.0) > FAR:
         k, d = np.unravel_index(np.abs(mixing).argmax(), mixing.shape)
         kept = np.sort(np.append(np.delete(kept, k), dropped[d]))
         dropped, mixing = _stood_for(R, kept)
     mixing = mixing * sizes[kept][:, None] / sizes[dropped]
     return Reduction(kept, dropped, mixing, dropped[~visible[dropped]], threshold=threshold)
+
+
+def ranks_of(parameters: Sequence[Parameter]) -> IntArray:
+    return np.array([effect_of(p.effect).rank for p in parameters], dtype=np.int64)
 
 
 def _stood_for(R: Array, kept: IntArray) -> tuple[IntArray, Array]:
@@ -185,11 +188,27 @@ def choose(problem: Problem, r_factor: RFactor, sigma: float, threshold: float) 
     InsufficientDataError where no column is worth keeping."""
     free = problem.free
     parameters = tuple(problem.model.parameters[c] for c in free)
-    local = reduce(r_factor.R, problem.sizes[free], parameters, sigma, threshold)
+    # What leans on others is as far off as what the cell states of it, not as a registration.
+    lean, own = np.isin(free, problem.leaning), [p.typical or PLACED for p in parameters]
+    sizes, ranks = np.where(lean, own, problem.sizes[free]), ranks_of(parameters) + LINK * lean
+    local = reduce(r_factor.R, sizes, parameters, sigma, threshold, ranks)
     if not len(local.kept):
         raise nothing_shown(problem.observations, problem.residual(problem.x0))
     kept, dropped, gone = (free[own] for own in (local.kept, local.dropped, local.invisible))
     return replace(local, kept=kept, dropped=dropped, invisible=gone)
+
+
+def leaning(problem: Problem, sigma: float) -> IntArray:
+    """Which of the parameters placed the nominal arm does not tell from the others, as the height
+    of a base whose joints turn about the vertical and that of its markers.  Errors of the arm tell
+    them apart in the second order, where a millimetre of geometry stands for a metre of them."""
+    free, few = problem.free[is_placed(problem.model)[problem.free]], _sampled(problem)
+    if not len(free):
+        return free
+    more = len(problem.observations.value) / len(few.observations.value)
+    R, own = few.evaluate(problem.x0, free)[1].R, [problem.model.parameters[c] for c in free]
+    chosen = reduce(R, problem.sizes[free], own, sigma / np.sqrt(more), WORTH_A_COLUMN)
+    return np.delete(free, chosen.kept)
 
 
 def fit_kept(problem: Problem, x: Array, chosen: Reduction, max_steps: int = 60) -> Fit:
@@ -340,6 +359,11 @@ def solve(
     progress("choosing the parameters that the data determine")
     sigma, kept, r_factor = residual_sigma(found, 0), None, _as_of(found, problem)
     whole = few is problem
+    lean, model = leaning(problem, sigma), problem.model
+    started, problem = (replace(one, leaning=lean) for one in (started, problem))
+    if model.observe != "distance":  # what others make up for stays where the cell says
+        back = lean[[model.parameters[c].unit == "m" for c in lean]]
+        started = replace(started, x0=moved(started.x0, back, (model.nominal - started.x0)[back]))
     for turn in range(5 if whole else 10):
         reduction = choose(problem, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
@@ -347,7 +371,7 @@ def solve(
                 break
             whole = True  # what a sample has settled, all readings begin with
         held = reduction.dropped[is_placed(problem.model)[reduction.dropped]]
-        if problem.model.observe == "distance":
+        if model.observe == "distance":
             # What no reading tells stays at its guess: a fit of the nominal arm takes it anywhere.
             problem = replace(problem, x0=moved(problem.x0, held, (started.x0 - problem.x0)[held]))
         elif not exact and len(held):
@@ -366,7 +390,7 @@ def solve(
 
 def with_placed(problem: Problem, tolerance: float) -> tuple[Problem, Array]:
     """The problem with base, markers and cable placed at x0, and the residual (rows,) there."""
-    placed = problem.free[is_placed(problem.model)[problem.free]]
+    placed = np.setdiff1d(problem.free[is_placed(problem.model)[problem.free]], problem.leaning)
     if not len(placed):
         return problem, problem.residual(problem.x0)
     found = tied_fit(replace(problem, free=placed), tolerance)

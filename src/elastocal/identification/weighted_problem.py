@@ -294,8 +294,9 @@ AT_ONCE = 2
 @dataclass(frozen=True)
 class Problem:
     """Fit parameters among those that are `free` to the observations, the others held at x0
-    (parameters,); `sizes` (parameters,) are typical ones, by which variables are scaled.  A part of
-    another problem has its observations `index` (n,), whitened on their own."""
+    (parameters,); `sizes` (parameters,) are typical ones, by which variables are scaled; those
+    placed that lean on the others (`solve.leaning`) are chosen last.  A part of another problem has
+    its observations `index` (n,), whitened on their own."""
 
     model: Model
     observations: Observations
@@ -304,6 +305,7 @@ class Problem:
     free: NDArray[np.int64]
     sizes: Array
     index: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    leaning: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     @cached_property
     def rows(self) -> IntArray:

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell
 from elastocal.cell_tables import EffectChoice, TargetBox, TargetPath, TargetPose
-from elastocal.identification.prediction import NewPoses
+from elastocal.identification.prediction import NewPoses, moves
 from elastocal.measurements import (
     NUMBERED,
     Measurements,
@@ -36,6 +36,7 @@ from elastocal.messages import (
     rounded,
     wish,
 )
+from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import (
     Chain,
     beyond_limits,
@@ -49,6 +50,7 @@ from elastocal.model.effects.base import LEVEL_TOLERANCE
 from elastocal.model.effects.catalogue import choose_effects
 from elastocal.model.effects.geometry import MarkerPosition
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
 from elastocal.model.rigid import Postures, inverse_kinematics
 from elastocal.planning.collision import data_base
 from elastocal.planning.feasibility import Feasibility, Struck
@@ -444,6 +446,17 @@ class TargetPoses(NewPoses):
         )
         weight = weight / weight.max()  # so that no sum overflows
         return cls(q, force, weight / weight.sum(), source, point, stated)
+
+    def rows(self, arm: CalibratedArm, observed: Observations) -> tuple[Array, Array]:
+        """As a plan counts (`known_rows`), of what this arm was identified from."""
+        if not self.stated.any() and fitted_markers(arm.model):
+            return super().rows(arm, observed)
+        A, left = prediction_rows(arm.model, self, arm.x), arm.left
+        if left is not None and fitted_markers(arm.model):
+            lost = moves(arm, A[self.stated])[1][..., np.isin(left.names, left.redundant)]
+            with suppress(InsufficientDataError):  # fewer than three markers hold no point
+                A = prediction_rows(arm.model, self, arm.x, carried=True) if lost.any() else A
+        return A.reshape(-1, 3, A.shape[-1]), np.repeat(self.weight, A.shape[1] // 3)
 
 
 def test_poses(

@@ -295,7 +295,10 @@ def sensitivity(d: Diagnosis) -> Iterator[str]:
         )
     visible = sum(c.visible for c in d.candidates)
     text = f"of {len(d.candidates)} candidates {visible} would have been found at typical size"
-    if faint := [c for c in d.candidates if c.hidden]:
+    faint = [c for c in d.candidates if c.hidden]
+    if rest := len(d.candidates) - visible - len(faint):
+        text += f", {rest} more perhaps"
+    if faint:
         kinds = dict.fromkeys(say.plain_name(c.effect) for c in faint)
         names = some(kinds, MOST_NAMED, more=" and {} more kinds")
         text += f"; below the noise even then: {len(faint)} ({names})"

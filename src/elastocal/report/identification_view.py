@@ -360,10 +360,7 @@ HELD = {
     findings.ABSORBED: ", absorbed in a combination",
     REDUNDANT: ", not identifiable at any pose under these loads (expected)",
 }
-WITHOUT = {
-    findings.UNREAD: "held: no reading of this marker",
-    findings.FIXED: "fixed by the user",
-}
+WITHOUT = {findings.UNREAD: "held: no reading of this marker", findings.FIXED: "fixed by the user"}
 
 
 def limits(result: Calibration, e: Estimate) -> str:
