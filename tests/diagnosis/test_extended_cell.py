@@ -116,11 +116,15 @@ def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
 def test_the_cell_says_where_its_smooth_functions_end(tmp_path):
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
     source = tmp_path / "cell.toml"
-    source.write_text('[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n')
+    own = '# hall 3\n[robot]\nurdf = "arm.urdf"  # of June\n[model]\n'
+    source.write_text(own + 'effects = ["base_frame"]  # so far\n# the end\n')
     settings = {"curve_low_rad": -1.5, "curve_high_rad": 1.5}
     curve = replace(ECCENTRICITY, effect="joint_curve", parameters=(), settings=settings)
     cell = write_extended_cell(source, tmp_path / "new.toml", (curve,))
-    assert f"{curve.where} from -85.9° to 85.9°;" in (tmp_path / "new.toml").read_text()
+    told, *kept = (tmp_path / "new.toml").read_text().partition(own)
+    assert f"{curve.where} from -85.9° to 85.9°;" in told
+    added = 'effects = ["base_frame", "joint_curve:joint2"]\n# the end\n\n[model.nominal.settings.'
+    assert kept[1].startswith(added)
     assert cell.model == read_cell(tmp_path / "new.toml").model
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from elastocal.above import checked_arguments
 from elastocal.cell import Cell, read_cell
 from elastocal.cell_tables import SOURCES, Convention, Robot
+from elastocal.config import toml_key, toml_value
 from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told
@@ -136,7 +137,7 @@ def first_cell(robot: Robot, folder: Path) -> str:
         " init. It runs as it is.",
         "# What the robot's file does not say is a guess, and marked so: replace it by your own.",
         *(f"# Note: {printable(note)}." for note in notes_of(robot, chain)),
-        f"name = {_text(chain.name)}",
+        f"name = {toml_value(chain.name)}",
         "",
         *_robot(robot, kind, path, folder),
         *_joints(chain),
@@ -197,25 +198,19 @@ def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
     return tree.placed(base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
 
 
-def _text(value: str) -> str:
-    import tomli_w
-
-    return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")
-
-
 def _vector(values: Any) -> str:
     return "[" + ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in values) + "]"
 
 
 def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
     yield "[robot]"
-    yield f"{kind} = {_text(Path(os.path.relpath(path, folder)).as_posix())}"
+    yield f"{kind} = {toml_value(Path(os.path.relpath(path, folder)).as_posix())}"
     if kind == "dh" and path.suffix.lower() == ".csv":
         yield f'dh_convention = "{robot.dh_convention}"' + " " * 7 + '# or "modified" (Craig)'
         yield '# masses = "links.csv"               # link masses, for weights: docs, File formats'
     for name in ("base", "flange", "ur_model", "joint_names"):
         if (value := getattr(robot, name)) is not None:
-            yield f"{name} = {_text(value)}"
+            yield f"{name} = {toml_value(value)}"
     yield ""
 
 
@@ -246,8 +241,7 @@ def _markers(reach: float, arm: MjcfArm | None) -> str:
         told = "guess; fitted below"
     lines = [f"{'[tool.markers_m]':<38} # {told}"]
     for name, at in stub.items():
-        bare = name.isascii() and name.replace("-", "_").replace("_", "a").isalnum()
-        lines.append(f"{name if bare else _text(name)} = {_vector(at)}")
+        lines.append(f"{toml_key(name)} = {_vector(at)}")
     return "\n".join(lines)
 
 
