@@ -133,9 +133,9 @@ def highest_origins(chain: Chain, up: Array) -> Array:
 
 
 def reach_of(chain: Chain) -> float:
-    """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
-    poses.  What carries an arm, as a rail, stands still: a slide before it, or several before as
-    many joints as an arm has; a gantry's slides move."""
+    """How far the flange gets from the first axis that turns, where the second is, in m: the
+    largest of 500 drawn poses.  What carries an arm, as a rail, stands still: a slide before it, or
+    several before as many joints as an arm has; a gantry's slides move."""
     low, high, q = drawn_joints(chain)
     turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
     first = turning[0] if turning else 0
@@ -145,7 +145,12 @@ def reach_of(chain: Chain) -> float:
     symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
     frames = [base, *nominal_frames(chain, symbol, base)]
     # A slide, where none turns, starts from where it stands at zero.
-    start = point(frames[first], chain.joints[first].placement[:3, 3])
+    joint = chain.joints[first]
+    start = point(frames[first], joint.placement[:3, 3])
+    if len(turning) > 1 and first == turning[0]:  # files put its frame anywhere along its axis
+        axis = frames[first][:3, :3] @ (joint.placement[:3, :3] @ joint.axis)
+        second = chain.joints[turning[1]].placement[:3, 3]
+        start += axis * ca.dot(axis, point(frames[turning[1]], second) - start)
     reach = ca.norm_2(frames[-1][:3, 3] - start)
     return float(BatchFunction([symbol], [reach])(q)[0].max())
 
