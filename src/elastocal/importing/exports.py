@@ -451,7 +451,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         ],
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
                         if i - 1 not in used),
-        "rows": len(kept), "ignored": tuple(sorted({*table.ignored, *ignored})),
+        "rows": len({*line}), "ignored": tuple(sorted({*table.ignored, *ignored})),
     }  # fmt: skip
     told = f"{name}: column %r states no unit and is not read; name it with one, as %s [%s]"
     doubts = [told % (n, c.stem, next(iter(FACTORS[c.quantities[0]]))) for n, c in no_unit.items()]
@@ -637,7 +637,8 @@ def _with_names_read(where: str, records: Records, names: mapping_file.NamesTabl
     good = np.setdiff1d(np.arange(len(records)), bad)
     kept = replace(records, texts=present | records.texts).take(good)
     ignored = tuple(sorted([*records.understood["ignored"], *reasons]))
-    return replace(kept, understood=kept.understood | {"rows": len(kept), "ignored": ignored})
+    rows = len({*kept.line})
+    return replace(kept, understood=kept.understood | {"rows": rows, "ignored": ignored})
 
 
 UNLOADED = ("none", "unloaded", "0")
