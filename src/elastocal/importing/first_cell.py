@@ -36,6 +36,7 @@ ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("elastocal_flange", "attachment_site", "flange", "tool0", "ee_site")
+WORLDS = (TRACKER, "world")  # roots that are no part of a robot
 MOST_SITES = 8  # listed as markers; of more most are something else
 THICKNESS = 15.0  # reach over a link's radius
 
@@ -120,9 +121,10 @@ def robot_of(
     require(convention == "standard", f"{option('convention')} is for DH tables; {is_for}")
     if kind == "urdf":
         tree = check_urdf(path)
-        if base is None and tree.root == TRACKER:
-            base = next(joint.child for joint in tree.joints if joint.parent == TRACKER)
-        return Robot.from_urdf(path, *tree.ends(base, flange or None))
+        start, end = tree.ends(base, flange or None)
+        first = tree.ways[end][0]
+        own = base is None and tree.root in WORLDS and not first.moves
+        return Robot.from_urdf(path, first.child if own else start, end)
     arm = MjcfArm.read(path, base, flange)
     there = arm.tree.places(arm.base, arm.flange) if flange is None else ()
     found = (site for site in FLANGE_SITES if site in there)
@@ -200,7 +202,7 @@ def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
     tree = check_urdf(robot.urdf)
     base = tree.root if robot.base is None else robot.base
     T, told = tree.placed(base), f"of '{base}' in the file's '{tree.root}', z up"
-    return (T if tree.root == TRACKER else pose_at(np.zeros(3), T[:3, :3])), told
+    return (T if tree.root in WORLDS else pose_at(np.zeros(3), T[:3, :3])), told
 
 
 def _vector(values: Any, digits: int = 4) -> str:
@@ -323,8 +325,10 @@ def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]
     thin = max(5 * round(thick * 0.6 / 5), 5)
     radii = [thick if i < n - 3 else thin for i in range(n)]
     # What never leaves the mounting plane is no body that could strike it.
-    highest = highest_origins(chain, turned[:, 2]) * 1e3
+    highest = highest_origins(chain) * 1e3
     radii = [0 if h <= r else r for h, r in zip(highest, radii, strict=True)]
+    if chain.kinds[:2] == ("prismatic", "prismatic"):  # of a gantry: no column in its middle
+        radii[0] = 0
     return {
         "station": f"position_m = {_vector([round(2 * reach, 1), 0, round(0.5 * reach, 1)])}",
         "effects": "\n    ".join(" ".join(effects[k : k + 2]) for k in range(0, len(effects), 2)),
