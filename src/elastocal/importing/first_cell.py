@@ -29,7 +29,7 @@ from elastocal.model.effects.statics import JointCompliance, feels_weight, usual
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load
-from elastocal.model.urdf import TRACKER, check_urdf, xacro_left
+from elastocal.model.urdf import TRACKER, Tree, check_urdf, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
@@ -122,13 +122,18 @@ def robot_of(
     if kind == "urdf":
         tree = check_urdf(path)
         start, end = tree.ends(base, flange or None)
-        first = tree.ways[end][0]
-        own = base is None and tree.root in WORLDS and not first.moves
-        return Robot.from_urdf(path, first.child if own else start, end)
+        return Robot.from_urdf(path, _own_base(tree, end) if base is None else start, end)
     arm = MjcfArm.read(path, base, flange)
     there = arm.tree.places(arm.base, arm.flange) if flange is None else ()
     found = (site for site in FLANGE_SITES if site in there)
-    return Robot.from_mjcf(path, base, next(found, arm.flange))
+    start = _own_base(arm.tree, arm.flange) if base is None else base
+    return Robot.from_mjcf(path, start, next(found, arm.flange))
+
+
+def _own_base(tree: Tree, flange: str) -> str:
+    """The root, or where that is no part of the robot what is fixed to it."""
+    first = tree.ways[tree.link_of(flange)[0]][0]
+    return tree.root if first.moves or tree.root not in WORLDS else first.child
 
 
 def first_cell(robot: Robot, folder: Path) -> str:
@@ -196,7 +201,7 @@ def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
     """T (4, 4) of the base in a frame whose z is up, as the file has it, and who says so."""
     if arm is not None:
         up, told = arm.upright()
-        return pose_at(np.zeros(3), up @ arm.tree.placed(arm.base)[:3, :3]), told
+        return pose_at(np.zeros(3), up) @ arm.tree.placed(arm.base), told
     if robot.urdf is None:
         return np.eye(4), "guess: the base stands upright"
     tree = check_urdf(robot.urdf)
