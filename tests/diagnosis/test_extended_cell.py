@@ -89,19 +89,15 @@ def test_reading_it_back_gives_the_same_cell_and_the_additions(layout, found, fo
         target = root / folder / "new.toml"
         before, after = read_cell(source), write_extended_cell(source, target, found)
 
-        added = [EffectChoice(f.effect, f.where) for f in found]
-        known = before.model.effects
-        effects = (*known, *(choice for choice in added if choice not in known))
-        constants = {place: dict(keys) for place, keys in before.model.nominal.settings.items()}
-        for f in found:
-            if f.settings:
-                constants.setdefault(f.where, {}).update(f.settings)
-        nominal = replace(before.model.nominal, settings=constants)
-        expected = replace(
-            before, path=target, model=replace(before.model, effects=effects, nominal=nominal)
-        )
-        assert alike(after, expected)
-        assert alike(read_cell(target), expected)
+        model, added = before.model, [EffectChoice(f.effect, f.where) for f in found]
+        constants = {place: dict(keys) for place, keys in model.nominal.settings.items()}
+        for f in (f for f in found if f.settings):
+            constants.setdefault(f.where, {}).update(f.settings)
+        nominal = replace(model.nominal, settings=constants)
+        effects = tuple(dict.fromkeys((*model.effects, *added)))
+        model = replace(model, effects=effects, nominal=nominal)
+        expected = replace(before, path=target, model=model)
+        assert alike(after, expected) and alike(read_cell(target), expected)
         assert source.read_text(encoding="utf-8") == text
 
 
