@@ -112,8 +112,9 @@ def expand_plan(
     """Every pose of a plan once per load state, repeat and marker.
 
     `load` (3,) in N adds a loaded reading after each unloaded one where the plan itself states
-    no forces.  Where rows are of another marker than the first, each stays with its own.  Rows
-    are ordered as one would measure: configuration, repeat, load, marker.
+    no forces.  Where rows are of another marker than the first, each stays with its own; repeats
+    that the plan itself states share the readings, rounded up.  Rows are ordered as one would
+    measure: configuration, repeat, load, marker.
     """
     forces = [plan.force]
     if load is not None:
@@ -123,6 +124,9 @@ def expand_plan(
     stated = plan.marker_names == marker_names and plan.marker.any()
     shape = len(plan), repeats, len(forces), 1 if stated else len(marker_names)
     index, repeat, state, marker = (part.ravel() for part in np.indices(shape))
+    visit = numbered(plan.configuration, plan.marker, load_states(plan.force))
+    kept = repeat < -(-repeats // np.bincount(visit)[visit])[index]
+    index, repeat, state, marker = (part[kept] for part in (index, repeat, state, marker))
     rows = replace(
         plan.take(index), repeat=plan.repeat[index] * repeats + repeat,
         marker=plan.marker[index] if stated else marker, marker_names=marker_names,

@@ -99,8 +99,7 @@ class Sources:
 
     @cached_property
     def digest(self) -> str:
-        lines = [f"{name} {value}" for name, value in sorted(self.digests.items())]
-        return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+        return _hash(*(f"{name} {value}" for name, value in sorted(self.digests.items())))
 
 
 @dataclass(frozen=True)
@@ -188,9 +187,16 @@ def _tasks(folder: Path, module: ModuleType, sources: Sources) -> Iterator[Row]:
             told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
             require(key not in stated.columns, told)
         values = json.loads(_json(where, dict(task)))
-        same = sources.digest, stated.seed, index, json.dumps(values, sort_keys=True)
-        digest = hashlib.sha256("\n".join(map(str, same)).encode()).hexdigest()
-        yield {"task": index, "task_hash": digest, "values": values}
+        told = _task_hash(sources.digest, stated.seed, index, values)
+        yield {"task": index, "task_hash": told, "values": values}
+
+
+def _hash(*parts: object) -> str:
+    return hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()
+
+
+def _task_hash(digest: str, seed: int, index: int, values: Row) -> str:
+    return _hash(digest, seed, index, json.dumps(values, sort_keys=True))
 
 
 def _json(where: str, value: Any) -> str:
@@ -578,15 +584,15 @@ def run_study(
 
     They run in `jobs` processes (by default one per core), or on the Dask scheduler at `cluster`,
     reached this `way` (tls_ca, tls_cert, tls_key, unencrypted).  `restart` discards the results in
-    the folder `output`, `retry_failed` those that are errors; `progress` takes the number of tasks,
-    of those that ended and of those that failed.
+    the folder `output`, `retry_failed` those that are errors, also where study.py was corrected
+    since; `progress` takes the number of tasks, of those that ended and of those that failed.
 
     Raises InputError where the results are of another study, or the cluster cannot be reached;
     ClusterLostError where the scheduler goes away.
     """
     folder, stop = Path(output), stop or StudyStop()
     with opened(folder):
-        known = [] if restart else _known(study, folder)
+        known, earlier = ([], []) if restart else _known(study, folder, retry_failed)
         kept = [line for line in known if not (retry_failed and line["task_error"])]
         there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
@@ -603,7 +609,7 @@ def run_study(
         statement = {
             "schema": SCHEMA, "title": stated.title, "seed": stated.seed,
             "options": stated.options, "tasks": len(study.tasks), "columns": stated.columns,
-            "sources": study.sources.digests, "elastocal": __version__,
+            "sources": study.sources.digests, "earlier": earlier, "elastocal": __version__,
         }  # fmt: skip
         atomic_write(folder / STATEMENT, messages.json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
@@ -623,19 +629,28 @@ def run_study(
     return Ending(total, before, ended - failed, failed, stop.asked)
 
 
-def _known(study: Study, folder: Path) -> list[Row]:
+def _known(study: Study, folder: Path, retry_failed: bool) -> tuple[list[Row], list[str]]:
+    """The lines of results there are, and the digests of earlier sources that made some of them."""
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
     before, columns = statement_of(folder), study.sources.stated.columns
     told = f"{folder}: has other columns, types or units than the study now. {here}"
     require(before.get("columns", columns) == columns, told)
-    lines = result_lines(folder)
+    lines, seed = result_lines(folder), study.sources.stated.seed
+    failed = any(line["task_error"] for line in lines)
+    earlier = list(before.get("earlier", []))
+    if retry_failed and failed:
+        earlier.append(_hash(*(f"{n} {v}" for n, v in sorted(before.get("sources", {}).items()))))
     for line in lines:
         at = line["task"]
-        if at < len(study.tasks) and study.tasks[at]["task_hash"] != line["task_hash"]:
+        if at >= len(study.tasks) or study.tasks[at]["task_hash"] == line["task_hash"]:
+            continue
+        values = study.tasks[at]["values"]
+        if line["task_hash"] not in [_task_hash(d, seed, at, values) for d in earlier]:
             changes = _changes(study, before) or [f"task {at} was another one"]
             told = f"{folder}: holds results of another study: {'; '.join(changes)}"
-            raise InputError(f"{told}. {here} to keep them")
-    return lines
+            retry = f", with {option('retry_failed', True)} to run tasks anew that failed"
+            raise InputError(f"{told}. {here} to keep them{retry * failed}")
+    return lines, sorted({*earlier} - {study.sources.digest})
 
 
 def _changes(now: Study, before: dict[str, Any]) -> list[str]:

@@ -13,6 +13,7 @@ from fuzz.mutations import ON_TEXT
 from hypothesis import given
 from hypothesis import strategies as st
 
+from elastocal import cell_tables as t
 from elastocal.cell import (
     Acceptance,
     CarriedBody,
@@ -24,23 +25,6 @@ from elastocal.cell import (
     Visibility,
     Workspace,
     read_cell,
-)
-from elastocal.cell_tables import (
-    CartesianNoise,
-    DesignSpec,
-    EffectChoice,
-    Freedom,
-    ModelSpec,
-    Motion,
-    Nominal,
-    PolarNoise,
-    Robot,
-    TargetBox,
-    TargetPath,
-    TargetPose,
-    Tool,
-    Tracker,
-    Unsteadiness,
 )
 from elastocal.messages import InputError
 
@@ -95,17 +79,17 @@ def whole(folder: Path) -> Cell:
     return Cell(
         name="cell 7",
         path=folder / "cell.toml",
-        robot=Robot(urdf=folder / "arm.urdf"),
-        tool=Tool([0.1, 0, 0.3], {"M1": [1, 2, 3], "ball, left": [0.1, 0.2, 0.3]}),
-        tracker=Tracker([3, 0, 1], CartesianNoise([10 * um, 20 * um, 30 * um]),
+        robot=t.Robot(urdf=folder / "arm.urdf"),
+        tool=t.Tool([0.1, 0, 0.3], {"M1": [1, 2, 3], "ball, left": [0.1, 0.2, 0.3]}),
+        tracker=t.Tracker([3, 0, 1], t.CartesianNoise([10 * um, 20 * um, 30 * um]),
                         rotation_sigma=50 * um),
-        model=ModelSpec(
+        model=t.ModelSpec(
             observe="pose",
-            effects=["base_frame", EffectChoice("joint_compliance", "joint2"),
-                     EffectChoice("marker_position", "marker:M1")],
+            effects=["base_frame", t.EffectChoice("joint_compliance", "joint2"),
+                     t.EffectChoice("marker_position", "marker:M1")],
             gear_ripple_orders=[121, 88.5],
             compliance_levels={"joint2": [-quarter, 0.0], "joint3": [0.5]},
-            nominal=Nominal(
+            nominal=t.Nominal(
                 joint_compliance=[1e-6, 0], base_position=[1, 2, 3],
                 # yaw after pitch after roll
                 base_rotation=np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]]),
@@ -117,7 +101,7 @@ def whole(folder: Path) -> Cell:
             ),
         ),
         limits={"joint1": [-np.pi, quarter], "joint3": [0, 0.5]},
-        noise=Unsteadiness(joints=5 * um),
+        noise=t.Unsteadiness(joints=5 * um),
         require=Acceptance(heldout=50 * um),
         certificate=CertificateEntries(limit=100 * um),
         plugins=[str(folder / "mine.py"), "json"],
@@ -133,19 +117,19 @@ def whole(folder: Path) -> Cell:
             visibility=Visibility({"M1": [0, 0, 1], "ball, left": [1, 0, 0]}, np.pi / 6,
                                   (0.5, 20.0)),
         ),
-        design=DesignSpec(
+        design=t.DesignSpec(
             poses=7, criterion="c", loads=[[0, 0, 0], [0, 0, -2600]], repeatability=60 * um,
             marker_sigma={"M1": 10 * um, "ball, left": 20 * um},
             combination={"joint2.compliance": 1.0, "joint3.compliance": -2.0},
             candidates=5000, taught=folder / "path.csv", target=30 * um,
             levels={"joint2": [-quarter, 0.0]}, per_level=[3, 4],
-            test_poses=[TargetPose([quarter, np.pi], [1, 2, 3], 1, [0.1, 0, 0], True),
-                        TargetPose([0.5, 1])],
-            test_path=TargetPath(folder / "path.csv"),
-            test_box=TargetBox([0, 0, 0], [1, 2, 3], 7, yaw, [0, 0, -1], [0, 1, 0]),
-            motion=Motion(speed=[quarter, np.pi], home=[0, quarter], overshoot=np.radians(3),
+            test_poses=[t.TargetPose([quarter, np.pi], [1, 2, 3], 1, [0.1, 0, 0], True),
+                        t.TargetPose([0.5, 1])],
+            test_path=t.TargetPath(folder / "path.csv"),
+            test_box=t.TargetBox([0, 0, 0], [1, 2, 3], 7, yaw, [0, 0, -1], [0, 1, 0]),
+            motion=t.Motion(speed=[quarter, np.pi], home=[0, quarter], overshoot=np.radians(3),
                           degrees=True),
-            choose=Freedom(tracker=[[2, -1, 0], [4, 1, 2]]),
+            choose=t.Freedom(tracker=[[2, -1, 0], [4, 1, 2]]),
         ),
     )  # fmt: skip
 
@@ -184,7 +168,7 @@ def test_each_key_is_read_for_itself(read):
 
 
 def test_what_is_not_stated_has_its_default(read, folder):
-    plain = Cell(name="cell", path=folder / "cell.toml", robot=Robot(urdf=folder / "arm.urdf"))
+    plain = Cell(name="cell", path=folder / "cell.toml", robot=t.Robot(urdf=folder / "arm.urdf"))
     for more in ("", "[workspace]\n", "[workspace]\ngeometry = 'none'\n", "[design]\n",
                  "[design.motion]\n", "[noise]\n", "[tracker]\n"):  # fmt: skip
         for text in (ROBOT + more, "\ufeff" + ROBOT + more, (ROBOT + more).replace("\n", "\r\n")):
@@ -208,8 +192,8 @@ def test_other_robots_and_other_noise(read, folder):
     cell = read('[robot]\ndh = "dh.csv"\ndh_convention = "modified"\nmasses = "links.csv"\n'
                 "[tracker]\nrange_um = 5\nrange_ppm = 0.5\ntransverse_um = 15\n"
                 "transverse_ppm = 6\n")  # fmt: skip
-    assert cell.robot == Robot.from_dh(folder / "dh.csv", "modified", folder / "links.csv")
-    assert cell.tracker.noise == PolarNoise(5e-6, 5e-7, 1.5e-5, 6e-6)
+    assert cell.robot == t.Robot.from_dh(folder / "dh.csv", "modified", folder / "links.csv")
+    assert cell.tracker.noise == t.PolarNoise(5e-6, 5e-7, 1.5e-5, 6e-6)
     assert read(ROBOT + "[workspace]\ngeometry = 'urdf'").workspace.urdf_geometry
 
 
@@ -282,18 +266,18 @@ def test_other_encodings_and_absurd_texts_are_refused(refusal, text):
 
 
 IN_PYTHON = {
-    "unknown": (lambda: Tool(load_pont=[0, 0, 0]), "Tool has no load_pont.*'load_point'"),
+    "unknown": (lambda: t.Tool(load_pont=[0, 0, 0]), "Tool has no load_pont.*'load_point'"),
     "missing": (lambda: Solid("a", "box"), "Solid: size is missing"),
-    "shape": (lambda: Tool([0, 0]), r"Tool: load_point takes three numbers in m.*\[0, 0\]"),
-    "unit": (lambda: CartesianNoise(-1), "sigma takes a positive number in m, or three"),
-    "choice": (lambda: ModelSpec(observe="positon"), r"observe takes .* \(did you mean 'position'"),
+    "shape": (lambda: t.Tool([0, 0]), r"Tool: load_point takes three numbers in m.*\[0, 0\]"),
+    "unit": (lambda: t.CartesianNoise(-1), "sigma takes a positive number in m, or three"),
+    "choice": (lambda: t.ModelSpec(observe="positon"), r"observe takes .*you mean 'position'"),
     "spring": (
-        lambda: Nominal(gravity_compensator={"joint": "joint2", "arm": 1.0}),
+        lambda: t.Nominal(gravity_compensator={"joint": "joint2", "arm": 1.0}),
         "gravity_compensator: unknown key arm; missing unit: did you mean arm_m",
     ),
     "not a part": (lambda: Cell("a", robot="arm.urdf"), "Cell: robot takes an instance of Robot"),
     "no marker": (
-        lambda: Cell("a", design=DesignSpec(marker_sigma={"M1": 1e-5})).check(),
+        lambda: Cell("a", design=t.DesignSpec(marker_sigma={"M1": 1e-5})).check(),
         "a: .*no marker of the cell",
     ),
 }  # fmt: skip

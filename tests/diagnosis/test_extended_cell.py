@@ -89,19 +89,15 @@ def test_reading_it_back_gives_the_same_cell_and_the_additions(layout, found, fo
         target = root / folder / "new.toml"
         before, after = read_cell(source), write_extended_cell(source, target, found)
 
-        added = [EffectChoice(f.effect, f.where) for f in found]
-        known = before.model.effects
-        effects = (*known, *(choice for choice in added if choice not in known))
-        constants = {place: dict(keys) for place, keys in before.model.nominal.settings.items()}
-        for f in found:
-            if f.settings:
-                constants.setdefault(f.where, {}).update(f.settings)
-        nominal = replace(before.model.nominal, settings=constants)
-        expected = replace(
-            before, path=target, model=replace(before.model, effects=effects, nominal=nominal)
-        )
-        assert alike(after, expected)
-        assert alike(read_cell(target), expected)
+        model, added = before.model, [EffectChoice(f.effect, f.where) for f in found]
+        constants = {place: dict(keys) for place, keys in model.nominal.settings.items()}
+        for f in (f for f in found if f.settings):
+            constants.setdefault(f.where, {}).update(f.settings)
+        nominal = replace(model.nominal, settings=constants)
+        effects = tuple(dict.fromkeys((*model.effects, *added)))
+        model = replace(model, effects=effects, nominal=nominal)
+        expected = replace(before, path=target, model=model)
+        assert alike(after, expected) and alike(read_cell(target), expected)
         assert source.read_text(encoding="utf-8") == text
 
 
@@ -116,11 +112,15 @@ def test_a_bad_cell_is_refused_and_nothing_written(tmp_path, text):
 def test_the_cell_says_where_its_smooth_functions_end(tmp_path):
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
     source = tmp_path / "cell.toml"
-    source.write_text('[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n')
+    own = '# hall 3\n[robot]\nurdf = "arm.urdf"  # of June\n[model]\n'
+    source.write_text(own + 'effects = ["base_frame"]  # so far\n# the end\n')
     settings = {"curve_low_rad": -1.5, "curve_high_rad": 1.5}
     curve = replace(ECCENTRICITY, effect="joint_curve", parameters=(), settings=settings)
     cell = write_extended_cell(source, tmp_path / "new.toml", (curve,))
-    assert f"{curve.where} from -85.9° to 85.9°;" in (tmp_path / "new.toml").read_text()
+    told, *kept = (tmp_path / "new.toml").read_text().partition(own)
+    assert f"{curve.where} from -85.9° to 85.9°;" in told
+    added = 'effects = ["base_frame", "joint_curve:joint2"]\n# the end\n\n[model.nominal.settings.'
+    assert kept[1].startswith(added)
     assert cell.model == read_cell(tmp_path / "new.toml").model
 
 

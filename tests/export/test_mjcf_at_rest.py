@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from support.exports import LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
+import elastocal as ec
 from elastocal.export.robot_files import MujocoRest
 from elastocal.model.effects.base import Parameter
 
@@ -67,6 +69,11 @@ def test_every_spring_that_a_file_can_hold(tmp_path: Path) -> None:
     text = check_rest(*written)
     springs = [j for j in ET.fromstring(text).iter("joint") if j.get("stiffness")]
     assert len(springs) == 6 + 12 + 3 + 2
+    (tmp_path / "again.xml").write_text(text)
+    again = tomllib.loads(ec.init(tmp_path / "again.xml"))  # the same arm, without its springs
+    limits = {f"joint{i}_deg": [-e, e] for i, e in enumerate((185, 0, 0, 350, 125, 350), 1)}
+    limits |= {"joint2_deg": [-146, 0], "joint3_deg": [-119, 155]}
+    assert again["limits"] == limits and list(again["tool"]["markers_m"]) == ["M1", "M2"]
 
 
 def test_weights_compensator_and_a_payload_not_as_declared(tmp_path: Path) -> None:

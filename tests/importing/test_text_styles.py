@@ -72,7 +72,7 @@ def test_preamble_repeated_headers_footers_and_rows_without_a_value(tmp_path):
 
 POINT = '[[source]]\nrole = "points"\ncolumns = {x_mm = "x", y_mm = "y", z_mm = "z"}\n'
 KRL = "$AXIS_ACT={E6AXIS: A1 1.5, A2 -2E1,\n A3 3, A4 4, A5 5, A6 6}\nPOS Q={X 1,Y 2,Z 3}\n"
-KRL += "DECL AXIS P[2]={A1 7,A2 8,A3 9,A4 1,A5 2,A6 3} ; {A1 9}"
+KRL += "DECL AXIS P[2]={A1 7,A2 8,A3 9,A4 1,A5 2,A6 3} ; {A1 9}\n; via point\nPTP {A1 1}"
 RAPID = """\
 PERS jointtarget j{2}:=[[[1.5,-20,3,4,5,6],[1.5,9E9,9E9,9E9,9E9,9E9]],
 [[7,8,9,1,2,3],[2.5,9E9,9E9,9E9,9E9,9E9]]];
@@ -86,7 +86,9 @@ def program(tmp_path, text, preset):
     return imported(tmp_path, files, mapping)
 
 
-@pytest.mark.parametrize(("text", "preset", "lines"), [(KRL, "kuka", [3]), (RAPID, "abb", [3, 4])])
+@pytest.mark.parametrize(
+    ("text", "preset", "lines"), [(KRL, "kuka", [3, 6]), (RAPID, "abb", [3, 4])]
+)
 def test_robot_programs_over_several_lines_in_logs_and_arrays(tmp_path, text, preset, lines):
     found = program(tmp_path, text, preset)
     joints = [[1.5, -20, 3, 4, 5, 6], [7, 8, 9, 1, 2, 3]]

@@ -97,6 +97,10 @@ def test_the_clock_runs_as_the_order_takes() -> None:
             if len(moved):
                 assert stop.approach[joint] == np.sign(moved[-1])
         last = stop.q
+    once_more = replace(stops[0], part=1, time=9999.0)  # a visit has a row of its own
+    twice = replace(plan, execution=replace(plan.execution, stops=(*stops, once_more))).table()
+    assert sorted(twice.time) == pytest.approx([*times, 9999.0], abs=1e-3)
+    assert twice.repeat.sum() == 1
 
 
 def test_to_find_them_too_costs_something_and_the_certificate_stays() -> None:

@@ -53,11 +53,15 @@ def test_one_that_raises_is_recorded_with_its_traceback_until_it_is_retried(tmp_
     assert log.count('raise ArithmeticError("two")') == 2
     assert 'task 8 {"n": 16, "label": "many", "replicate": 2}' in log
     assert set(numbers(results)["task"]) == set(range(12)) - {2, 8}
-    (tmp_path / "mended").touch()
     again = run_study(folder, results)
     assert (again.before, again.failed) == (12, 2)
+    (tmp_path / "mended").touch()
+    write_study(folder, script + "# corrected")
+    with pytest.raises(InputError, match=r"study\.py changed.*retry_failed=True"):
+        run_study(folder, results)
     retried = run_study(folder, results, retry_failed=True)
     assert (retried.before, retried.done, retried.failed) == (10, 12, 0)
+    assert run_study(folder, results).before == 12
     assert not failures(results) and len(numbers(results)) == 24
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -11,11 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tomli_w
 from scipy.special import expit
 
 from elastocal.cell import Cell, read_cell
-from elastocal.config import read_toml
+from elastocal.config import MAX_BYTES, read_toml, rewritten_toml
 from elastocal.diagnosis.baseline import Baseline, NoiseValues, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import (
@@ -53,7 +53,7 @@ from elastocal.diagnosis.verdict import (
     unheard_of,
     warnings,
 )
-from elastocal.files import atomic_writer, is_plugin_file
+from elastocal.files import atomic_writer, is_plugin_file, read_text
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.identify import misread_for_a_while
 from elastocal.identification.mistakes import refuse_nonsense
@@ -93,8 +93,7 @@ def write_extended_cell(
     `[model.nominal.sizes]`.  Relative paths are rewritten so that they lead from `target`'s folder
     to the same files; a cell without a name keeps the one that its old file gave it.
     `model_keys` join [model] as they are; with `keys`, which join the whole file by table, nothing
-    is left to be chosen for a plan.  Comments are not carried over.  Without effects the model is
-    the one that was read.
+    is left to be chosen for a plan.  Lines that say the same stay as they are written.
 
     Raises InputError where `source` is no valid cell file or `target` cannot be written."""
     source, target = Path(source), Path(target)
@@ -116,16 +115,24 @@ def write_extended_cell(
     if keys:
         data.get("design", {}).pop("choose", None)
         _join(data, keys)
+    text = rewritten_toml(
+        re.sub(ENDS.format(".*"), "", read_text(source, "cell file", MAX_BYTES)), data
+    )
     with atomic_writer(target) as handle:
-        handle.write(tomli_w.dumps(data))
+        handle.write(text)
         handle.flush()
         # Read before it appears: a cell that cannot be read is not left behind.
         written = replace(read_cell(handle.name), path=target)
         if ends := where_smooth_functions_end(written):
             handle.seek(0)
-            handle.write(f"# Smooth functions correct the arm where it was measured, {ends};\n")
-            handle.write("# beyond, the model without them holds.\n" + tomli_w.dumps(data))
+            handle.write(ENDS.format(ends) + text)
         return written
+
+
+ENDS = """\
+# Smooth functions correct the arm where it was measured, {};
+# beyond, the model without them holds.
+"""
 
 
 def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:

@@ -24,8 +24,17 @@ from elastocal.model import mjcf
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.base import Spring, transverse_axes
 from elastocal.model.effects.statics import STANDARD_GRAVITY
-from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, transform
-from elastocal.model.urdf import MAX_BYTES, Tag, XmlFile, comment, element, tree_of, urdf_file
+from elastocal.model.mjcf import AXES, SPRING, SPRING_OF_NEW, MjcfArm, import_mujoco, transform
+from elastocal.model.urdf import (
+    MAX_BYTES,
+    TRACKER,
+    Tag,
+    XmlFile,
+    comment,
+    element,
+    tree_of,
+    urdf_file,
+)  # fmt: skip
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 
@@ -60,7 +69,7 @@ def nothing(T: Array) -> bool:
 # limits, mimics and calibration marks, which are stated in commanded values, stay as they are.
 
 PREFIX = "elastocal_"
-MOUNT, TRACKER, LOAD_POINT = f"{PREFIX}flange_mount", f"{PREFIX}tracker", f"{PREFIX}load_point"
+MOUNT, LOAD_POINT = f"{PREFIX}flange_mount", f"{PREFIX}load_point"
 
 
 def calibrated_urdf(
@@ -296,7 +305,7 @@ def calibrated_mjcf(
         integrator="implicitfast",
     )  # fmt: skip
     world = ET.SubElement(root, "worldbody")
-    ET.SubElement(world, "site", placed_body("tracker_axes", pose_at(np.zeros(3), R)))
+    ET.SubElement(world, "site", placed_body(AXES, pose_at(np.zeros(3), R)))
     actuators = ET.Element("actuator")
     body = _body(world, "base", pieces.T_tracker_base if base_frame else np.eye(4))
     _passive(body, pieces.springs_at("base"))
@@ -350,7 +359,7 @@ def _tool(flange: ET.Element, actuators: ET.Element, pieces: ExportNumbers) -> N
     # Forces along the tracker's axes, which keep their direction while the arm moves.
     for axis, unit in zip("xyz", np.eye(3, 6), strict=True):
         ET.SubElement(
-            actuators, "motor", name=f"load_{axis}", site="load_point", refsite="tracker_axes",
+            actuators, "motor", name=f"load_{axis}", site="load_point", refsite=AXES,
             gear=numbers(pieces.load_scale * unit),
         )  # fmt: skip
 
@@ -372,7 +381,7 @@ def _body(
 
 def _passive(body: ET.Element, springs: dict[Spring, float], frame: Array = IDENTITY) -> None:
     for spring, compliance in springs.items():
-        ET.SubElement(body, "joint", spring_joint("spring_", spring, compliance, frame))
+        ET.SubElement(body, "joint", spring_joint(SPRING_OF_NEW, spring, compliance, frame))
 
 
 def spring_joint(prefix: str, spring: Spring, compliance: float, F: Array) -> dict[str, str]:
@@ -394,14 +403,13 @@ def _motor(
     body: ET.Element, actuators: ET.Element, joint: Joint, name: str, compliance: float
 ) -> None:
     kp = 1.0 / compliance if compliance > 0 else RIGID
-    ET.SubElement(
-        body, "joint", name=name, type=MOTIONS[joint.kind], axis=numbers(joint.axis),
-        armature=_armature(kp),
-    )  # fmt: skip
+    moves = {"name": name, "type": MOTIONS[joint.kind], "axis": numbers(joint.axis)}
     drive = {"name": name, "joint": name, "kp": repr(kp), "kv": repr(SETTLING * kp)}
     # Limits are stated for what is commanded; the joint itself may yield past them.
     if math.isfinite(joint.lower) and math.isfinite(joint.upper):
-        drive |= {"ctrllimited": "true", "ctrlrange": numbers([joint.lower, joint.upper])}
+        moves |= {"limited": "false", "range": numbers([joint.lower, joint.upper])}
+        drive |= {"ctrllimited": "true", "ctrlrange": moves["range"]}
+    ET.SubElement(body, "joint", moves, armature=_armature(kp))
     ET.SubElement(actuators, "position", drive)
 
 
@@ -541,6 +549,8 @@ def corrected_mjcf(
     flange."""
     assert robot.mjcf is not None
     text = _MjcfText(MjcfArm.read(robot.mjcf, robot.base, robot.flange), pieces)
+    if AXES in text.arm.tree.frames:
+        raise NotInPlace("an earlier export made it, with actuators for springs")
     if pieces.springs_at(f"link{pieces.chain.n_joints}"):
         raise NotInPlace("a spring behind the last joint has no joint to stand before")
     sprung: dict[int, int] = {}  # joint → springs put before it

@@ -213,6 +213,7 @@ NO_JOINTS["robtarget"] = "no joint values"
 # is looked through once, not from each of its letters.
 _KRL = re.compile(r"(?:(?<![\w$])([$A-Za-z_][\w$]*+(?:\[\s*+\d++\s*+\])?)\s*+=\s*+)?\{([^{}]*+)\}")
 _KRL_PART = re.compile(r"([A-Za-z_]\w*+(?:\[\s*+\])?)\s++(\S.*)")
+_OF_DESIGN = re.compile("; (?:configuration (.+)|via point)")  # above a move of its programs
 _RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?\s*+:=")
 _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
@@ -222,7 +223,8 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
     aggregate of A1, A2 … (and E1 …); FRAME, POS and E6POS (X, Y, Z) are passed over.  RAPID: every
     jointtarget [[rax_1 … rax_6], [eax_a … eax_f]], an array's members named P{1}, P{2} …;
     robtargets hold no joint values and o_jointtarget is the position before a correction: both are
-    passed over, and named."""
+    passed over, and named, as are via points of a program of `design`, whose comments name poses.
+    """
     axes, mark, read, what = {
         "krl": (KRL_AXES, ";", _krl, "no {A1 …, A2 …} with joint values"),
         "rapid": (RAPID_AXES, "!", _rapid, "no jointtarget [[…], […]]"),
@@ -244,6 +246,11 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
                     f"{source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
                     "values, not expressions"
                 )
+        if own := _OF_DESIGN.match(lines[line - 2] if line > 1 else ""):
+            if own[1] is None:
+                ignored.append((line, "a via point, not measured"))
+                continue
+            name = name or own[1]
         kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
         rows.append((line, [name, *(kept.get(axis, "") for axis in axes)]))
     passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
@@ -451,7 +458,7 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         ],
         "unused": tuple(n or f"column {i}" for i, n in enumerate(table.header, 1)
                         if i - 1 not in used),
-        "rows": len(kept), "ignored": tuple(sorted({*table.ignored, *ignored})),
+        "rows": len({*line}), "ignored": tuple(sorted({*table.ignored, *ignored})),
     }  # fmt: skip
     told = f"{name}: column %r states no unit and is not read; name it with one, as %s [%s]"
     doubts = [told % (n, c.stem, next(iter(FACTORS[c.quantities[0]]))) for n, c in no_unit.items()]
@@ -637,7 +644,8 @@ def _with_names_read(where: str, records: Records, names: mapping_file.NamesTabl
     good = np.setdiff1d(np.arange(len(records)), bad)
     kept = replace(records, texts=present | records.texts).take(good)
     ignored = tuple(sorted([*records.understood["ignored"], *reasons]))
-    return replace(kept, understood=kept.understood | {"rows": len(kept), "ignored": ignored})
+    rows = len({*kept.line})
+    return replace(kept, understood=kept.understood | {"rows": rows, "ignored": ignored})
 
 
 UNLOADED = ("none", "unloaded", "0")

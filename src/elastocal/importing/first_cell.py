@@ -19,6 +19,7 @@ import numpy as np
 from elastocal.above import checked_arguments
 from elastocal.cell import Cell, read_cell
 from elastocal.cell_tables import SOURCES, Convention, Robot
+from elastocal.config import toml_key, toml_value
 from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
 from elastocal.model.chain import Chain, clashing, jaw_told, names_told
@@ -28,13 +29,14 @@ from elastocal.model.effects.statics import JointCompliance, feels_weight, usual
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load
-from elastocal.model.urdf import check_urdf, xacro_left
-from elastocal.units import Array, rpy_from_rotation
+from elastocal.model.urdf import TRACKER, Tree, check_urdf, xacro_left
+from elastocal.units import Array, pose_at, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
 # Sites that are flanges by what MuJoCo users call them.
-FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
+FLANGE_SITES = ("elastocal_flange", "attachment_site", "flange", "tool0", "ee_site")
+WORLDS = (TRACKER, "world")  # roots that are no part of a robot
 MOST_SITES = 8  # listed as markers; of more most are something else
 THICKNESS = 15.0  # reach over a link's radius
 
@@ -118,10 +120,20 @@ def robot_of(
         return replace(Robot.from_dh(path, convention), ur_model=ur_model)
     require(convention == "standard", f"{option('convention')} is for DH tables; {is_for}")
     if kind == "urdf":
-        return Robot.from_urdf(path, *check_urdf(path).ends(base, flange or None))
+        tree = check_urdf(path)
+        start, end = tree.ends(base, flange or None)
+        return Robot.from_urdf(path, _own_base(tree, end) if base is None else start, end)
     arm = MjcfArm.read(path, base, flange)
-    found = (site for site in FLANGE_SITES if flange is None and site in arm.sites())
-    return Robot.from_mjcf(path, base, next(found, arm.flange))
+    there = arm.tree.places(arm.base, arm.flange) if flange is None else ()
+    found = (site for site in FLANGE_SITES if site in there)
+    start = _own_base(arm.tree, arm.flange) if base is None else base
+    return Robot.from_mjcf(path, start, next(found, arm.flange))
+
+
+def _own_base(tree: Tree, flange: str) -> str:
+    """The root, or where that is no part of the robot what is fixed to it."""
+    first = tree.ways[tree.link_of(flange)[0]][0]
+    return tree.root if first.moves or tree.root not in WORLDS else first.child
 
 
 def first_cell(robot: Robot, folder: Path) -> str:
@@ -136,11 +148,11 @@ def first_cell(robot: Robot, folder: Path) -> str:
         " init. It runs as it is.",
         "# What the robot's file does not say is a guess, and marked so: replace it by your own.",
         *(f"# Note: {printable(note)}." for note in notes_of(robot, chain)),
-        f"name = {_text(chain.name)}",
+        f"name = {toml_value(chain.name)}",
         "",
         *_robot(robot, kind, path, folder),
         *_joints(chain),
-        REST.format(**_guesses(chain, reach, *_mount(robot, arm)), markers=_markers(reach, arm)),
+        REST.format(**_guesses(chain, reach, *_mount(robot, arm)), **_tool(robot, reach, arm)),
     ]
     return "\n".join(lines)
 
@@ -186,36 +198,31 @@ def placeholder_masses(chain: Chain) -> str:
 
 
 def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
-    """Rotation (3, 3) of the base in a frame whose z is up, as the file has it, and who says so."""
+    """T (4, 4) of the base in a frame whose z is up, as the file has it, and who says so."""
     if arm is not None:
         up, told = arm.upright()
-        return up @ arm.tree.placed(arm.base)[:3, :3], told
+        return pose_at(np.zeros(3), up) @ arm.tree.placed(arm.base), told
     if robot.urdf is None:
-        return np.eye(3), "guess: the base stands upright"
+        return np.eye(4), "guess: the base stands upright"
     tree = check_urdf(robot.urdf)
     base = tree.root if robot.base is None else robot.base
-    return tree.placed(base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
+    T, told = tree.placed(base), f"of '{base}' in the file's '{tree.root}', z up"
+    return (T if tree.root in WORLDS else pose_at(np.zeros(3), T[:3, :3])), told
 
 
-def _text(value: str) -> str:
-    import tomli_w
-
-    return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")
-
-
-def _vector(values: Any) -> str:
-    return "[" + ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in values) + "]"
+def _vector(values: Any, digits: int = 4) -> str:
+    return "[" + ", ".join(f"{round(float(v), digits) + 0.0:g}" for v in values) + "]"
 
 
 def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
     yield "[robot]"
-    yield f"{kind} = {_text(Path(os.path.relpath(path, folder)).as_posix())}"
+    yield f"{kind} = {toml_value(Path(os.path.relpath(path, folder)).as_posix())}"
     if kind == "dh" and path.suffix.lower() == ".csv":
         yield f'dh_convention = "{robot.dh_convention}"' + " " * 7 + '# or "modified" (Craig)'
         yield '# masses = "links.csv"               # link masses, for weights: docs, File formats'
     for name in ("base", "flange", "ur_model", "joint_names"):
         if (value := getattr(robot, name)) is not None:
-            yield f"{name} = {_text(value)}"
+            yield f"{name} = {toml_value(value)}"
     yield ""
 
 
@@ -235,26 +242,36 @@ def _joints(chain: Chain) -> Iterator[str]:
     yield ""
 
 
-def _markers(reach: float, arm: MjcfArm | None) -> str:
-    sites = {} if arm is None else arm.sites()
-    usable = {n: p for n, p in sites.items() if n == n.strip() == printable(n)}
-    if 0 < len(usable) <= MOST_SITES:
-        stub, told = usable, "the model's sites; keep the reflectors"
-    else:
+def _tool(robot: Robot, reach: float, arm: MjcfArm | None) -> dict[str, str]:
+    """Load point and markers: those of the file, where `export` has put them there."""
+    there: dict[str, Array] = {}
+    if arm is not None:
+        there = arm.tree.places(arm.base, arm.flange)
+    elif robot.urdf is not None:
+        tree = check_urdf(robot.urdf)
+        there = tree.places(*tree.ends(robot.base, robot.flange))
+    usable = {n: p for n, p in there.items() if n == n.strip() == printable(n)}
+    told, side, digits = "the model's sites; keep the reflectors", reach / 12, 4
+    # Off the last joint's axis, which a load on it would not turn.
+    load, whose = np.array([side, 0, side]), "guess: where a load hangs"
+    own = {n.removeprefix("elastocal_"): p for n, p in usable.items()}
+    if "load_point" in own:
+        load, whose, told, digits = own["load_point"], "of the file", "of the file", 6
+        usable = {n.removeprefix("marker_"): own[n] for n in own if n.startswith("marker_")}
+    if not 0 < len(usable) <= MOST_SITES:
         places = {"M1": (1, 0.0, 1 / 3), "M2": (-0.5, 0.9, 0.5), "M3": (-0.5, -0.9, 1)}
-        stub = {name: reach / 12 * np.array(at) for name, at in places.items()}
-        told = "guess; fitted below"
+        usable = {name: side * np.array(at) for name, at in places.items()}
+        told, digits = "guess; fitted below", 4
     lines = [f"{'[tool.markers_m]':<38} # {told}"]
-    for name, at in stub.items():
-        bare = name.isascii() and name.replace("-", "_").replace("_", "a").isalnum()
-        lines.append(f"{name if bare else _text(name)} = {_vector(at)}")
-    return "\n".join(lines)
+    lines += [f"{toml_key(name)} = {_vector(at, digits)}" for name, at in usable.items()]
+    load_line = f"load_point_m = {_vector(load, digits)}"
+    return {"load_point": f"{load_line:<38} # {whose}", "markers": "\n".join(lines)}
 
 
 # What follows robot and limits: keys at their guesses, each line's remark in column 40.
 REST = """\
 [tool]                                 # all in m, in the flange frame
-{load_point:<38} # guess: where a load hangs
+{load_point}
 
 {markers}
 
@@ -271,7 +288,7 @@ effects = [
 {gravity:<38} # {weights}
 
 [model.nominal]                        # the robot's base in the data's frame
-base_position_m = [0, 0, 0]            # guess: the base is the origin of the data
+{position:<38} # {placed}
 {turned:<38} # {whose}
 
 [workspace]                            # where the arm may be; design keeps to it
@@ -280,7 +297,7 @@ clearance_mm = {clearance}
 
 [[workspace.keep_out]]
 name = "mounting plane"                # the arm stays above it, z of the base
-point_m = [0, 0, 0]
+point_m = {origin}
 normal = {up}
 
 # [[workspace.obstacle]]
@@ -296,8 +313,8 @@ candidates = 2000                      # to choose from; more take longer
 """
 
 
-def _guesses(chain: Chain, reach: float, turned: Array, whose: str) -> dict[str, Any]:
-    n, side = chain.n_joints, reach / 12
+def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]:
+    n, turned, origin = chain.n_joints, T[:3, :3], T[:3, 3]
     names = [effect.name for effect in (BaseFrame, MarkerPosition, JointOffset, LinkGeometry)]
     sprung = [j + 1 for j in range(n) if feels_weight(chain, j, turned[2])]
     names += [f"{JointCompliance.name}:joint{i}" for i in sprung]
@@ -313,15 +330,18 @@ def _guesses(chain: Chain, reach: float, turned: Array, whose: str) -> dict[str,
     thin = max(5 * round(thick * 0.6 / 5), 5)
     radii = [thick if i < n - 3 else thin for i in range(n)]
     # What never leaves the mounting plane is no body that could strike it.
-    highest = highest_origins(chain, turned[:, 2]) * 1e3
+    highest = highest_origins(chain) * 1e3
     radii = [0 if h <= r else r for h, r in zip(highest, radii, strict=True)]
+    if chain.kinds[:2] == ("prismatic", "prismatic"):  # of a gantry: no column in its middle
+        radii[0] = 0
     return {
-        # Off the last joint's axis, which a load on it would not turn.
-        "load_point": f"load_point_m = {_vector([side, 0, side])}",
         "station": f"position_m = {_vector([round(2 * reach, 1), 0, round(0.5 * reach, 1)])}",
         "effects": "\n    ".join(" ".join(effects[k : k + 2]) for k in range(0, len(effects), 2)),
         "gravity": f"link_gravity = {str(weighed).lower()}",
         "weights": told,
+        "position": f"base_position_m = {_vector(origin)}",
+        "placed": "of the file" if origin.any() else "guess: the base is the origin of the data",
+        "origin": _vector(origin),
         "turned": f"base_rpy_deg = {_vector(np.degrees(rpy_from_rotation(turned)))}",
         "whose": whose,
         "radii": f"link_radius_mm = [{', '.join(map(str, radii))}]",

@@ -36,8 +36,9 @@ from elastocal.model.urdf import MAX_BYTES, MOVING, FileJoint, Tag, Tree, XmlFil
 from elastocal.units import Array, pose_at
 
 WORLD = 0  # MuJoCo's number of the world body
-# Springs that `elastocal export` adds; they are held at zero, so the nominal arm has none.
-SPRING = "elastocal_spring_"
+# Springs that `elastocal export` adds to a file, and those in a new one, which has the site AXES;
+# they are held at zero, so the nominal arm has none.
+SPRING, SPRING_OF_NEW, AXES = "elastocal_spring_", "spring_", "tracker_axes"
 # MuJoCo wants masses of moving bodies; where a file's meshes are missing, these stand for them.
 STAND_IN = 1e-6
 MOST_MESH_BYTES = 100_000_000  # a larger one is taken as missing
@@ -129,15 +130,6 @@ class MjcfArm:
         told = self._weights_told() if found.masses else ()
         return replace(found, notes=(*self.told, *told))
 
-    def sites(self) -> dict[str, Array]:
-        """Name → place (3,) in m in the flange frame of every site that moves with the flange."""
-        frames = self.tree.frames | {self.flange: self.tree.link_of(self.flange)}
-        last = len(self.moving) - 1
-        at = {name: self._carriers[link][1] @ T for name, (link, T) in frames.items()
-              if self._carriers.get(link, (-1,))[0] == last}  # fmt: skip
-        end = at.pop(self.flange)
-        return {name: np.asarray(np.linalg.solve(end, T)[:3, 3]) for name, T in at.items()}
-
     def upright(self) -> tuple[Array, str]:
         """Rotation (3, 3) of the file's world that turns its gravity down, and who says so."""
         size = float(np.linalg.norm(self.model.opt.gravity))
@@ -189,7 +181,7 @@ class MjcfArm:
         rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
         rows &= ~np.isin(data.efc_id, [e for e in range(model.neq) if self._drags(e)])
         J, which = data.efc_J.reshape(-1, model.nv)[rows], data.efc_id[rows]
-        springs = [j for j in range(model.njnt) if model.joint(j).name.startswith(SPRING)]
+        springs = [j for j in range(model.njnt) if is_spring(model, j)]
         others = np.delete(J, [*own, *model.jnt_dofadr[springs]], axis=1)
         N = null_space(np.hstack([others, np.zeros((len(J), 1))]).T).T if len(J) else J[:0, :0]
         left = N @ J[:, own] if len(J) else np.zeros((0, len(own)))
@@ -272,7 +264,9 @@ def _joint(model: Any, j: int, parent: str, child: str, T: Array) -> FileJoint:
     name, kind = model.joint(j).name, KINDS[model.jnt_type[j]]
     if kind not in MOVING:
         return FileJoint(name, kind, parent, child, T, np.zeros(3), number=j)
-    lower, upper = map(float, model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf))
+    # A range that does not limit is that of commands, as `export` writes it.
+    stated = model.jnt_limited[j] or model.jnt_range[j].any()
+    lower, upper = map(float, model.jnt_range[j] if stated else (-np.inf, np.inf))
     return FileJoint(
         name, kind, parent, child, T @ before(model, j), np.array(model.jnt_axis[j]),
         (lower, upper), rest=float(model.qpos0[model.jnt_qposadr[j]]), number=j,
@@ -283,7 +277,12 @@ def joints_of(model: Any, body: int) -> list[int]:
     """The joints of a body in their order, without springs of an earlier export."""
     first = int(model.body_jntadr[body])
     own = range(first, first + int(model.body_jntnum[body]))
-    return [j for j in own if not model.joint(j).name.startswith(SPRING)]
+    return [j for j in own if not is_spring(model, j)]
+
+
+def is_spring(model: Any, j: int) -> bool:
+    made = any(model.site(i).name == AXES for i in range(model.nsite))
+    return bool(model.joint(j).name.startswith((SPRING, SPRING_OF_NEW) if made else SPRING))
 
 
 def before(model: Any, j: int) -> Array:

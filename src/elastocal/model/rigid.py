@@ -123,19 +123,19 @@ def drawn_joints(chain: Chain) -> tuple[Array, Array, Array]:
     return low, high, np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
 
 
-def highest_origins(chain: Chain, up: Array) -> Array:
-    """The largest height (joints,) in m of each joint's origin along `up` (3,), of drawn poses."""
+def highest_origins(chain: Chain) -> Array:
+    """The largest height (joints,) in m of each joint's origin above the base, of drawn poses."""
     symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
     placed = zip([base, *nominal_frames(chain, symbol, base)], chain.joints, strict=False)
     origins = ca.horzcat(*(point(T, joint.placement[:3, 3]) for T, joint in placed))
-    heights = BatchFunction([symbol], [ca.DM(up).T @ origins])(drawn_joints(chain)[2])[0]
+    heights = BatchFunction([symbol], [origins[2, :]])(drawn_joints(chain)[2])[0]
     return np.asarray(heights).reshape(-1, chain.n_joints).max(axis=0)
 
 
 def reach_of(chain: Chain) -> float:
-    """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
-    poses.  What carries an arm, as a rail, stands still: a slide before it, or several before as
-    many joints as an arm has; a gantry's slides move."""
+    """How far the flange gets from the first axis that turns, where the second is, in m: the
+    largest of 500 drawn poses.  What carries an arm, as a rail, stands still: a slide before it, or
+    several before as many joints as an arm has; a gantry's slides move."""
     low, high, q = drawn_joints(chain)
     turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
     first = turning[0] if turning else 0
@@ -145,7 +145,12 @@ def reach_of(chain: Chain) -> float:
     symbol, base = ca.SX.sym("q", chain.n_joints), ca.SX.eye(4)
     frames = [base, *nominal_frames(chain, symbol, base)]
     # A slide, where none turns, starts from where it stands at zero.
-    start = point(frames[first], chain.joints[first].placement[:3, 3])
+    joint = chain.joints[first]
+    start = point(frames[first], joint.placement[:3, 3])
+    if len(turning) > 1 and first == turning[0]:  # files put its frame anywhere along its axis
+        axis = frames[first][:3, :3] @ (joint.placement[:3, :3] @ joint.axis)
+        second = chain.joints[turning[1]].placement[:3, 3]
+        start += axis * ca.dot(axis, point(frames[turning[1]], second) - start)
     reach = ca.norm_2(frames[-1][:3, 3] - start)
     return float(BatchFunction([symbol], [reach])(q)[0].max())
 

@@ -226,6 +226,7 @@ FLANGES = ("tool0", "flange", "ee_link", "tcp")
 MOST_IN_A_FINGER = 5  # joints
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
+TRACKER = "elastocal_tracker"  # the root that it puts above a robot with --base-frame
 
 
 @dataclass(frozen=True, eq=False)
@@ -466,6 +467,18 @@ class Tree:
                 k, T = at[way[-1].parent]
                 at[link] = k, T @ way[-1].held
         return at
+
+    def places(self, base: str, flange: str) -> dict[str, Array]:
+        """Name → place (3,) in m in the flange frame of every frame that moves with the flange, or
+        link that `export` has added there."""
+        added = {link: self.link_of(link) for link in self.links if link.startswith(TOOL_FRAMES)}
+        moving = self.serial_chain(base, flange)
+        carriers, last = self.carriers(moving), len(moving) - 1
+        at = {name: carriers[link][1] @ T
+              for name, (link, T) in (added | self.frames | {flange: self.link_of(flange)}).items()
+              if carriers.get(link, (-1,))[0] == last}  # fmt: skip
+        end = at.pop(flange)
+        return {name: np.asarray(np.linalg.solve(end, T)[:3, 3]) for name, T in at.items()}
 
     def chain(self, base: str, flange: str) -> Chain:
         """Placements in m, unit axes, limits in rad or m, and one mass per joint in kg of all that

@@ -101,13 +101,13 @@ DIGITS = 9
 
 
 def _rows(
-    execution: Execution, by_load: bool, seen: BoolArray | None
+    execution: Execution, by_load: bool, by_visit: bool, seen: BoolArray | None
 ) -> tuple[list[list[tuple[int, Stop]]], IntArray]:
     """The stops of each row, with their places in the order, and its marker (rows,)."""
     visits: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
     for place, stop in enumerate(execution.stops, start=1):
         load = stop.load if by_load else -1
-        key = (stop.again > 0, stop.pose, stop.again, stop.side, load)
+        key = (stop.again > 0, stop.pose, stop.again, stop.side, load, by_visit * stop.part)
         visits.setdefault(key, []).append((place, stop))
     rows = [visits[key] for key in sorted(visits)]
     if seen is None:
@@ -131,6 +131,8 @@ def write_plan(
     columns: dict[str, Sequence[str]] = {"configuration": names}
     if table.marker_names != (DEFAULT_MARKER,):
         columns["marker"] = [table.marker_names[k] for k in table.marker]
+    if table.repeat.any():
+        columns["repeat"] = [str(k) for k in table.repeat]
     kinds = table.joint_kinds
     blocks = [(joint_columns(kinds), np.round(in_file_units(table.q, kinds), DIGITS) + 0.0)]
     if forces:
@@ -455,15 +457,18 @@ class Plan(Result):
         """The table that is read of the plan, sorted by pose, side of approach and load state, and
         its columns beside: level, order and notes.
 
-        Where `stated_forces` are, one row per reading, under its force; else one per pose and side,
-        to be measured in every load state.  `order` is the first of its stops, note_order_2 the
-        second, …; note_load, note_load_2, … what of the load states hangs there.  A pose that is
-        approached from both sides is two configurations, 7+ (joints moving up to it) and 7-.
-        Where only some markers are seen there is a row for each, and where poses are not read
-        alike note_readings says how often each is.
+        Where `stated_forces` are, one row per reading, under its force, where time counts one per
+        visit; else one per pose and side, to be measured in every load state.  `order` is the first
+        of its stops, note_order_2 the second, …; note_load, note_load_2, … what of the load states
+        hangs there.  A pose that is approached from both sides is two configurations, 7+ (joints
+        moving up to it) and 7-.  Where only some markers are seen there is a row for each, where
+        poses are not read alike note_readings says how often each is.
         """
         forces, kinds = self.stated_forces, self.model.chain.kinds
-        rows, marker = _rows(self.execution, forces is not None, self.seen)
+        timed = self.execution.stops[0].time is not None
+        # Of deflections each loaded reading has one partner, the mean of those without load.
+        apart = timed and self.model.observe != "deflection"
+        rows, marker = _rows(self.execution, forces is not None, apart, self.seen)
         own = tuple(self.model.cell.tool.markers)
         first, n = [row[0][1] for row in rows], len(rows)
         two = self.execution.motion.both_directions or any(stop.side for stop in first)
@@ -481,6 +486,7 @@ class Plan(Result):
             "plan", np.column_stack(q), force, row=np.arange(n) + 2,
             configuration=np.array([labels.index(name) for name in names]),
             configuration_labels=labels, marker=marker,
+            repeat=np.array([stop.part * apart for stop in first]),
             marker_names=own if self.seen is not None else (DEFAULT_MARKER,),
             approach=np.array(approach, dtype=float) if approach else None,
             time=np.round(time, 3) if len(time) else None, joint_kinds=tuple(kinds),

@@ -319,9 +319,9 @@ ROLES = {"points": "points", "joints": "joint values", "both": "points and joint
 
 def left_out(found: Imported) -> Iterator[str]:
     for observed in found.understood:
-        if n := len(observed["ignored"]):
+        if n := len({line for line, _ in observed["ignored"]}):
             rows = listed((f"line {line} ({reason})" for line, reason in observed["ignored"]), 8)
-            yield f"{observed['file']}: passed over {say.counted(n, 'line')}: {rows}"
+            yield f"{observed['file']}: passed over in {say.counted(n, 'line')}: {rows}"
     if (joined := found.joined) is not None:
         for told, names in (("left out, without joint values: %d points", joined.left_out),
                             ("poses without a point: %d", joined.unused)):  # fmt: skip

@@ -545,11 +545,13 @@ USUAL_MASS, OF_ANY_ARM = 30.0, 10.0
 
 
 def usual_over_stated_mass(chain: Chain) -> float:
-    """What the masses are to be multiplied by; 1 where an arm of this length may have them."""
+    """What the masses are to be multiplied by; 1 where an arm of this length may have them, and of
+    gantries, whose travel is no length of theirs."""
     mass = sum(body.mass for body in chain.masses)
     usual = USUAL_MASS * extent(chain) ** 3
     alike = usual <= OF_ANY_ARM * mass and mass <= OF_ANY_ARM * usual
-    return 1.0 if alike or mass == 0 else usual / mass
+    gantry = chain.kinds.count("prismatic") > 1
+    return 1.0 if alike or mass == 0 or gantry else usual / mass
 
 
 def torque_scale(chain: Chain, cell: Cell, i: int) -> float:
