@@ -15,8 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, partial, reduce, wraps
-from operator import getitem
+from functools import cache, partial, wraps
 from pathlib import Path
 from types import UnionType
 from typing import (
@@ -32,7 +31,6 @@ from typing import (
 )  # fmt: skip
 
 import numpy as np
-import tomli_w
 from pydantic import (
     AfterValidator,
     AllowInfNan,
@@ -581,92 +579,54 @@ turn_key = partial(keyed, form=Vector3, into=lambda v, *_: rotation_from_rpy(np.
 
 # --- Writing -------------------------------------------------------------------------------------
 
-Way = tuple[str | int, ...]  # keys, and places in lists of tables, that lead to a value
+WIDE = 90  # characters of a list on one line
 
 
 def toml_value(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{toml_key(k)} = {toml_value(v)}' for k, v in value.items())} }}"
-    if not isinstance(value, list | tuple):
-        return tomli_w.dumps({"x": value})[4:-1]
-    parts = [toml_value(one) for one in value]
-    line = f"[{', '.join(parts)}]"
-    return line if len(line) < 90 else "[\n    " + ",\n    ".join(parts) + ",\n]"
+    import tomlkit  # slow to load, seldom asked for
+
+    return _folded(tomlkit.item(value)).as_string()
 
 
-def toml_key(*names: str | int) -> str:
-    return ".".join(tomli_w.dumps({name: 0})[:-5] for name in names if isinstance(name, str))
+def toml_key(name: str) -> str:
+    import tomlkit
+
+    return str(tomlkit.key(name).as_string())
 
 
 def rewritten_toml(text: str, data: dict[str, Any]) -> str:
     """The TOML `text` made to say `data`: lines that say the same stay, with the comments around
     them; what is new joins its table, or follows in one of its own."""
-    with suppress(ValueError):
-        if tomllib.loads(found := _rewritten(text.replace("\r\n", "\n"), data)) == data:
+    import tomlkit
+
+    document = tomlkit.parse(text)
+    with suppress(tomlkit.exceptions.TOMLKitError, ValueError):
+        _say(document, data)
+        if tomllib.loads(found := tomlkit.dumps(document)) == data:
             return found
-    return _rewritten("", data)
+    return tomlkit.dumps(data)
 
 
-def _rewritten(text: str, data: dict[str, Any]) -> str:
-    blocks: dict[Way, list[str]] = {(): []}  # the lines of each table, and where its keys end
-    ends: Counter[Way] = Counter()
-    said, dotted, items = set[Way](), set[Way](), dict[Way, int]()
-    at: Way = ()
-    gone, begun = False, ""
-    for line in text.rstrip().split("\n"):
-        try:
-            parsed = tomllib.loads(part := begun + line)
-        except ValueError:  # it goes on in the next line
-            begun = part + "\n"
-            continue
-        begun, heading = "", part.lstrip().startswith("[")
-        if heading:
-            at, names = (), _way(parsed)
-            for k, name in enumerate(names, 1):
-                at = (*at, name)
-                if k == len(names) and part.lstrip().startswith("[["):
-                    items[at] = items.get(at, -1) + 1
-                at = (*at, items[at]) if at in items else at
-            gone = _at_way(data, at) is None
-            blocks[at], ends[at] = [part] * (not gone), 1
-        elif parsed:
-            key = _way(tomllib.loads(part.partition("=")[0] + "= 0"))
-            said.add(where := (*at, *key))
-            dotted |= {(*at, *key[:k]) for k in range(1, len(key))}
-            if (value := _at_way(data, where)) is not None:
-                same = value == _at_way(parsed, key)
-                blocks[at].append(part if same else f"{toml_key(*key)} = {toml_value(value)}")
-                ends[at] = len(blocks[at])
-        elif not (gone := gone and bool(part.strip())):
-            blocks[at].append(part)
-
-    def join(path: Way, table: Any) -> None:
-        for name, value in table.items() if isinstance(table, dict) else enumerate(table):
-            where, home = (*path, name), path
-            if where in said:
-                continue
-            if (isinstance(value, dict) and value) or (*where, 0) in blocks:
-                join(where, value)
-                continue
-            while home in dotted and home not in blocks:
-                home = home[:-1]
-            if home not in blocks:
-                blocks[home], ends[home] = ["", f"[{toml_key(*home)}]"], 2
-            told = f"{toml_key(*where[len(home) :])} = {toml_value(value)}"
-            blocks[home].insert(ends[home], told)
-            ends[home] += 1
-
-    join((), data)
-    return "\n".join(line for block in blocks.values() for line in block) + "\n"
+def _folded(item: Any) -> Any:
+    if isinstance(item, list) and len(item.as_string()) > WIDE:  # type: ignore[attr-defined]
+        item.multiline(True)  # type: ignore[attr-defined]
+    return item
 
 
-def _way(parsed: Any) -> Way:
-    """The keys of the only value there is."""
-    name, value = next(iter(parsed.items()))
-    return (name, *_way(value)) if isinstance(value, dict) and value else (name,)
-
-
-def _at_way(data: Any, way: Way) -> Any:
-    with suppress(LookupError, TypeError):
-        return reduce(getitem, way, data)
-    return None
+def _say(there: Any, data: Mapping[str, Any]) -> None:
+    for name in [name for name in there if name not in data]:
+        del there[name]
+    for name, value in data.items():
+        known = there.get(name)
+        tables = isinstance(value, list) and value and all(isinstance(v, dict) for v in value)
+        if isinstance(value, Mapping) and isinstance(known, Mapping):
+            _say(known, value)
+        elif tables and isinstance(known, list) and len(known) == len(value):
+            for own, one in zip(known, value, strict=True):
+                _say(own, one)
+        elif isinstance(known, list) and known and known == value[: len(known)]:
+            known.extend(value[len(known) :])
+            _folded(known)
+        elif known is None or known != value:
+            there[name] = value
+            _folded(there[name])

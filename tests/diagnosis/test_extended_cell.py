@@ -113,14 +113,14 @@ def test_the_cell_says_where_its_smooth_functions_end(tmp_path):
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
     source = tmp_path / "cell.toml"
     own = '# hall 3\n[robot]\nurdf = "arm.urdf"  # of June\n[model]\n'
-    source.write_text(own + 'effects = ["base_frame"]  # so far\n# the end\n')
+    source.write_text(own + 'effects = ["base_frame"]  # so far\n# the end\n', encoding="utf-8")
     settings = {"curve_low_rad": -1.5, "curve_high_rad": 1.5}
     curve = replace(ECCENTRICITY, effect="joint_curve", parameters=(), settings=settings)
     cell = write_extended_cell(source, tmp_path / "new.toml", (curve,))
-    told, *kept = (tmp_path / "new.toml").read_text().partition(own)
-    assert f"{curve.where} from -85.9° to 85.9°;" in told
-    added = 'effects = ["base_frame", "joint_curve:joint2"]\n# the end\n\n[model.nominal.settings.'
-    assert kept[1].startswith(added)
+    text = (tmp_path / "new.toml").read_text()
+    assert f"{curve.where} from -85.9° to 85.9°;" in text.partition("# hall 3\n")[0]
+    added = 'effects = ["base_frame", "joint_curve:joint2"]  # so far\n# the end\n\n[model.nominal'
+    assert added in text and 'urdf = "arm.urdf"  # of June\n' in text
     assert cell.model == read_cell(tmp_path / "new.toml").model
 
 

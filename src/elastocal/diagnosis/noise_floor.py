@@ -352,13 +352,16 @@ def rms_with_interval(
     return resampled_rms(*squared_lengths(data, packed), rng)
 
 
+FEW = 10  # rows
+
+
 def first_steps(
     dataset: DiagnosisData, noise: NoiseValues, rng: np.random.Generator
 ) -> list[BudgetStep]:
-    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects, as
-    `identify` predicts what it is not given.  Where it cannot, by the weights of an ordinary
-    calibration: scatter of joints that is fitted beside a missing effect is that effect, and
-    weights by it would spare it."""
+    """The nominal arm, base and markers placed as the baseline left it, and the fitted effects.  By
+    the weights of an ordinary calibration: scatter of joints that is fitted beside a missing effect
+    is that effect, and weights by it would spare it.  Where there are FEW rows to a parameter, what
+    is held of those hardly shown decides, and `identify` says it."""
     base, data, blocks = dataset.base, dataset.data, dataset.blocks
     rows, good = base.nominal.reshape(-1, blocks.size, 1).copy(), ~data.faulty
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(data, blocks.pack(rows)[:, :, 0], rng))]
@@ -371,10 +374,11 @@ def first_steps(
         later = tuple(p for p, effect in effects.items() if stage_of(effect) > k)
         part = replace(data, X=data.X[:, :, stage <= k], precision=data.precision[stage <= k])
         left = left_out_residual(project(part, noise.of_instrument()))
+        few = data.n_rows < FEW * part.X.shape[2]
         with suppress(ElastocalError):
-            held = left_out(base.model, subset(base.observed, good), later)
+            held = left_out(base.model, subset(base.observed, good), later) if few else np.inf
             if np.isfinite(held).all():
-                rows[good] = held.reshape(-1, blocks.size, 1)
+                rows[good] = np.reshape(held, (-1, blocks.size, 1))
                 left = blocks.pack(rows)[:, :, 0]
         steps.append(BudgetStep(name, *rms_with_interval(data, left, rng)))
     return steps
