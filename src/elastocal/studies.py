@@ -609,8 +609,8 @@ def run_study(
         statement = {
             "schema": SCHEMA, "title": stated.title, "seed": stated.seed,
             "options": stated.options, "tasks": len(study.tasks), "columns": stated.columns,
-            "sources": study.sources.digests, "earlier": earlier, "elastocal": __version__,
-        }  # fmt: skip
+            "sources": study.sources.digests, "elastocal": __version__,
+        } | ({"earlier": earlier} if earlier else {})  # fmt: skip
         atomic_write(folder / STATEMENT, messages.json_text(statement) + "\n")
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task["task"], False) for task in wanted)

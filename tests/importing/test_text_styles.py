@@ -78,6 +78,7 @@ PERS jointtarget j{2}:=[[[1.5,-20,3,4,5,6],[1.5,9E9,9E9,9E9,9E9,9E9]],
 [[7,8,9,1,2,3],[2.5,9E9,9E9,9E9,9E9,9E9]]];
 CONST robtarget r:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];
 CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];"""
+PROGRAMS = [(KRL, "kuka", [3, 6]), (RAPID, "abb", [3, 4])]
 
 
 def program(tmp_path, text, preset):
@@ -86,9 +87,7 @@ def program(tmp_path, text, preset):
     return imported(tmp_path, files, mapping)
 
 
-@pytest.mark.parametrize(
-    ("text", "preset", "lines"), [(KRL, "kuka", [3, 6]), (RAPID, "abb", [3, 4])]
-)
+@pytest.mark.parametrize(("text", "preset", "lines"), PROGRAMS)
 def test_robot_programs_over_several_lines_in_logs_and_arrays(tmp_path, text, preset, lines):
     found = program(tmp_path, text, preset)
     joints = [[1.5, -20, 3, 4, 5, 6], [7, 8, 9, 1, 2, 3]]

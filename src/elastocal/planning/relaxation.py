@@ -143,9 +143,9 @@ class DesignProblem:
         if n < needed:
             prior = f" and the prior {known}" if known else ""
             raise InsufficientDataError(
-                f"{self.source}fewer equations than parameters: {n} poses of {r} readings give "
-                f"{n * r}{prior}, for {p} parameters; plan at least {needed} poses, switch effects "
-                "off or state a prior"
+                f"{self.source}fewer equations than parameters: {n} pose{'s' * (n != 1)} of {r} "
+                f"readings give {n * r}{prior}, for {p} parameters; plan at least {needed} poses, "
+                "switch effects off or state a prior"
             )
 
     def check_determined(self, value: float) -> None:

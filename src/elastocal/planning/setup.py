@@ -432,11 +432,10 @@ class Choice:
             )
         self.progress("comparing what was chosen with the cell as it stands")
         before, after = (self.relaxed(c, COMPARED) for c in (cell, found.cell))
-        if after is None or (
-            freedom.loads is None
-            and before is not None
-            and before.relaxed.value <= after.relaxed.value
-        ):
+        stated = boxes.places(cell)
+        inside = bool(((boxes.lower <= stated) & (stated <= boxes.upper)).all())
+        no_worse = before and after and before.relaxed.value <= after.relaxed.value
+        if after is None or (no_worse and inside and freedom.loads is None):
             found, after = found._replace(cell=cell), before
         assert after is not None
         criterion = after.setup.criterion
