@@ -173,7 +173,6 @@ def test_both_verbs_say_the_same_and_to_correct_what_is_stated(tmp_path):
     assert fit.verdict.trusted and "Correct [tracker]" in steps(fit)
     assert "scatter 1.3 times" in steps(fit)
     assert any("1.3 times as much" in w and "correct [tracker]" in w for w in found.warnings)
-    assert "more poses" in ec.diagnose(path, table.take(np.arange(30))).findings[0].remedy
     # What nothing tells from scatter of the joints is not to be corrected downwards.
     shaken = cell(tmp_path, "shaken", markers=one, sigma="10\n[noise]\njoints_urad = 60")
     found = ec.diagnose(path, ec.simulate(shaken, poses(60, 3), draw=0.3, seed=4))
@@ -185,6 +184,7 @@ def test_an_effect_beside_noise_as_stated_is_no_noise(tmp_path):
     """As large an excess, which markers of one pose share."""
     path = cell(tmp_path)
     table = ec.simulate(path, poses(50, 3), draw=0.3, seed=4)
+    assert "more poses" in ec.diagnose(path, table.take(np.arange(24))).findings[0].remedy
     table = replace(table, position=table.position + 5e-5 * np.sin(3 * table.q[:, 1:4]))
     fit = ec.identify(path, table)
     assert fit.noise.ratio_to_stated > 1.2 and not fit.verdict.trusted
