@@ -61,8 +61,7 @@ def test_everything_missing_at_once(campaign, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("shell", "code"),
-    [('"$@" | true', 0), ('"$@" >&-', 0), ('"$@" > /dev/full', 2)],
+    ("shell", "code"), [('"$@" | true', 0), ('"$@" >&-', 0), ('"$@" > /dev/full', 2)]
 )
 def test_streams_that_are_closed_or_full(campaign, tmp_path, shell, code):
     if "full" in shell and not Path("/dev/full").exists():

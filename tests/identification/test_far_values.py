@@ -184,6 +184,7 @@ def test_an_effect_beside_noise_as_stated_is_no_noise(tmp_path):
     """As large an excess, which markers of one pose share."""
     path = cell(tmp_path)
     table = ec.simulate(path, poses(50, 3), draw=0.3, seed=4)
+    assert "more poses" in ec.diagnose(path, table.take(np.arange(24))).findings[0].remedy
     table = replace(table, position=table.position + 5e-5 * np.sin(3 * table.q[:, 1:4]))
     fit = ec.identify(path, table)
     assert fit.noise.ratio_to_stated > 1.2 and not fit.verdict.trusted

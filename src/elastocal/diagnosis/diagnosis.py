@@ -480,10 +480,10 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         "probability_nothing": d.probability_nothing,
         "probability_unknown": d.probability_unknown,
     }
-    # "No effect" is no finding where it is the less likely half, or none would have been seen.
-    unseen = d.verdict == "nothing_significant" and (
-        d.doubtful or not any(c.visible for c in d.candidates)
-    )
+    # "No effect" is no finding where it is the less likely half, or none would have been seen; nor
+    # where the poses leave the model's own parameters as open.
+    seen = any(c.visible for c in d.candidates) and d.gap.calibrated <= OPEN * d.gap.noise_floor
+    unseen = d.verdict == "nothing_significant" and (d.doubtful or not seen)
     settled = d.verdict in ("explained", "nothing_significant") and not unseen
     remedy = UNSEEN if unseen else _remedy(d.verdict) * (not (settled and d.fields))
     yield Finding(d.verdict, "good" if settled else "care", numbers, remedy)
@@ -533,6 +533,7 @@ def _kept_back(has: str) -> str:
     )
 
 
+OPEN = 2.0  # held-out error, in that of noise alone, beyond which parameters are most of it
 UNSEEN = (
     "These readings do not show whether an effect is missing: measure more poses, spread over the "
     "whole range of every joint, and under more than one load."

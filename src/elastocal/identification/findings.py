@@ -410,7 +410,8 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
     if n := len(lacking) - len(shown):
         yield _good("redundant", parameters=n)
     if unread := tuple(name for name, standing in all_of_them.items() if standing == UNREAD):
-        it, none = "it" if len(unread) == 1 else "them", no_reading(result)
+        none = no_reading(result)
+        it = "them" if "markers" in none else "it"
         remedy = f"There is {none}: measure {it}, or delete {it} from [tool.markers_m]."
         yield _note("markers_not_read", remedy, parameters=unread)
     if n := len(shown):

@@ -428,7 +428,9 @@ def refuse_nonsense(
     reach = 0.0 if table.position is None else float(np.abs(table.position).max())
     beyond = [(p.name, v) for p, v in zip(model.parameters, x, strict=True)
               if p.unit == "m" and not abs(v) <= LARGEST * (length + reach)]  # fmt: skip
-    sane = max(fitted) <= POOREST * length and share <= FEW and not beyond
+    # A joint whose values were not recorded may move the markers by less than that.
+    most = POOR if (every.q == every.q[0]).all(axis=0).any() else np.inf
+    sane = max(fitted) <= min(POOREST * length, most) and share <= FEW and not beyond
     wrong = rotations_off(turned, "the model")
     if wrong and (sane or _placed(model, every)):
         raise InsufficientDataError(
@@ -446,11 +448,11 @@ def refuse_nonsense(
         return
     # Of those set apart too: beside them the few that fit say nothing.
     error, rms = every_off
-    most = f", {share:.0%} of them more than {rounded(POOREST * length, 2)} m," * (share > FEW)
+    many = f", {share:.0%} of them more than {rounded(POOREST * length, 2)} m," * (share > FEW)
     value = f", whose {beyond[0][0]} is {rounded(beyond[0][1])} m" if beyond else ""
     raise InsufficientDataError(
         f"{table.source}: after the fit the readings are {rounded(error)} m (median) and "
-        f"{rounded(rms)} m (rms){most} from the model{value}, which no arm of {rounded(length)} m "
+        f"{rounded(rms)} m (rms){many} from the model{value}, which no arm of {rounded(length)} m "
         f"could be; {_cause(every, fit)}"
     )
 
@@ -515,6 +517,8 @@ def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, .
         before, marker = marker, np.where(other, nearest, table.marker)
         if np.array_equal(marker, before):
             break
+    if np.percentile(distance[row, marker], MOST) > POOR:
+        return None  # of an arm that fits nowhere readings lie near another marker by chance
     best, places, known = np.arange(len(names)), found.markers, model.cell.tool.markers
     pairs = list(combinations([m for m, name in enumerate(names) if name in known], 2))
     level = special.fdtri(6, 6, 1 - FALSE_ALARM / max(len(pairs), 1))
