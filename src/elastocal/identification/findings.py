@@ -411,7 +411,7 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
         yield _good("redundant", parameters=n)
     if unread := tuple(name for name, standing in all_of_them.items() if standing == UNREAD):
         none = no_reading(result)
-        it = "them" if "markers" in none else "it"
+        it = "them" if "of markers " in none else "it"
         remedy = f"There is {none}: measure {it}, or delete {it} from [tool.markers_m]."
         yield _note("markers_not_read", remedy, parameters=unread)
     if n := len(shown):
