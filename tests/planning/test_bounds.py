@@ -111,7 +111,7 @@ def test_the_same_plan_in_parameters_of_any_scale():
 
 
 def test_too_few_poses_and_pools_that_leave_something_open_are_refused():
-    with pytest.raises(InsufficientDataError, match=r"1 poses of 3 readings give 3, for 5 param"):
+    with pytest.raises(InsufficientDataError, match=r"1 pose of 3 readings give 3, for 5 param"):
         problem_of("D", 0, n=1).check_enough()
     problem = problem_of("D", 0)
     problem.blocks[..., 4] = problem.blocks[..., 0]

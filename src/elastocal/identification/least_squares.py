@@ -91,13 +91,21 @@ def correlations(covariance: Array) -> tuple[Array, Array]:
     return covariance / np.outer(unit, unit), unit
 
 
+DEPENDENT = 1e-10  # of a variance: what is less beside the others before it follows from these
+
+
 def drawing_root(covariance: Array) -> Array:
     """L (p, p) with L Lᵀ = covariance, for draws: triangular, since alike eigenvalues turn their
-    axes, and the draws with them, by their last digits; by way of correlations, since the rounding
-    of large variances would drown small ones.  What does not vary is not drawn."""
+    axes, and the draws with them, by their last digits; so would columns that follow from others.
+    By way of correlations, since the rounding of large variances would drown small ones.  What does
+    not vary is not drawn."""
     rho, unit = correlations(covariance)
-    lower = np.asarray(np.linalg.qr(root_of(rho).T, mode="r")).T
-    return np.asarray(unit[:, None] * lower * np.where(np.diag(lower) < 0, -1, 1))
+    lower = np.zeros_like(rho)
+    for k in range(len(rho)):
+        left = rho[k:, k] - lower[k:, :k] @ lower[k, :k]
+        if left[0] > DEPENDENT:
+            lower[k:, k] = left / np.sqrt(left[0])
+    return np.asarray(unit[:, None] * lower)
 
 
 def t_quantile(level: float, dof: Array) -> Array:
