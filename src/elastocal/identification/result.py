@@ -267,7 +267,7 @@ REMEDIES: dict[str, str | Callable[[], str]] = {
         "more than their intervals, far readings decide them; look for what makes single readings "
         "err (line of sight, vibration, a tracker that has not settled)."
     ),
-    "test_data_far": "Measure poses there: the fit extrapolates.",
+    "test_data_far": "Measure poses like those of the test: the fit extrapolates to them.",
     "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
     "(joints, load), fit some like them; where they do not, the arm or the tracker has changed in "
     "between.",

@@ -45,8 +45,9 @@ def calibration_blocks(
 ) -> Iterator[say.Block]:
     budget = cache(lambda: gap_budget(result))
     yield say.Fold("", lambda: [_key(result, budget())])
-    yield words.judgement(result)
+    yield words.judgement(result, reasons=False)
     yield say.Lines([
+        *(("Reason", why) for why in words.reasons_of(result)),
         ("Error (rms)", error_line(result)),
         ("Expected", at_new_poses(result.predicted)),
         *(("Next", f.remedy) for f in next_steps(result)),

@@ -19,19 +19,29 @@ from elastocal.model.observations import available_noise
 from elastocal.report import blocks as say
 
 
-def judgement(result: Calibration) -> say.ShownVerdict:
+def judgement(result: Calibration, reasons: bool = True) -> say.ShownVerdict:
+    """With all its `reasons`, or where there are several without: they are lines of their own."""
     trust = result.finding("trust")
     assert trust is not None, "every identification is judged"
     if trust.severity == "poor":
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return say.ShownVerdict("poor", f"Do not use this calibration: {_doubt(why)}.")
     if trust.severity == "care":
-        named = "; and ".join(map(_doubt, result.verdict.missing))
-        told = f"Use this calibration with care: {named}. {_accuracy(result)}"
-        return say.ShownVerdict("warn", told)
+        named = list(map(_doubt, result.verdict.missing))
+        told = f": {'; and '.join(named)}" if reasons or len(named) == 1 else ""
+        return say.ShownVerdict(
+            "warn", f"Use this calibration with care{told}. {_accuracy(result)}"
+        )
     compared = result.finding(*COMPARED[1:])
     noise = "" if compared is None else " The residual is consistent with noise."
     return say.ShownVerdict("good", f"This calibration can be used. {_accuracy(result)}{noise}")
+
+
+def reasons_of(result: Calibration) -> list[str]:
+    """Why it is to be used with care, where the verdict has not the room to say it."""
+    trust, named = result.finding("trust"), list(map(_doubt, result.verdict.missing))
+    several = trust is not None and trust.severity == "care" and len(named) > 1
+    return list(map(say.sentence, named)) if several else []
 
 
 def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
