@@ -560,7 +560,6 @@ NonNegative = Annotated[float, Field(ge=0, description="a number >= 0")]
 Count = Annotated[int, Field(ge=1, le=10_000_000, description="a whole number >= 1")]
 Numbers = Annotated[Array, numbers()]
 Positives = Annotated[Array, numbers(above=0)]
-Vector2 = Annotated[Array, numbers(2)]
 Vector3 = Annotated[Array, numbers(3)]
 DISTINCT = AfterValidator(_all_differ)
 RISING = holding(lambda ends: bool(np.less(ends[0], ends[-1]).all()))
