@@ -46,8 +46,7 @@ def values_from(model: Model, chosen: dict[str, float]) -> Array:
         if name not in names:
             hint = did_you_mean(name, names) or "; it has: " + listed(names)
             raise InputError(f"the model has no parameter '{name}'{hint}")
-        told = f"parameter '{name}' must be a finite number, found {value}"
-        require(np.isfinite(value), told)
+        require(np.isfinite(value), f"parameter '{name}' must be a finite number, found {value}")
         x[names.index(name)] = value
     return x
 

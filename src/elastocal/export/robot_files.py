@@ -256,8 +256,7 @@ def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Ar
     for row in q:
         motion = np.zeros(model.nv)  # a position is (cos q, sin q) where there are no limits
         motion[[model.joints[number].idx_v for number in numbers]] = row
-        position = pin.integrate(model, pin.neutral(model), motion)
-        pin.framesForwardKinematics(model, data, position)
+        pin.framesForwardKinematics(model, data, pin.integrate(model, pin.neutral(model), motion))
         start, end = (data.oMf[frame].homogeneous for frame in ends)
         found.append(np.linalg.solve(start, end))
     return np.array(found)
