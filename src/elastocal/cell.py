@@ -127,8 +127,7 @@ class Solid:
         if shape != "mesh":
             size = np.hstack([table[name] for name in needed])
         turned = rotation_from_rpy(np.radians(table.get("rpy_deg", (0, 0, 0))))
-        placement = pose_at(table.get("position_m", (0, 0, 0)), turned)
-        return {"size": size, "placement": placement}
+        return {"size": size, "placement": pose_at(table.get("position_m", (0, 0, 0)), turned)}
 
 
 @record
@@ -459,10 +458,9 @@ class Cell:
                 check_known(choice.name, tuple(known_effects), told, "known effects:")
 
     def _check_markers(self, table: str, names: Iterable[str]) -> None:
-        markers = tuple(self.tool.markers)
         for name in names:
             told = f"{table} names {quoted(name)}, which is no marker of the cell"
-            check_known(name, markers, told, "[tool.markers_m] has")
+            check_known(name, self.tool.markers, told, "[tool.markers_m] has")
 
 
 read_cell = Cell.read

@@ -97,8 +97,7 @@ class Robot:
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         given = [name for name in SOURCES if name in table]
-        told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
-        spot.require(given, told)
+        spot.require(given, f"[robot] takes exactly one of {listed(SOURCES)}; none is given")
         of_a_table = ("dh_convention", "masses", "ur_model")
         other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():

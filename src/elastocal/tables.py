@@ -137,8 +137,7 @@ def first_bad_cell(
             cell = cells[i].strip()
             if not cell and header in blanks:
                 continue
-            problem = _problem(cell, comma_allowed)
-            if problem is not None:
+            if problem := _problem(cell, comma_allowed):
                 return InputError(f"{source}, {noun} {number}, column {header}: {problem}")
             if mark := "." if "." in cell else "," if "," in cell else "":
                 marks.setdefault(mark, f"{noun} {number}, column {header}: {quoted(cell)}")
@@ -453,8 +452,7 @@ def _read(
             for _, cells in rows:
                 for i in numbers:  # labels stay as they are written
                     cells[i] = plain_minus(cells[i])
-            problem = first_bad_cell(source, rows, numbers, commas, blanks, marks, noun)
-            if problem is not None:
+            if problem := first_bad_cell(source, rows, numbers, commas, blanks, marks, noun):
                 raise problem
             bare = ([c[i].replace(",", ".").strip() or "nan" for i in numbers] for _, c in rows)
             values = np.array([list(map(float, own)) for own in bare]).reshape(len(rows), -1)

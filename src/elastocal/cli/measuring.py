@@ -210,13 +210,12 @@ def design(
         if report is not None:
             progress("writing the report")
         texts = _programs(programs, plan.model.cell, plan)
-        page = partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())
         run.write(
             (output, lambda path: save_plan(plan, path, repeated())),
             *((path, partial(atomic_write, content=text)) for path, text in texts.items()),
             (picture, lambda path: write_plan_picture(path, plan)),
             (cell_out, chosen),
-            (report, page),
+            (report, partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())),
         )
         checkpoint.clear()
     if run.json:

@@ -714,8 +714,7 @@ class _MjcfText(XmlFile):
         told = [tag.stated.get("inertiafromgeom") for tag in self.anywhere("compiler")]
         from_geoms = "true" in [value for value in told if value][-1:]
         now = MjcfArm.read(self.path, self.arm.base, self.arm.flange, self.result())
-        both = zip(self.arm.joints, now.chain.masses, self.pieces.masses, strict=False)
-        for j, old, new in both:
+        for j, old, new in zip(self.arm.joints, now.chain.masses, self.pieces.masses, strict=False):
             mass = new.mass - old.mass
             moment = new.mass * new.com - old.mass * old.com
             if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:

@@ -743,8 +743,7 @@ class Paths:
                 rows = slice(start, start + CHUNK)
                 m, t = move[rows], middle[rows, None]
                 poses = self._kinematics.poses(q_from[m] + t * step[m], force[m])
-                half = width[rows, None] * np.abs(step[m])
-                certain[rows], refused = self._interval(poses, half)
+                certain[rows], refused = self._interval(poses, width[rows, None] * np.abs(step[m]))
                 free[m[refused]] = False
             left = ~certain & free[move]
             move, middle, width = (np.repeat(v[left], 2) for v in (move, middle, width / 2))

@@ -266,9 +266,8 @@ def rule_book(
         bounds, seen = (), (EnoughMarkers(bounds, sight, markers, least),)
     units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
     joints = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
-    limits = joint_limits(cell, chain)
     return (
-        Bound("joint_limits", lambda p: p.q, *limits, joints, "a limit", units),
+        Bound("joint_limits", lambda p: p.q, *joint_limits(cell, chain), joints, "a limit", units),
         *bounds,
         *_load(cell, chain, joints),
         *(
@@ -513,8 +512,7 @@ class Roadmap:
         """`needed` points by what free moves connect, the largest part first.  Only as many moves
         are checked as it takes, first among `needed`, then through all points: every part tries its
         shortest ways out, twice as many each time (Borůvka)."""
-        every = np.arange(len(self.points))
-        for among, tries in ((np.array(needed), 1), (every, 1)):
+        for among, tries in ((np.array(needed), 1), (np.arange(len(self.points)), 1)):
             while len(set((label := self._joined())[needed])) > 1:
                 new: list[tuple[int, int]] = []
                 for part in set(label[among]):

@@ -489,8 +489,7 @@ def check(effect: object) -> None:
         ("needs", effect.needs, NEEDS),
     ):
         for found in given:
-            told = f"{kind.__name__}.{key} takes {listed(known)}; found {found!r}"
-            require(found in known, told)
+            require(found in known, f"{kind.__name__}.{key} takes {listed(known)}; found {found!r}")
     hooks = ("shape", "load", "read")
     lacking = [] if kind.places is not Effect.places or kind.at else ["places"]
     lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]
