@@ -184,7 +184,11 @@ def design(
 
     summary = beside(output)
     programs = program or []
-    _check_names(programs, picture)
+    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
+    for path in programs:
+        told = f"--program {path}: the suffix says the language, {kinds}"
+        require(path.suffix.lower() in PROGRAMS, told)
+    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
     run.writes(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
@@ -273,14 +277,6 @@ def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str
         text += f"\nTo try it without an arm: elastocal simulate {cell} {output} -o data.csv"
         text += f" --draw 1{carried}"
     return text
-
-
-def _check_names(programs: list[Path], picture: Path | None) -> None:
-    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
-    for path in programs:
-        told = f"--program {path}: the suffix says the language, {kinds}"
-        require(path.suffix.lower() in PROGRAMS, told)
-    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
 
 
 def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[Path, str]:
