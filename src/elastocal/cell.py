@@ -35,6 +35,7 @@ from elastocal.config import (
     Text,
     Transform,
     Vector3,
+    by_name,
     checked,
     fields_of,
     file_key,
@@ -45,8 +46,10 @@ from elastocal.config import (
     keyed,
     keys_of,
     numbers,
+    optional,
     read_toml,
     record,
+    several,
     stated,
 )
 from elastocal.files import check_exists, is_plugin_file
@@ -99,7 +102,7 @@ class Solid:
     shape: Shape = keyed()
     size: Numbers = keyed(keys=SIZES)
     placement: Transform = keyed(keys=PLACE, default_factory=lambda: np.eye(4))
-    mesh: File | None = file_key("file", takes='the path of a mesh, as "part.stl"', default=None)
+    mesh: File | None = file_key("file", takes='the path of a mesh, as "part.stl"')
 
     def __post_init__(self) -> None:
         count = {"box": 3, "mesh": 3, "sphere": 1}.get(self.shape, 2)
@@ -124,8 +127,7 @@ class Solid:
         if shape != "mesh":
             size = np.hstack([table[name] for name in needed])
         turned = rotation_from_rpy(np.radians(table.get("rpy_deg", (0, 0, 0))))
-        placement = pose_at(table.get("position_m", (0, 0, 0)), turned)
-        return {"size": size, "placement": placement}
+        return {"size": size, "placement": pose_at(table.get("position_m", (0, 0, 0)), turned)}
 
 
 @record
@@ -163,11 +165,9 @@ class HangingLoad:
     solid: Solid = keyed(keys=keys_of(Solid, without=("name", "position_m", "rpy_deg")))
     rope: NonNegative = keyed("rope_m", note=", from load point to load", default=0.0)
     rope_radius: Positive = keyed("rope_radius_mm", default=0.01)
-    rope_axis: Direction | None = keyed(note=", a direction in the flange frame", default=None)
-    max_angle: float | None = keyed("max_angle_deg", note=", at most 180", form=Angle, default=None)
-    min_height: float | None = keyed(
-        "min_height_m", note=", a height in the data's frame", default=None
-    )
+    rope_axis: Direction | None = optional(note=", a direction in the flange frame")
+    max_angle: float | None = optional("max_angle_deg", note=", at most 180", form=Angle)
+    min_height: float | None = optional("min_height_m", note=", a height in the data's frame")
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
@@ -188,12 +188,8 @@ class Visibility:
     `range` m; `beam_radius` m of free sight.
     """
 
-    normals: dict[str, Direction] = keyed(
-        note=" per marker, in the flange frame", default_factory=dict
-    )
-    max_incidence: float | None = keyed(
-        "max_incidence_deg", note=", at most 180", form=Angle, default=None
-    )
+    normals: dict[str, Direction] = by_name(note=" per marker, in the flange frame")
+    max_incidence: float | None = optional("max_incidence_deg", note=", at most 180", form=Angle)
     range: Annotated[tuple[Distance, Distance], TUPLE, RISING] = keyed(
         "range_m",
         takes="[nearest, farthest] in m with 0 <= nearest < farthest",
@@ -202,7 +198,7 @@ class Visibility:
     )
     beam_radius: NonNegative = keyed("beam_radius_mm", default=0.005)
     line_of_sight: bool = keyed(default=True)
-    min_markers: Count | None = keyed(default=None)
+    min_markers: Count | None = optional()
 
     def __post_init__(self) -> None:
         require(
@@ -232,14 +228,13 @@ class Workspace:
         0.05
     """
 
-    obstacles: Many[Solid] = keyed("obstacle", default=())
-    bodies: Many[CarriedBody] = keyed("body", default=())
-    keep_out: Many[HalfSpace] = keyed(default=())
-    load: HangingLoad | None = keyed(default=None)
-    visibility: Visibility | None = keyed(default=None)
-    link_radius: Many[float] = keyed(
-        "link_radius_mm", "link_radius_m", note=", or one per link (0: no body)", form=Radii,
-        default=(),
+    obstacles: Many[Solid] = several("obstacle")
+    bodies: Many[CarriedBody] = several("body")
+    keep_out: Many[HalfSpace] = several()
+    load: HangingLoad | None = optional()
+    visibility: Visibility | None = optional()
+    link_radius: Many[float] = several(
+        "link_radius_mm", "link_radius_m", note=", or one per link (0: no body)", form=Radii
     )  # fmt: skip
     urdf_geometry: bool = keyed(
         "geometry",
@@ -248,14 +243,12 @@ class Workspace:
         default=False,
     )
     self_collision: bool = keyed(default=True)
-    mounting_plane: bool | None = keyed(default=None)
-    ignored_pairs: Many[Pair] = keyed(
-        takes='pairs of names, as in [["link2", "link4"]]', default=()
-    )
+    mounting_plane: bool | None = optional()
+    ignored_pairs: Many[Pair] = several(takes='pairs of names, as in [["link2", "link4"]]')
     clearance: NonNegative = keyed("clearance_mm", "clearance_m", default=0.0)
     self_clearance: NonNegative = keyed("self_clearance_mm", "self_clearance_m", default=0.0)
-    torque_limits: Many[Positive] = keyed(
-        "torque_limits_Nm", note=", one per joint", form=Positives, default=()
+    torque_limits: Many[Positive] = several(
+        "torque_limits_Nm", note=", one per joint", form=Positives
     )
 
     @classmethod
@@ -319,12 +312,12 @@ class Acceptance:
     readings that took no part in the fit.
     """
 
-    heldout: Positive | None = keyed("heldout_um", default=None)
-    new_poses: Positive | None = keyed("new_poses_um", default=None)
-    test: Positive | None = keyed("test_um", default=None)
+    heldout: Positive | None = optional("heldout_um")
+    new_poses: Positive | None = optional("new_poses_um")
+    test: Positive | None = optional("test_um")
 
 
-ENTRY = partial(keyed, form=Text, default=None)
+ENTRY = partial(optional, form=Text)
 
 
 @record
@@ -338,21 +331,21 @@ class CertificateEntries:
 
     number: str | None = ENTRY()
     laboratory: str | None = ENTRY()
-    country: Country | None = keyed(takes='the two letters of ISO 3166, as in "DE"', default=None)
+    country: Country | None = optional(takes='the two letters of ISO 3166, as in "DE"')
     customer: str | None = ENTRY()
     robot_serial: str | None = ENTRY()
     tool_serial: str | None = ENTRY()
     instrument: str | None = ENTRY()
     instrument_calibration: str | None = ENTRY()
     place: str | None = ENTRY()
-    measured_on: Annotated[str, holding(date.fromisoformat)] | None = keyed(
-        takes='the date of measurement, as in "2026-03-17"', default=None
+    measured_on: Annotated[str, holding(date.fromisoformat)] | None = optional(
+        takes='the date of measurement, as in "2026-03-17"'
     )
     operator: str | None = ENTRY()
     procedure: str | None = ENTRY()
-    temperature: float | None = keyed("temperature_c", takes="a number in °C", default=None)
-    instrument_uncertainty: NonNegative | None = keyed("instrument_uncertainty_um", default=None)
-    limit: Positive | None = keyed("limit_um", default=None)
+    temperature: float | None = optional("temperature_c", takes="a number in °C")
+    instrument_uncertainty: NonNegative | None = optional("instrument_uncertainty_um")
+    limit: Positive | None = optional("limit_um")
 
     @property
     def missing(self) -> list[str]:
@@ -392,17 +385,16 @@ class Cell:
     tool: Tool = keyed(default_factory=Tool)
     tracker: Tracker = keyed(default_factory=Tracker)
     model: ModelSpec = keyed(default_factory=ModelSpec)
-    limits: dict[str, Joint] = keyed(
+    limits: dict[str, Joint] = by_name(
         takes="[lower, upper] per joint, lower < upper, as in joint1_deg = [-170.0, 170.0]",
         form=dict[str, Joint],
         into=joint_values,
-        default_factory=dict,
     )
     workspace: Workspace = keyed(default_factory=Workspace)
     design: DesignSpec = keyed(default_factory=DesignSpec)
     require: Acceptance = keyed(default_factory=Acceptance)
     certificate: CertificateEntries = keyed(default_factory=CertificateEntries)
-    plugins: Many[Text] = keyed(form=PluginsTable, into=_modules, default=())
+    plugins: Many[Text] = several(form=PluginsTable, into=_modules)
     noise: Unsteadiness = keyed(default_factory=Unsteadiness)
 
     @classmethod
@@ -466,10 +458,9 @@ class Cell:
                 check_known(choice.name, tuple(known_effects), told, "known effects:")
 
     def _check_markers(self, table: str, names: Iterable[str]) -> None:
-        markers = tuple(self.tool.markers)
         for name in names:
             told = f"{table} names {quoted(name)}, which is no marker of the cell"
-            check_known(name, markers, told, "[tool.markers_m] has")
+            check_known(name, self.tool.markers, told, "[tool.markers_m] has")
 
 
 read_cell = Cell.read

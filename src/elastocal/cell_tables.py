@@ -29,6 +29,7 @@ from elastocal.config import (
     Table,
     Text,
     Vector3,
+    by_name,
     checked,
     existing_file,
     fields_of,
@@ -40,7 +41,9 @@ from elastocal.config import (
     keyed,
     keys_of,
     numbers,
+    optional,
     record,
+    several,
     stated,
     turn_key,
 )
@@ -74,17 +77,16 @@ class Robot:
         6
     """
 
-    urdf: File | None = file_key(takes='the path of a URDF file, e.g. "arm.urdf"', default=None)
-    mjcf: File | None = file_key(takes='the path of a MuJoCo model, e.g. "arm.xml"', default=None)
-    base: Text | None = keyed(takes=OF_THE_FILE.format(""), default=None)
-    flange: Text | None = keyed(takes=OF_THE_FILE.format(" or site"), default=None)
-    dh: File | None = file_key(takes='the path of a DH table, e.g. "dh.csv"', default=None)
+    urdf: File | None = file_key(takes='the path of a URDF file, e.g. "arm.urdf"')
+    mjcf: File | None = file_key(takes='the path of a MuJoCo model, e.g. "arm.xml"')
+    base: Text | None = optional(takes=OF_THE_FILE.format(""))
+    flange: Text | None = optional(takes=OF_THE_FILE.format(" or site"))
+    dh: File | None = file_key(takes='the path of a DH table, e.g. "dh.csv"')
     dh_convention: Convention = keyed(default="standard")
-    masses: File | None = file_key(takes='a table of link masses, e.g. "links.csv"', default=None)
-    ur_model: Text | None = keyed(takes='a Universal Robot, e.g. "UR10e"', default=None)
-    joint_names: Literal["order", "file"] | None = keyed(
-        note=": whether jointN is the Nth joint, or one of that name in the robot's file",
-        default=None,
+    masses: File | None = file_key(takes='a table of link masses, e.g. "links.csv"')
+    ur_model: Text | None = optional(takes='a Universal Robot, e.g. "UR10e"')
+    joint_names: Literal["order", "file"] | None = optional(
+        note=": whether jointN is the Nth joint, or one of that name in the robot's file"
     )
 
     def __post_init__(self) -> None:
@@ -95,8 +97,7 @@ class Robot:
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         given = [name for name in SOURCES if name in table]
-        told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
-        spot.require(given, told)
+        spot.require(given, f"[robot] takes exactly one of {listed(SOURCES)}; none is given")
         of_a_table = ("dh_convention", "masses", "ur_model")
         other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():
@@ -168,9 +169,7 @@ class Tool:
     """
 
     load_point: Vector3 = keyed("load_point_m", note=", in the flange frame", default_factory=ZEROS)
-    markers: dict[str, Vector3] = keyed(
-        "markers_m", note=" per marker, in the flange frame", default_factory=dict
-    )
+    markers: dict[str, Vector3] = by_name("markers_m", note=" per marker, in the flange frame")
 
     def __post_init__(self) -> None:
         for name in self.markers:
@@ -212,12 +211,10 @@ class Tracker:
     """
 
     position: Vector3 = keyed("position_m", default_factory=ZEROS)
-    noise: CartesianNoise | PolarNoise | None = keyed(
-        keys=keys_of(CartesianNoise, PolarNoise), default=None
-    )
-    anchor: Vector3 | None = keyed("anchor_m", default=None)
-    rotation_sigma: Positive | None = keyed("rotation_urad", default=None)
-    distance_sigma: Positive | None = keyed("distance_um", default=None)
+    noise: CartesianNoise | PolarNoise | None = optional(keys=keys_of(CartesianNoise, PolarNoise))
+    anchor: Vector3 | None = optional("anchor_m")
+    rotation_sigma: Positive | None = optional("rotation_urad")
+    distance_sigma: Positive | None = optional("distance_um")
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
@@ -257,10 +254,9 @@ class Unsteadiness:
     drift: NonNegative = keyed("drift_um", default=0.0)
     lasting: Positive = keyed("lasting_s", default=3600.0)
     configuration: NonNegative = keyed("configuration_um", default=0.0)
-    tails: Annotated[float, Field(gt=2)] | None = keyed(
+    tails: Annotated[float, Field(gt=2)] | None = optional(
         takes="a number > 2, as 3: with two degrees of freedom or fewer Student's t has no "
-        "standard deviation, which is what [tracker] states",
-        default=None,
+        "standard deviation, which is what [tracker] states"
     )
 
     @property
@@ -323,26 +319,22 @@ class Nominal:
     this arm's is known and the effect's own would not do.
     """
 
-    joint_compliance: Many[NonNegative] | None = keyed(
-        note=" per joint, in rad/(N m)", form=Compliances, default=None
+    joint_compliance: Many[NonNegative] | None = optional(
+        note=" per joint, in rad/(N m)", form=Compliances
     )
-    base_position: Vector3 | None = keyed("base_position_m", default=None)
-    base_rotation: Rotation | None = turn_key(
-        "base_rpy_deg", note=": roll, pitch, yaw", default=None
-    )
-    gravity_compensator: dict[str, Any] | None = keyed(
+    base_position: Vector3 | None = optional("base_position_m")
+    base_rotation: Rotation | None = turn_key("base_rpy_deg", note=": roll, pitch, yaw")
+    gravity_compensator: dict[str, Any] | None = optional(
         takes='a table with joint = "joint2"',
         form=CompensatorTable,
         into=lambda table, *_: table.model_dump(exclude_none=True),
-        default=None,
     )
-    settings: dict[str, dict[str, AnyFloat]] = keyed(
+    settings: dict[str, dict[str, AnyFloat]] = by_name(
         takes="a table per place, as in settings.joint2 = { jump_time_s = 720.0 }",
         form=dict[str, dict[str, float]],
-        default_factory=dict,
     )
-    sizes: dict[str, dict[str, Positive]] = keyed(
-        takes="a table per place, as in sizes.joint2 = { move_lag = 0.002 }", default_factory=dict
+    sizes: dict[str, dict[str, Positive]] = by_name(
+        takes="a table per place, as in sizes.joint2 = { move_lag = 0.002 }"
     )
 
     def __post_init__(self) -> None:
@@ -369,19 +361,18 @@ class ModelSpec:
     """
 
     observe: Observe = keyed(default="position")
-    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices), DISTINCT] = keyed(
-        takes='a list of "effect" or "effect:where", each once', form=Effects, default=()
+    effects: Annotated[tuple[EffectChoice, ...], BeforeValidator(_choices), DISTINCT] = several(
+        takes='a list of "effect" or "effect:where", each once', form=Effects
     )
     torque: Literal["computed", "measured"] = keyed(default="computed")
     link_gravity: bool = keyed(default=False)
     deflection_model: Literal["equilibrium", "linear"] = keyed(default="equilibrium")
-    compliance_levels: dict[str, Levels] = keyed(
+    compliance_levels: dict[str, Levels] = by_name(
         note=" per joint, each once, as in joint2_deg = [-25.2, 0.0]",
         form=dict[str, Annotated[Numbers, DISTINCT]],
         into=joint_values,
-        default_factory=dict,
     )
-    gear_ripple_orders: Many[Positive] = keyed(takes="a list of positive numbers", default=())
+    gear_ripple_orders: Many[Positive] = several(takes="a list of positive numbers")
     thermal_driver: Literal["time", "temperature"] = keyed(default="time")
     play_side: Literal["load", "load_and_approach"] = keyed(default="load")
     approach: Literal["column", "order"] = keyed(default="column")
@@ -399,8 +390,8 @@ class ModelSpec:
 TEST_POSE = "test_pose"  # the criterion where none is asked for
 EXTRA_TIME = 0.05  # of the shortest time, for a longer way where none is stated
 ELSEWHERE_CAP = 0.05  # where the user states no test poses: a price that buys most of what can be
-FORCE = partial(keyed, "load_N", note=", a force in the data's frame", default=None)
-POINT = partial(keyed, "point_m", note=", a point in the flange frame", default=None)
+FORCE = partial(optional, "load_N", note=", a force in the data's frame")
+POINT = partial(optional, "point_m", note=", a point in the flange frame")
 
 
 @record
@@ -428,7 +419,9 @@ class TargetPose:
 class TargetPath:
     """A table of poses: q1_deg … (force_x_N …), or x_mm, y_mm, z_mm (rx_deg …) of the point."""
 
-    file: File = file_key(takes='the path of a table of poses, e.g. "path.csv"')
+    file: File = keyed(
+        takes='the path of a table of poses, e.g. "path.csv"', form=Text, into=existing_file
+    )
     force: Vector3 | None = FORCE()
     point: Vector3 | None = POINT()
 
@@ -443,9 +436,7 @@ class TargetBox:
     lower: Vector3 = keyed("lower_m", note=", a corner in the data's frame")
     upper: Vector3 = keyed("upper_m", note=", the opposite corner")
     count: Annotated[int, Field(ge=1, le=10_000)] = keyed(note=" from 1 to 10000", default=20)
-    rotation: Rotation | None = turn_key(
-        "rpy_deg", note=": roll, pitch, yaw of the flange", default=None
-    )
+    rotation: Rotation | None = turn_key("rpy_deg", note=": roll, pitch, yaw of the flange")
     force: Vector3 | None = FORCE()
     point: Vector3 | None = POINT()
 
@@ -470,20 +461,19 @@ class Motion:
     `reference_every`: after so many visits one pose is visited again. `degrees`: speed or home were
     stated in degrees, which fits revolute joints only."""
 
-    speed: Positives | None = keyed(
+    speed: Positives | None = optional(
         keys=[Key("speed_deg_per_s", note=", or one per joint", form=Speeds),
-              Key("speed_si", "one positive number per joint, in rad/s or m/s", form=Positives)],
-        default=None,
+              Key("speed_si", "one positive number per joint, in rad/s or m/s", form=Positives)]
     )  # fmt: skip
-    home: Numbers | None = keyed("home_deg", "home_si", note=", one per joint", default=None)
+    home: Numbers | None = optional("home_deg", "home_si", note=", one per joint")
     dwell: NonNegative = keyed("dwell_s", default=30.0)
     reading: NonNegative = keyed("reading_s", default=0.0)
     load_change: NonNegative = keyed("load_change_s", default=600.0)
     both_directions: bool = keyed(default=False)
     overshoot: Positive = keyed("overshoot_deg", default=0.05)
-    load_changes: Count | None = keyed(default=None)
-    extra_time: NonNegative | None = keyed(note=", a share of the time", default=None)
-    reference_every: Count | None = keyed(default=None)
+    load_changes: Count | None = optional()
+    extra_time: NonNegative | None = optional(note=", a share of the time")
+    reference_every: Count | None = optional()
     degrees: bool = False
 
     @property
@@ -515,10 +505,10 @@ class Freedom:
     `markers` by name and the `load_point` (flange frame) and for the `tracker` (data's frame), and
     how many of the design's `loads` that are not zero will hang."""
 
-    markers: dict[str, Box] = keyed("markers_m", takes=f"per marker {BOX}", default_factory=dict)
-    load_point: Box | None = keyed("load_point_m", takes=BOX, default=None)
-    tracker: Box | None = keyed("tracker_m", takes=BOX, default=None)
-    loads: Count | None = keyed(default=None)
+    markers: dict[str, Box] = by_name("markers_m", takes=f"per marker {BOX}")
+    load_point: Box | None = optional("load_point_m", takes=BOX)
+    tracker: Box | None = optional("tracker_m", takes=BOX)
+    loads: Count | None = optional()
 
 
 CANDIDATES = (
@@ -561,53 +551,44 @@ class DesignSpec:
     little error there as can be had (see `cap`); `combination` name → factor for c; `candidates` to
     draw, and `taught`: a table of poses that are brought, instead of these or beside them."""
 
-    poses: Count | None = keyed(default=None)
+    poses: Count | None = optional()
     criterion: Text = keyed(
         takes='the name of a planning criterion, as "test_pose" or "D"', default=TEST_POSE
     )
-    levels: dict[str, Levels] = keyed(
+    levels: dict[str, Levels] = by_name(
         takes="a list of numbers per joint, each once, as in joint2_deg = [-25.2, 0.0]",
         form=LevelsTable,
-        default_factory=dict,
     )
     per_level: Many[Count] = ()
     repeats: Count = keyed(default=1)
-    loads: Annotated[Array, numbers(None, 3), DISTINCT] | None = keyed(
+    loads: Annotated[Array, numbers(None, 3), DISTINCT] | None = optional(
         "loads_N",
         takes="a list of forces in N, each once ([design] repeats says how often each is read), "
         "as in [[0, 0, 0], [0, 0, -2600]]",
-        default=None,
     )
     repeatability: NonNegative = keyed("repeatability_um", default=0.0)
-    marker_sigma: dict[str, Positive] = keyed(
-        "marker_sigma_um", note=" per marker", default_factory=dict
-    )
-    interest: Many[Text] = keyed(
-        takes='a list of names, as in ["joint_compliance", "joint2"]', default=()
-    )
-    combination: dict[str, float] = keyed(
-        takes='factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
-        default_factory=dict,
+    marker_sigma: dict[str, Positive] = by_name("marker_sigma_um", note=" per marker")
+    interest: Many[Text] = several(takes='a list of names, as in ["joint_compliance", "joint2"]')
+    combination: dict[str, float] = by_name(
+        takes='factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }'
     )
     load_states: Literal["all", "chosen"] = keyed(default="all")
     prior: Literal["none", "typical"] = keyed(default="none")
-    elsewhere: Annotated[float, Field(ge=0, lt=1)] | None = keyed(
-        takes="a number from 0 to below 1", default=None
+    elsewhere: Annotated[float, Field(ge=0, lt=1)] | None = optional(
+        takes="a number from 0 to below 1"
     )
-    elsewhere_cap: NonNegative | None = keyed(note=", as in 0.05", default=None)
-    candidates: Count | None = keyed(
-        takes=CANDIDATES,
-        form=Annotated[Count | Text | list[Count | Text], holding(of_candidates)],
-        default=None,
+    elsewhere_cap: NonNegative | None = optional(note=", as in 0.05")
+    candidates: Count | None = optional(
+        takes=CANDIDATES, form=Annotated[Count | Text | list[Count | Text], holding(of_candidates)]
     )
     taught: File | None = None
-    target: Positive | None = keyed("target_um", default=None)
-    minutes: Positive | None = keyed(default=None)
-    test_poses: Many[TargetPose] = keyed("test_pose", default=())
-    test_path: TargetPath | None = keyed(default=None)
-    test_box: TargetBox | None = keyed(default=None)
+    target: Positive | None = optional("target_um")
+    minutes: Positive | None = optional()
+    test_poses: Many[TargetPose] = several("test_pose")
+    test_path: TargetPath | None = optional()
+    test_box: TargetBox | None = optional()
     motion: Motion = keyed(default_factory=Motion)
-    choose: Freedom | None = keyed(default=None)
+    choose: Freedom | None = optional()
 
     def __post_init__(self) -> None:
         joints, levels = " and ".join(self.levels), wish("levels", "[design.levels]")

@@ -428,8 +428,7 @@ def _other_postures(
     limits = search.lower, search.upper
     found = inverse_kinematics(chain, position, limits, rotation=flange, point=place, seed=seed)
     n, count, joints = found.q.shape
-    target = np.repeat(lost, count)
-    missed = search.commands(found.q.reshape(n * count, joints), target)[1]
+    missed = search.commands(found.q.reshape(n * count, joints), np.repeat(lost, count))[1]
     good = _is_reached(missed).reshape(n, count)
     far = np.linalg.norm(found.q - nominal[:, None], axis=2)
     chosen = found.q[np.arange(n), np.where(good, far, np.inf).argmin(axis=1)]

@@ -560,7 +560,6 @@ NonNegative = Annotated[float, Field(ge=0, description="a number >= 0")]
 Count = Annotated[int, Field(ge=1, le=10_000_000, description="a whole number >= 1")]
 Numbers = Annotated[Array, numbers()]
 Positives = Annotated[Array, numbers(above=0)]
-Vector2 = Annotated[Array, numbers(2)]
 Vector3 = Annotated[Array, numbers(3)]
 DISTINCT = AfterValidator(_all_differ)
 RISING = holding(lambda ends: bool(np.less(ends[0], ends[-1]).all()))
@@ -572,9 +571,13 @@ File = Annotated[Path, BeforeValidator(lambda path: Path(path) if isinstance(pat
 Rotation = Annotated[Array, numbers(3, 3)]
 Transform = Annotated[Array, numbers(4, 4)]
 Direction = Annotated[Array, PlainValidator(_direction), Field(description="three numbers")]
-# Fields of these two types, which a file states otherwise.
-file_key = partial(keyed, form=Text, into=existing_file)
-turn_key = partial(keyed, form=Vector3, into=lambda v, *_: rotation_from_rpy(np.radians(v)))
+# Fields that need not be stated: None, nothing by name, and none of a list.
+optional = partial(keyed, default=None)
+by_name = partial(keyed, default_factory=dict)
+several = partial(keyed, default=())
+# Those of two types, which a file states otherwise.
+file_key = partial(optional, form=Text, into=existing_file)
+turn_key = partial(optional, form=Vector3, into=lambda v, *_: rotation_from_rpy(np.radians(v)))
 
 
 # --- Writing -------------------------------------------------------------------------------------

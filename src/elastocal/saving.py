@@ -227,18 +227,13 @@ LONGEST_STOP = 86_400.0  # s
 LONGEST = 100  # characters of a note; controllers cut or refuse long lines
 LONGEST_NAME = 24
 # Words of both languages that no module or function can be called; upper and lower case alike.
-RESERVED = frozenset(
-    re.findall(
-        r"\w+",
-        """
-        and break codes continue def do else elif end endfor endif endswitch endwhile enddat
-        enddefct exit for function global goto halt if import in interrupt is local loop endloop
-        main movec movej movel movep not on or pass popup print ptp lin circ pulse repeat resume
-        return run signal sleep socket struct switch textmsg then thread to true false trigger until
-        wait while with bool int real char frame axis e6axis pos e6pos decl const enum
-        """,
-    )
-)
+RESERVED = frozenset(re.findall(r"\w+", """
+    and break codes continue def do else elif end endfor endif endswitch endwhile enddat enddefct
+    exit for function global goto halt if import in interrupt is local loop endloop main movec movej
+    movel movep not on or pass popup print ptp lin circ pulse repeat resume return run signal sleep
+    socket struct switch textmsg then thread to true false trigger until wait while with bool int
+    real char frame axis e6axis pos e6pos decl const enum
+"""))  # fmt: skip
 
 # A move to joints (n,) rad with a note on what is there; a stop until someone has done what the
 # note says; a stop of so many s (1,) while the tracker measures what the note says.

@@ -46,8 +46,7 @@ def values_from(model: Model, chosen: dict[str, float]) -> Array:
         if name not in names:
             hint = did_you_mean(name, names) or "; it has: " + listed(names)
             raise InputError(f"the model has no parameter '{name}'{hint}")
-        told = f"parameter '{name}' must be a finite number, found {value}"
-        require(np.isfinite(value), told)
+        require(np.isfinite(value), f"parameter '{name}' must be a finite number, found {value}")
         x[names.index(name)] = value
     return x
 
@@ -92,8 +91,7 @@ def _sizes_shown(model: Model) -> Array:
     unsized = {p.effect for p in model.parameters if p.typical is None}
     cell = model.cell
     own = tuple(choice for choice in cell.model.effects if choice.name in unsized)
-    spec = replace(cell.model, observe="position", torque="computed", effects=own)
-    seen = model.specified(spec)
+    seen = model.specified(replace(cell.model, observe="position", torque="computed", effects=own))
     loads = np.zeros((1, 3)) if cell.design.loads is None else np.asarray(cell.design.loads)
     load = np.linalg.norm(loads, axis=1).max() or suitable_load(reach_of(model.chain))
     poses = random_table(seen, Conditions(), POSES, 0).take(np.repeat(np.arange(POSES), 3))
@@ -182,8 +180,7 @@ def simulate(
         size = np.full((len(rows), 1), cell.design.repeatability)
         if model.observe == "deflection":  # as plans count it: of the loaded visit
             size *= rows.force.any(axis=1, keepdims=True)
-        stop = numbered(rows.configuration, load_states(rows.force))
-        found = _off(found, size, stop, rng)
+        found = _off(found, size, numbered(rows.configuration, load_states(rows.force)), rng)
     if not cell.noise.drift or found.position is None:
         return found
     # Where nobody says when, visits follow each other in the order of the rows.
@@ -275,8 +272,7 @@ def run_demo(
     progress(f"measuring {len(rows)} simulated readings")
     table = simulate(model, rows, values_from(model, truth), seed)
     table.save(data := folder / "data.csv")
-    result = identify(model, replace(table, source=str(data)), progress=progress)
-    return result, truth, published
+    return identify(model, replace(table, source=str(data)), progress=progress), truth, published
 
 
 def _copy_example(folder: Path) -> None:

@@ -44,6 +44,7 @@ MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
 DELIMITERS = ",;\t"
 UTF16 = (b"\xff\xfe", b"\xfe\xff")
 ARCHIVE = b"PK\x03\x04"
+SAYS_NOTHING = re.compile(r"""\ufeff?[ \t,;"]*(#.*)?""")  # a comment, or cells that are empty
 NOT_FINITE = re.compile(r"[+-]?(nan|na|n/a|null|none|inf|infinity|#n/?a|#num!)", re.IGNORECASE)
 THOUSANDS = re.compile(r"[+-]?[0-9]+([.,' ][0-9]{3})*[.,][0-9]+")
 
@@ -61,8 +62,7 @@ def csv_lines(
     require(some, f"{source}: empty file; the first line names the columns")
     (number, first), *others = some
     first = first.removeprefix("\ufeff")
-    told = f"{source}: line 1 is blank; the first line must name the columns"
-    require(first.strip(), told)
+    require(first.strip(), f"{source}: line 1 is blank; the first line must name the columns")
     delimiter = max(DELIMITERS, key=first.count)
     header = tuple(name.strip() for name in _split(source, number, first, delimiter))
     blank = " " if delimiter == "\t" else " \t"
@@ -84,7 +84,7 @@ def _sound_lines(source: str, handle: BinaryIO, what: str, comments: bool) -> Li
                     raise InputError(f"{source}, line {k}: {fault}")
         text = decoded(source, whole, remedy, "utf-8", line=number).replace("\r", "")
         found = enumerate(text.removesuffix("\n").split("\n"), number)
-        yield [(k, t) for k, t in found if not (comments and _says_nothing(t))]
+        yield [(k, t) for k, t in found if not (comments and SAYS_NOTHING.fullmatch(t))]
         number += len(lines)
 
 
@@ -97,11 +97,6 @@ def _fault(line: bytes, what: str) -> str:
     inside = b"\r" in line.removesuffix(b"\r")
     told = "a carriage return inside the line; save the table with ordinary line ends (LF or CRLF)"
     return told if inside else ""
-
-
-def _says_nothing(line: str) -> bool:
-    bare = line.removeprefix("\ufeff").strip(' \t,;"')
-    return not bare or bare.startswith("#")
 
 
 def _split(source: str, number: int, line: str, delimiter: str) -> list[str]:
@@ -142,8 +137,7 @@ def first_bad_cell(
             cell = cells[i].strip()
             if not cell and header in blanks:
                 continue
-            problem = _problem(cell, comma_allowed)
-            if problem is not None:
+            if problem := _problem(cell, comma_allowed):
                 return InputError(f"{source}, {noun} {number}, column {header}: {problem}")
             if mark := "." if "." in cell else "," if "," in cell else "":
                 marks.setdefault(mark, f"{noun} {number}, column {header}: {quoted(cell)}")
@@ -458,8 +452,7 @@ def _read(
             for _, cells in rows:
                 for i in numbers:  # labels stay as they are written
                     cells[i] = plain_minus(cells[i])
-            problem = first_bad_cell(source, rows, numbers, commas, blanks, marks, noun)
-            if problem is not None:
+            if problem := first_bad_cell(source, rows, numbers, commas, blanks, marks, noun):
                 raise problem
             bare = ([c[i].replace(",", ".").strip() or "nan" for i in numbers] for _, c in rows)
             values = np.array([list(map(float, own)) for own in bare]).reshape(len(rows), -1)

@@ -562,8 +562,7 @@ def diagnose(
     from elastocal.diagnosis.extra_poses import plan_extra
 
     tell("looking for poses that tell the rivals apart")
-    extra = plan_extra(found, extra_poses, cast(int, seed), tell)
-    return replace(found, extra=extra)
+    return replace(found, extra=plan_extra(found, extra_poses, cast(int, seed), tell))
 
 
 @checked_arguments

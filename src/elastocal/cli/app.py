@@ -291,8 +291,7 @@ class Run:
             real = os.path.realpath(path)
             told = f"{path} is read and would be written over; name another output"
             require(real not in inputs, told)
-            told = f"{path}: two outputs of the same name; name another one"
-            require(real not in taken, told)
+            require(real not in taken, f"{path}: two outputs of the same name; name another one")
             taken.add(real)
         return given
 

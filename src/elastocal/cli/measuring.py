@@ -184,7 +184,11 @@ def design(
 
     summary = beside(output)
     programs = program or []
-    _check_names(programs, picture)
+    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
+    for path in programs:
+        told = f"--program {path}: the suffix says the language, {kinds}"
+        require(path.suffix.lower() in PROGRAMS, told)
+    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
     run.writes(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
@@ -210,13 +214,12 @@ def design(
         if report is not None:
             progress("writing the report")
         texts = _programs(programs, plan.model.cell, plan)
-        page = partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())
         run.write(
             (output, lambda path: save_plan(plan, path, repeated())),
             *((path, partial(atomic_write, content=text)) for path, text in texts.items()),
             (picture, lambda path: write_plan_picture(path, plan)),
             (cell_out, chosen),
-            (report, page),
+            (report, partial(plan.report, inputs=list(dict.fromkeys(files)), command=repeated())),
         )
         checkpoint.clear()
     if run.json:
@@ -274,14 +277,6 @@ def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str
         text += f"\nTo try it without an arm: elastocal simulate {cell} {output} -o data.csv"
         text += f" --draw 1{carried}"
     return text
-
-
-def _check_names(programs: list[Path], picture: Path | None) -> None:
-    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
-    for path in programs:
-        told = f"--program {path}: the suffix says the language, {kinds}"
-        require(path.suffix.lower() in PROGRAMS, told)
-    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
 
 
 def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[Path, str]:

@@ -265,7 +265,15 @@ def compensate(
     # What can be wrong with the options is told before any file is read.
     verbs.check_frame(asked["frame"])
     force = given_force(asked.get("load"))
-    _check(targets, target, output, table, (grid, box, rotation))
+    given = (targets is not None) + (target is not None)
+    need = "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE"
+    require(given > 0 or table is not None, need)
+    require(given < 2, f"both {targets} and --target are given; drop one of them")
+    need = "-o writes the commands of targets; name a table of them, or give --target"
+    require(given > 0 or output is None, need)
+    need = "--grid, --box and --rotation belong to a correction table; give --table FILE"
+    require(table is not None or (grid, box, rotation) == ("5", None, None), need)
+    require(rotation is None or box is not None, "--rotation belongs to --box")
     run.writes((output, ".csv"), (table, ".csv"))
     content, commands, corrections, reached = {}, "", "", False
     with run.progress() as progress:
@@ -300,21 +308,6 @@ def compensate(
             f"Next: Run {output.name} and measure some. 95 % of the targets should be reached "
             "within its column within95_um, measurement noise excluded."
         )
-
-
-def _check(
-    targets: Path | None, target: str | None, output: Path | None, table: Path | None,
-    of_a_table: tuple[str, str | None, str | None],
-) -> None:  # fmt: skip
-    (_, box, rotation), given = of_a_table, (targets is not None) + (target is not None)
-    need = "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE"
-    require(given > 0 or table is not None, need)
-    require(given < 2, f"both {targets} and --target are given; drop one of them")
-    need = "-o writes the commands of targets; name a table of them, or give --target"
-    require(given > 0 or output is None, need)
-    need = "--grid, --box and --rotation belong to a correction table; give --table FILE"
-    require(table is not None or of_a_table == ("5", None, None), need)
-    require(rotation is None or box is not None, "--rotation belongs to --box")
 
 
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")

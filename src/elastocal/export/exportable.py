@@ -338,8 +338,7 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     ]
     effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
     forces, measured = np.unique(table.force, axis=0), kept.conditions.visits is not None
-    unsettled = int((~settled).sum())
-    return Cost(apart(exported), tuple(effects), poses, unsettled, forces, measured)
+    return Cost(apart(exported), tuple(effects), poses, int((~settled).sum()), forces, measured)
 
 
 def points_of(part: Valued, table: Measurements, points: Array) -> Array:

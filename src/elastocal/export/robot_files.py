@@ -256,8 +256,7 @@ def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Ar
     for row in q:
         motion = np.zeros(model.nv)  # a position is (cos q, sin q) where there are no limits
         motion[[model.joints[number].idx_v for number in numbers]] = row
-        position = pin.integrate(model, pin.neutral(model), motion)
-        pin.framesForwardKinematics(model, data, position)
+        pin.framesForwardKinematics(model, data, pin.integrate(model, pin.neutral(model), motion))
         start, end = (data.oMf[frame].homogeneous for frame in ends)
         found.append(np.linalg.solve(start, end))
     return np.array(found)
@@ -715,8 +714,7 @@ class _MjcfText(XmlFile):
         told = [tag.stated.get("inertiafromgeom") for tag in self.anywhere("compiler")]
         from_geoms = "true" in [value for value in told if value][-1:]
         now = MjcfArm.read(self.path, self.arm.base, self.arm.flange, self.result())
-        both = zip(self.arm.joints, now.chain.masses, self.pieces.masses, strict=False)
-        for j, old, new in both:
+        for j, old, new in zip(self.arm.joints, now.chain.masses, self.pieces.masses, strict=False):
             mass = new.mass - old.mass
             moment = new.mass * new.com - old.mass * old.com
             if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:

@@ -118,8 +118,7 @@ def pooled(records: Sequence[Records]) -> Records:
     if any(r.load is not None for r in records):
         told = "says no load, other files do; give load in its [[source]], or a group (?P<load>…)"
         for r in records:
-            stated = "load" in r.texts or r.load is not None
-            require(stated, f"{r.source}: {told} in its pattern")
+            require("load" in r.texts or r.load is not None, f"{r.source}: {told} in its pattern")
         records = [replace(r, texts={"load": [str(r.load)] * len(r)} | r.texts) for r in records]
     first = records[0]
     for other in records[1:]:

@@ -167,8 +167,7 @@ def notes_of(robot: Robot, chain: Chain) -> list[str]:
         )
     moved = ""
     if robot.urdf is not None and robot.flange is not None:
-        last = check_urdf(robot.urdf).parent_joint[robot.flange]
-        moved = robot.flange if last.moves else ""
+        moved = robot.flange if check_urdf(robot.urdf).parent_joint[robot.flange].moves else ""
     if doubt := placeholder_masses(chain):
         found.append(
             f"{doubt}, which looks like placeholders. Weights would bend the joints wrongly, so "

@@ -384,10 +384,8 @@ def resolve(
     header; `width`: cells of the first row; `units`: for columns whose key ends in _auto where
     neither the header nor `hint`, the unit that a comment of the file states, says one.  Times and
     temperatures that are optional have the unit AUTO where nothing says it."""
-    columns: list[ColumnKey] = []
-    for target in asked:
-        if (found := _column(source, target, header, width)) is not None:
-            columns.append(_with_unit(source, found, units, hint))
+    found = (_column(source, target, header, width) for target in asked)
+    columns = [_with_unit(source, one, units, hint) for one in found if one is not None]
     unstated = {c: column(c.stem, next(iter(FACTORS[c.quantities[0]]))) for c in columns
                 if c.unit == AUTO and not c.spare}  # fmt: skip
     if not unstated:

@@ -498,8 +498,7 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
         hint = f"{did_you_mean(text, markers)}; its markers: {listed(markers)}; or give {what}"
         raise InputError(f"{here} is no marker of the cell{hint}")
     place = numbers(option("point"), text, (3,), what)
-    told = f"{here} is more than 10 m from the flange; give x,y,z in m"
-    require(np.abs(place).max() <= 10, told)
+    require(np.abs(place).max() <= 10, f"{here} is more than 10 m from the flange; give x,y,z in m")
     return ToolPoint(place, None, f"point {text} m in the flange frame")
 
 

@@ -263,8 +263,7 @@ def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[L
         require(i not in found, f"{where}: '{text}' appears twice")
         mass = dh_number(table, k, "mass", "mass")
         com = [dh_number(table, k, "com", f"com_{axis}") for axis in "xyz"]
-        told = f"{table.where(k, 'mass_kg')}: {mass:g} is negative; give 0 or more"
-        require(not mass < 0, told)
+        require(not mass < 0, f"{table.where(k, 'mass_kg')}: {mass:g} is negative; give 0 or more")
         found[i] = LinkMass(mass, (after[i] @ np.array([*com, 1.0]))[:3])
     missing = [link for i, link in enumerate(numbered) if i not in found]
     told = f"no row for {listed(missing)}; give every link, with mass_kg 0 if it has none"

@@ -67,8 +67,7 @@ def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
     instructions, of which few are in use at a time.  NotImplementedError for a CasADi operation
     that numpy has no counterpart for.  Not a tuple for every step: thousands of these would have
     Python look for garbage in all that is loaded, 0.07 s each time."""
-    columns = tuple([*column] for column in zip(*_steps(function), strict=True))
-    return columns, int(function.sz_w())
+    return tuple([*column] for column in zip(*_steps(function), strict=True)), int(function.sz_w())
 
 
 def _steps(f: ca.Function) -> Iterator[tuple[int, Any, int, int, int]]:

@@ -401,8 +401,7 @@ class Model(ByValue):
         # Together, as many as make up a block: a call for each takes several times as long.
         for some in (x[block] for block in row_blocks(len(x), CHUNK // max(n, 1))):
             rows = [np.tile(a, (len(some), 1)) for a in inputs]
-            h = self._readings(rows, np.repeat(some, n, axis=0))
-            found.append(h.reshape(len(some), n, -1))
+            found.append(self._readings(rows, np.repeat(some, n, axis=0)).reshape(len(some), n, -1))
         return observed.apply(np.concatenate(found).transpose(1, 2, 0)).reshape(-1, len(x)).T
 
     def _readings(self, inputs: list[NDArray], x: NDArray) -> NDArray:

@@ -213,8 +213,7 @@ class MjcfArm:
         last = [self._carriers.get(self.bodies[b], (-1,))[0] == len(self.joints) - 1 for b in ends]
         still = [model.body_weldid[b] == WORLD for b in ends]
         held = any(one and other for one, other in zip(last, still[::-1], strict=True))
-        dragged = any(model.body_mocapid[b] >= 0 for b in ends)
-        return dragged or (held and kind == kinds.mjEQ_WELD)
+        return any(model.body_mocapid[b] >= 0 for b in ends) or (held and kind == kinds.mjEQ_WELD)
 
 
 BOUND = 1e-6  # of m or rad per rad or m; what is less is rounding

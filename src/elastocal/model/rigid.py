@@ -24,12 +24,6 @@ from elastocal.units import Array, IntArray
 TINY = 1e-30
 
 
-def rotation_about(axis: Any, angle: Any) -> ca.SX:
-    """Rotation by `angle` about the constant unit `axis` (Rodrigues)."""
-    along, across, about = _rodrigues(tuple(map(float, axis)))
-    return along + ca.cos(angle) * across + ca.sin(angle) * about
-
-
 @lru_cache(maxsize=64)
 def _rodrigues(axis: tuple[float, float, float]) -> tuple[ca.SX, ca.SX, ca.SX]:
     """a aᵀ, 1 − a aᵀ and skew(a): an arm turns about the same few axes in every model of it."""
@@ -60,8 +54,7 @@ def vector_from_rotation(R: Any) -> ca.SX:
         members[1 + i] = 1 + 2 * R[i, i] - trace
         members[1 + j] = R[i, j] + R[j, i]
         members[1 + k] = R[i, k] + R[k, i]
-        larger = R[i, i] > largest
-        best = ca.if_else(larger, ca.vertcat(*members), best)
+        best = ca.if_else(R[i, i] > largest, ca.vertcat(*members), best)
         largest = ca.fmax(largest, R[i, i])
     unit = best / ca.sqrt(ca.sumsqr(best))
     unit = ca.if_else(unit[0] < 0, -unit, unit)
@@ -86,7 +79,8 @@ def constant(T: Any) -> ca.SX:
 def joint_motion(kind: str, axis: Any, value: Any) -> ca.SX:
     """Motion of a revolute or prismatic joint by `value` (rad or m) along its unit axis."""
     if kind == "revolute":
-        return transform(rotation=rotation_about(axis, value))
+        along, across, about = _rodrigues(tuple(map(float, axis)))
+        return transform(rotation=along + ca.cos(value) * across + ca.sin(value) * about)
     return transform(translation=ca.SX(ca.DM(np.asarray(axis, dtype=float))) * value)
 
 

@@ -580,8 +580,7 @@ def xacro_left(path: Path, what: str) -> str:
 def _name(path: Path, tag: Tag, known: Collection[str]) -> str:
     kind, name = tag.name, tag.get("name").strip()
     require(len(known) < MOST_LINKS, f"{path}: more than {MOST_LINKS} {kind}s; remove some")
-    told = f'{path}: {kind} number {len(known) + 1} has no name; write <{kind} name="…">'
-    require(name, told)
+    require(name, f'{path}: {kind} number {len(known) + 1} has no name; write <{kind} name="…">')
     told = f"{path}: two {kind}s are named '{name}'; names must be unique, rename one"
     require(name not in known, told)
     return name

@@ -402,8 +402,7 @@ def _outline(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> Iterator[Bod
         yield from skeleton(chain, (THIN,), data_base(cell), cell.name)
     tool = {f"marker {name}": p for name, p in cell.tool.markers.items()}
     for name, point in {"load point": cell.tool.load_point, **tool}.items():
-        placement = chain.flange_placement @ pose_at(point)
-        solid = Solid(name, "sphere", np.array([THIN]), placement)
+        solid = Solid(name, "sphere", np.array([THIN]), chain.flange_placement @ pose_at(point))
         yield Body(solid, chain.n_joints - 1, "carried")
 
 
@@ -662,8 +661,7 @@ class MotionBound:
         # The points and radii whose motion bounds that of all bodies on a joint; the load point.
         parts = [(i, *_reach([b for b in bodies if b.carrier == i])) for i in range(n)]
         parts.append((n - 1, load_point, np.zeros(1)))
-        sizes = [len(points) for _, points, _ in parts]
-        self._first = np.cumsum([0, *sizes[:-1]])
+        self._first = np.cumsum([0, *(len(points) for _, points, _ in parts[:-1])])
         self._carried = [(carrier, points.T) for carrier, points, _ in parts]
         self._radii = np.concatenate([radii for _, _, radii in parts])
         # Each pair's bound is one entry of S, or the sum of two.
@@ -745,8 +743,7 @@ class Paths:
                 rows = slice(start, start + CHUNK)
                 m, t = move[rows], middle[rows, None]
                 poses = self._kinematics.poses(q_from[m] + t * step[m], force[m])
-                half = width[rows, None] * np.abs(step[m])
-                certain[rows], refused = self._interval(poses, half)
+                certain[rows], refused = self._interval(poses, width[rows, None] * np.abs(step[m]))
                 free[m[refused]] = False
             left = ~certain & free[move]
             move, middle, width = (np.repeat(v[left], 2) for v in (move, middle, width / 2))

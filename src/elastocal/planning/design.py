@@ -126,8 +126,7 @@ class DesignOptions:
     hold: bool = False
 
     def __post_init__(self) -> None:
-        told = f"{option('effort')} {quoted(self.effort)} is unknown"
-        check_known(self.effort, EFFORTS, told)
+        check_known(self.effort, EFFORTS, f"{option('effort')} {quoted(self.effort)} is unknown")
         require(
             self.jobs == -1 or self.jobs >= 1,
             f"{option('jobs')} takes a number of processes, or -1 for all cores; found {self.jobs}",
@@ -174,8 +173,7 @@ def design(
             own = checkpoint
             if spec.minutes:  # poses come in several numbers
                 own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
-            made = _Design(cell, options, own, progress, whole)
-            return replace(made.run(), chosen=chosen)
+            return replace(_Design(cell, options, own, progress, whole).run(), chosen=chosen)
 
         if not spec.minutes:
             return plan_of(placed)
@@ -377,8 +375,7 @@ class _Design:
         lots, names, told, options = list[Candidates](), list[str](), "", self.options
         if spec.taught is not None:
             self.progress(f"checking the poses of {spec.taught}")
-            table = poses_of(self.model, spec.taught)
-            own, names, told = brought(*asked, table, options.pins)
+            own, names, told = brought(*asked, poses_of(self.model, spec.taught), options.pins)
             lots.append(own)
         if spec.taught is None or spec.candidates is not None:
             self.progress("drawing candidates")

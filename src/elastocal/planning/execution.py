@@ -520,8 +520,7 @@ def schedule(
     used = sorted(set(moves.load.tolist()), key=lambda state: (moves.loaded[state], state))
     begun = in_turns(nearest_first(moves.travel()), moves.load, used)
     clock, drift = VisitTimes.of(moves, motion, begun), None
-    steps = PER_VISIT * len(begun)
-    tour, clock = clock.searched(begun, seed, progress, (SHORT,), steps)
+    tour, clock = clock.searched(begun, seed, progress, (SHORT,), PER_VISIT * len(begun))
     if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, clock, drift = against_drift(clock, motion, tour, alias, seed, progress)
     moves, order = clock.moves, [(node, 0) for node in tour]

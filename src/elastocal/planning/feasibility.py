@@ -114,16 +114,15 @@ class Bound(Rule):
 NEARBY = 0.2  # rad or m in every joint: what stands in one pose's way will stand in the other's
 
 
+@dataclass(frozen=True)
 class Struck(Rule):
     """Not near one of the poses (m, n) that the user has struck out."""
 
+    struck: Array
     name = "struck"
 
-    def __init__(self, struck: Array) -> None:
-        self._struck = struck
-
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        off = [np.abs(poses.q - q).max(axis=1) for q in self._struck]
+        off = [np.abs(poses.q - q).max(axis=1) for q in self.struck]
         return {"a pose struck out": np.asarray(np.min(off, axis=0) < NEARBY)}
 
 
@@ -267,9 +266,8 @@ def rule_book(
         bounds, seen = (), (EnoughMarkers(bounds, sight, markers, least),)
     units = tuple("°" if kind == "revolute" else "m" for kind in chain.kinds)
     joints = tuple(f"joint{i + 1}" for i in range(chain.n_joints))
-    limits = joint_limits(cell, chain)
     return (
-        Bound("joint_limits", lambda p: p.q, *limits, joints, "a limit", units),
+        Bound("joint_limits", lambda p: p.q, *joint_limits(cell, chain), joints, "a limit", units),
         *bounds,
         *_load(cell, chain, joints),
         *(
@@ -466,7 +464,6 @@ class Roadmap:
         self.carrying = " with the load" if loaded else ""
         self.direct = times.copy()  # inf where blocked
         self.checked = np.eye(len(times), dtype=bool)
-        self._ways: tuple[Array, NDArray[np.integer]] | None = None
 
     def check(self, moves: Iterable[tuple[int, int]]) -> bool:
         """All free?  Each move is checked once, those not checked before together."""
@@ -478,12 +475,12 @@ class Roadmap:
             self.checked[i, j] = self.checked[j, i] = True
             i, j = i[~free], j[~free]
             self.direct[i, j] = self.direct[j, i] = np.inf
-            self._ways = None
+            vars(self).pop("_shortest", None)
         return all(np.isfinite(self.direct[pair]) for pair in pairs)
 
     def costs(self) -> Array:
         """Times (m, m) between points: straight, or by the fastest way around; inf for none."""
-        return np.where(np.isfinite(self.direct), self.direct, self._shortest()[0])
+        return np.where(np.isfinite(self.direct), self.direct, self._shortest[0])
 
     def way(self, i: int, j: int) -> list[int]:
         """Points passed on the fastest way from i to j, j included, i not."""
@@ -491,7 +488,7 @@ class Roadmap:
             return []
         if np.isfinite(self.direct[i, j]):
             return [j]
-        before, way = self._shortest()[1][i], [j]
+        before, way = self._shortest[1][i], [j]
         while before[way[-1]] != i:
             way.append(int(before[way[-1]]))
         return way[::-1]
@@ -505,21 +502,17 @@ class Roadmap:
             self.check(move for way in ways for move in pairwise(way))
             left = [(w[0], w[-1]) for w in ways if np.isinf(self.direct[w[:-1], w[1:]]).any()]
 
+    @cached_property
     def _shortest(self) -> tuple[Array, NDArray[np.integer]]:
-        if self._ways is None:
-            finite = self.direct[np.isfinite(self.direct)]
-            extra = max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
-            self._ways = csgraph.shortest_path(
-                self.direct + extra, method="FW", return_predecessors=True
-            )
-        return self._ways
+        finite = self.direct[np.isfinite(self.direct)]
+        extra = max(PER_EDGE * float(finite.max()), np.finfo(float).tiny)
+        return csgraph.shortest_path(self.direct + extra, method="FW", return_predecessors=True)
 
     def parts(self, needed: list[int]) -> list[list[int]]:
         """`needed` points by what free moves connect, the largest part first.  Only as many moves
         are checked as it takes, first among `needed`, then through all points: every part tries its
         shortest ways out, twice as many each time (Borůvka)."""
-        every = np.arange(len(self.points))
-        for among, tries in ((np.array(needed), 1), (every, 1)):
+        for among, tries in ((np.array(needed), 1), (np.arange(len(self.points)), 1)):
             while len(set((label := self._joined())[needed])) > 1:
                 new: list[tuple[int, int]] = []
                 for part in set(label[among]):
@@ -744,8 +737,7 @@ class Moves:
         return f"pose {point + (self.home is None)} (joints {joints})"
 
     def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
-        points, loaded = roadmap.points, roadmap.loaded
-        names = roadmap.checker.blockers(points[i], points[j], loaded)
+        names = roadmap.checker.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
         return f" (in the way: {', '.join(names)})" if names else ""
 
 

@@ -176,8 +176,7 @@ class PoseInformation:
             configuration=pose, configuration_labels=tuple(map(str, range(1, len(q) + 1))),
             marker=np.resize(np.arange(len(names)), len(pose)), marker_names=names,
         )  # fmt: skip
-        table = simulate(self.model, table, self.x, 0, noise=False)
-        return marker_sigmas(self.model.cell, table)
+        return marker_sigmas(self.model.cell, simulate(self.model, table, self.x, 0, noise=False))
 
     def seen(self, q: Array, readings: IntArray | None = None) -> BoolArray:
         """(N, L, markers): which markers are seen and read of poses q (N, n) in each load state."""

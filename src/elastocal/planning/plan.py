@@ -571,9 +571,9 @@ class Plan(Result):
             "n_poses": len(self.q),
             "candidates": asdict(self.candidates),
             "certificate": bounds | told | {"bound_pool": self.bound_reported},
-            "random_plans": _numbers(self.chance),
-            "everywhere": _numbers(self.everywhere),
-            "gain": _numbers(self.gain),
+            "random_plans": self.chance and asdict(self.chance),
+            "everywhere": self.everywhere and asdict(self.everywhere),
+            "gain": self.gain and asdict(self.gain),
             "chosen": (c := self.chosen) and {
                 "cell": c.keys,
                 "relaxed": {"before": c.before, "after": c.after, "candidates": c.candidates},
@@ -589,7 +589,7 @@ class Plan(Result):
                     for force, n in zip(self.forces.tolist(), self.read_in.tolist(), strict=True)
                 ],
             },
-            "drift": _numbers(self.execution.drift),
+            "drift": (d := self.execution.drift) and asdict(d),
             "predicted": [
                 {("ci95_half_width" if k == "half_width" else k): v for k, v in asdict(p).items()}
                 for p in self.predicted
@@ -609,7 +609,7 @@ class Plan(Result):
                 }
                 for k, r in enumerate(self.reasons)
             ],
-            "scheduled": _numbers(self.scheduled),
+            "scheduled": self.scheduled and asdict(self.scheduled),
             "timed": [asdict(size) for size in self.timed],
             "minutes": self.execution.total / 60,
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
@@ -617,7 +617,3 @@ class Plan(Result):
             **({"made_for": self.made_for} if self.made_for else {}),
             "seed": self.seed,
         }  # fmt: skip
-
-
-def _numbers(record: Any) -> dict[str, Any] | None:
-    return None if record is None else asdict(record)

@@ -102,8 +102,7 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     for joint, levels in cell.model.compliance_levels.items():
         if joint in wanted:
             continue
-        i = joint_index(joint)
-        turns = chain.kinds[i] == "revolute"
+        turns = chain.kinds[joint_index(joint)] == "revolute"
         stated = ", ".join(f"{math.degrees(v) if turns else v:.6g}" for v in levels)
         instead = f" instead of {next(iter(wanted))}" if wanted else ""
         raise InputError(
@@ -209,8 +208,7 @@ def brought(
         raise InsufficientDataError(f"{told}; {rules.advice(verdict) if len(own) else levels}")
     new = ok
     if pins is not None and len(pins.q):
-        near = np.abs(q[ok, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
-        new = ok[~near]
+        new = ok[np.abs(q[ok, None] - pins.q[None]).max(axis=2).min(axis=1) >= LEVEL_SLACK]
     found = Candidates(q[new], group[new], CandidateCounts(len(q), len(ok), removed))
     return found, [names[k] for k in new], told
 

@@ -233,8 +233,7 @@ def _aimed(
             "over the joint ranges, but the rules allow none, or no plan can make all of them "
             "certain; leave it out"
         )
-    warnings = setup.warnings + told
-    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)
+    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=setup.warnings + told)
 
 
 # The weight of what lies elsewhere, from the price that the test poses may pay for it.
@@ -258,8 +257,7 @@ def share_within(
         return 0.0
     progress(f"weight of the joint ranges, at most {100 * cap:g} % worse at the test poses")
     # As many as tell the share: it hangs on where poses are, not on each of them.
-    each = max(ENOUGH // len(shares), 20 * int(shares.max()))
-    pool = pool.take(evenly(pool.group, each))
+    pool = pool.take(evenly(pool.group, max(ENOUGH // len(shares), 20 * int(shares.max()))))
     problem = replace(setup, share=0.0).problem(pool, shares)
     own, T = problem.criterion, problem.balancing()
     alone = relax(problem.balanced(T), LOOSE)
@@ -322,8 +320,7 @@ def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, kno
     names = dict.fromkeys(p.effect for p in model.parameters if p.name not in without.names)
     errors: tuple[float | None, float | None] = (None, None)
     with suppress(InsufficientDataError):
-        A = found.on_kept(known_rows(model, targets, x, found)[0])
-        R = root(A, targets.weight)
+        R = root(found.on_kept(known_rows(model, targets, x, found)[0]), targets.weight)
         errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
     return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
 
@@ -511,8 +508,7 @@ class Choice:
         return np.asarray(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
 
     def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
-        rules = Feasibility(cell, self.work.chain)
-        return draw(rules, plan_forces(cell), candidates, self.seed)
+        return draw(Feasibility(cell, self.work.chain), plan_forces(cell), candidates, self.seed)
 
     def relaxed(
         self, cell: Cell, drawn: Candidates | int = SEARCHED, read: BoolArray | None = None
@@ -587,8 +583,7 @@ def within(choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes:
             break
         asked *= minutes / took
     more = (f"the plan takes {took:.0f} minutes, as its moves are longer than was thought",)
-    warnings = plan.warnings + (more if took > minutes else ())
-    return replace(plan, timed=sizes, warnings=warnings)
+    return replace(plan, timed=sizes, warnings=plan.warnings + more * (took > minutes))
 
 
 class _Fit(NamedTuple):
@@ -713,8 +708,7 @@ def chosen_states(
     ways = single_ways(information)
     if len(ways) == 1:
         one = "a deflection takes its reading without load and that under the only one"
-        alone = "there is one load state"
-        return setup, LoadStates("all", one if ways.sum() > 1 else alone)
+        return setup, LoadStates("all", one if ways.sum() > 1 else "there is one load state")
     progress("load states of the poses")
     few = np.arange(0, len(q), max(len(q) // SOME, 1))
 

@@ -469,8 +469,7 @@ class Residuals:
             for m in range(many if several else 1):
                 at = shown[marker[shown] == m] if several else shown
                 label = say.short_name(table.marker_names[used[m]]) if several else ""
-                size = 2.6 if len(shown) <= 1500 else 1.6
-                dots(axes, x[at], values[at], SERIES[m], size, label)
+                dots(axes, x[at], values[at], SERIES[m], 2.6 if len(shown) <= 1500 else 1.6, label)
             axes.set_ylabel(f"{name} in {unit}")
             if name == self.components[-1]:
                 axes.set_xlabel("configuration")

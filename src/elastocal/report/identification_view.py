@@ -387,8 +387,7 @@ def combination_truth(result: Calibration, combination: Combination, truth: Trut
     (first, _), *rest = combination.terms.items()
     if any(name not in truth for name in combination.terms):
         return None
-    shift = sum(f * (truth[name] - result[name].held) for name, f in rest)
-    return truth[first] + shift
+    return truth[first] + sum(f * (truth[name] - result[name].held) for name, f in rest)
 
 
 def inside(value: float | None, ci95: tuple[float, float] | None) -> str:

@@ -284,8 +284,7 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
             how = f"Refitted to the calibrated arm at {refit.visits} measured visits"
             told += f", with the values identified {say.length(refit.before)}"
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
-        nominal = say.length(refit.nominal)
-        told += f", the nominal file with base and tool placed {nominal}{worse}"
+        told += f", the nominal file with base and tool placed {say.length(refit.nominal)}{worse}"
         yield say.Sentence(f"{how}: {told}.")
         if fitted:
             there = ", which the file has" if done.framed else ": place it there"

@@ -123,14 +123,13 @@ class Spring:
     name: str
     site: str
     kind: str
-    axis: tuple[float, float, float]
+    axis: tuple[float, ...]
     law: Callable[[ca.SX], ca.SX]
 
     @classmethod
     def linear(cls, name: str, site: str, kind: str, axis: Any, compliance: ca.SX) -> Spring:
         """A spring with θ = k τ, k in rad/(N m) or m/N."""
-        x, y, z = (float(a) for a in axis)
-        return cls(name, site, kind, (x, y, z), lambda tau: compliance * tau)
+        return cls(name, site, kind, tuple(map(float, axis)), lambda tau: compliance * tau)
 
 
 class Arm:
@@ -490,8 +489,7 @@ def check(effect: object) -> None:
         ("needs", effect.needs, NEEDS),
     ):
         for found in given:
-            told = f"{kind.__name__}.{key} takes {listed(known)}; found {found!r}"
-            require(found in known, told)
+            require(found in known, f"{kind.__name__}.{key} takes {listed(known)}; found {found!r}")
     hooks = ("shape", "load", "read")
     lacking = [] if kind.places is not Effect.places or kind.at else ["places"]
     lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]

@@ -138,10 +138,8 @@ def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[
         value = given.get(setting.key, setting.default)
         where = f"{cell.source}: [model.nominal.settings.{place}] {setting.key}"
         if value is None:
-            told = (
-                f"is missing, which {effect.name} at {place} needs; `elastocal diagnose` searches"
-            )
-            raise InputError(f"{where} {told} for it")
+            told = f"is missing, which {effect.name} at {place} needs; `elastocal diagnose`"
+            raise InputError(f"{where} {told} searches for it")
         told = f"takes {setting.lower:g} to {setting.upper:g}; found {value:g}"
         require(setting.lower <= value <= setting.upper, f"{where} {told}")
         values[setting.key] = ca.SX(value)
@@ -149,8 +147,7 @@ def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[
 
 
 def _check_known(key: str, what: str, found: str, valid: Collection[str], cell: Cell) -> None:
-    told = f"{cell.source}: [model] {key}: unknown {what} '{found}'"
-    check_known(found, valid, told, "valid:")
+    check_known(found, valid, f"{cell.source}: [model] {key}: unknown {what} '{found}'", "valid:")
 
 
 MAX_STEPS = 30

@@ -141,10 +141,8 @@ class DistanceSensor(Effect):
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         nominal = cell.tracker.anchor if cell.tracker.anchor is not None else np.zeros(3)
-        anchor = [
-            ParameterSpec(f"anchor_{k}", "m", float(v), 3e-3)
-            for k, v in zip("xyz", nominal, strict=True)
-        ]
+        known = zip("xyz", nominal, strict=True)
+        anchor = (ParameterSpec(f"anchor_{k}", "m", float(v), 3e-3) for k, v in known)
         return (*anchor, ParameterSpec("length_offset", "m", 0.0, 3e-3))
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:

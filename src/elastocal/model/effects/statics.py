@@ -421,8 +421,7 @@ class LinkWeights(Effect):
                 for key, axis in zip("xy", transverse_axes(joint.axis), strict=True):
                     moment += p[f"{link}_moment_{key}"] * (up @ rigid.constant(axis))
             else:
-                along = up @ rigid.constant(joint.axis)
-                moment += p[f"{link}_mass"] * along * arm.joint_angle(i)
+                moment += p[f"{link}_mass"] * (up @ rigid.constant(joint.axis)) * arm.joint_angle(i)
         arm.add_potential(STANDARD_GRAVITY * moment)
 
 
@@ -450,8 +449,7 @@ def add_deflection(arm: Arm, i: int, name: str, law: Callable[[ca.SX], ca.SX]) -
         arm.q[i] += law(arm.input("torque", arm.chain.n_joints)[i])
         return
     joint = arm.chain.joints[i]
-    x, y, z = (float(a) for a in joint.axis)
-    arm.add_spring(Spring(name, f"joint{i + 1}", joint.kind, (x, y, z), law))
+    arm.add_spring(Spring(name, f"joint{i + 1}", joint.kind, tuple(map(float, joint.axis)), law))
 
 
 def nominal_compliance(chain: Chain, cell: Cell) -> tuple[float, ...] | None:
