@@ -61,9 +61,12 @@ def csv_lines(
     require(some, f"{source}: empty file; the first line names the columns")
     (number, first), *others = some
     first = first.removeprefix("\ufeff")
-    told = f"{source}: line 1 is blank; the first line must name the columns"
+    stated = re.fullmatch(f'"?sep=([{DELIMITERS}])"?', first.rstrip(" "))  # as Excel has it
+    if stated and others:
+        (number, first), *others = others
+    told = f"{source}: line {number} is blank; the first line must name the columns"
     require(first.strip(), told)
-    delimiter = max(DELIMITERS, key=first.count)
+    delimiter = stated[1] if stated else max(DELIMITERS, key=first.count)
     header = tuple(name.strip() for name in _split(source, number, first, delimiter))
     blank = " " if delimiter == "\t" else " \t"
     lines = ([(k, t) for k, t in piece if t.strip(blank)] for piece in chain([others], pieces))

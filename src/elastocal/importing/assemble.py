@@ -26,7 +26,7 @@ from elastocal.importing import exports
 from elastocal.importing.exports import FORCES, Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
-from elastocal.messages import InputError, length, listed, quoted, require, rounded
+from elastocal.messages import InputError, counted, length, listed, quoted, require, rounded
 from elastocal.model.chain import beyond_limits
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
@@ -347,18 +347,36 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
             "configuration in [source.columns], and a pattern in [source.names]",
         )
     q, row = log.q, np.full(len(points), -1)
-    key = _keys(own, names) or _key
+    force = np.column_stack([np.zeros((len(log), 0)), *(log.numbers[s] for s in log.forces)])
+    markers, key = points.texts.get("marker", own), _keys(own, names) or _key
     unused: set[int] = set(range(len(log)))
     for _, chosen, rows in _loads_apart(points, log):
-        known: dict[str, int] = {}
+        known, taken = defaultdict[str, list[int]](list), defaultdict[tuple, list[int]](list)
         for r in rows:
-            first = known.setdefault(key(names[r]), int(r))
-            if first != r and not np.array_equal(q[first], q[r]):
+            (visits := known[key(names[r])]).append(int(r))
+            if not np.array_equal(q[visits[0]], q[r]):
                 raise InputError(
                     f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
-                    f"{log.line[first]}; name visits apart, or say which load each belongs to"
+                    f"{log.line[visits[0]]}; name visits apart, or say which load each belongs to"
                 )
-        row[chosen] = [known.get(key(own[i]), -1) for i in chosen]
+        for k, i in enumerate(chosen):
+            taken[key(own[i]), markers[i]].append(k)
+        runs = _visits(points, chosen, None)
+        for (name, _), some in taken.items():
+            visits = known.get(name, [-1])
+            # Visits under one load are as one.
+            visits = visits[: 1 if (force[visits] == force[visits[0]]).all() else None]
+            nth = np.unique(runs[some], return_inverse=True)[1]
+            if nth[-1] + 1 != len(visits):
+                nth = np.arange(len(some)) * len(visits) // len(some)
+                lines = listed((str(log.line[r]) for r in visits), SHOWN)
+                require(
+                    len(some) % len(visits) == 0,
+                    f"{points.shown(int(chosen[some[0]]))}: {counted(len(some), 'reading')}, but "
+                    f"{log.source} visits the pose under several loads (lines {lines}); give each "
+                    "load's points in a file of its own, with load in its [[source]]",
+                )
+            row[chosen[some]] = np.array(visits)[nth]
         used = {key(own[i]) for i in chosen}
         unused -= {int(r) for r in rows if key(names[r]) in used}
     left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))
@@ -616,6 +634,10 @@ def import_files(
     if log is not None:
         lack = f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         require(log.q.shape[1], lack)
+        if log.forces and ("load" in points.texts or points.forces):
+            warnings.append(f"{log.source}: its loads are not taken, as the points state theirs")
+            kept = {stem: v for stem, v in log.numbers.items() if stem not in FORCES}
+            log = replace(log, numbers=kept)
         joined = join(points, log, table.join)
         points = _with_joint_values(points, log, joined)
     columns, kinds, doubts = assemble(where, points, table)
