@@ -517,6 +517,7 @@ def _parquet(source: str, what: str) -> str:
             ) from None
         except Exception as error:  # it has exceptions of its own
             raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
+    frame = frame.reset_index() if any(frame.index.names) else frame
     cells, text = frame.astype(object).where(frame.notna(), ""), StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(frame.columns)
