@@ -347,7 +347,7 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
             "configuration in [source.columns], and a pattern in [source.names]",
         )
     q, row = log.q, np.full(len(points), -1)
-    force = np.column_stack([np.zeros((len(log), 0)), *(log.numbers[s] for s in log.forces)])
+    force = np.column_stack([np.zeros(len(log)), *(log.numbers[stem] for stem in log.forces)])
     markers, key = points.texts.get("marker", own), _keys(own, names) or _key
     unused: set[int] = set(range(len(log)))
     for _, chosen, rows in _loads_apart(points, log):
@@ -363,20 +363,20 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
             taken[key(own[i]), markers[i]].append(k)
         runs = _visits(points, chosen, None)
         for (name, _), some in taken.items():
-            visits = known.get(name, [-1])
-            # Visits under one load are as one.
-            visits = visits[: 1 if (force[visits] == force[visits[0]]).all() else None]
+            at, n = np.array(known.get(name, [-1])), len(some)
+            states = len(np.unique(force[at], axis=0))
+            at = at[: None if states > 1 else 1]
             nth = np.unique(runs[some], return_inverse=True)[1]
-            if nth[-1] + 1 != len(visits):
-                nth = np.arange(len(some)) * len(visits) // len(some)
-                lines = listed((str(log.line[r]) for r in visits), SHOWN)
+            if nth[-1] + 1 != (k := len(at)):  # as many each, if none is a half of a load's
+                nth = np.arange(n) * k // n
+                lines = listed((str(log.line[r]) for r in at), SHOWN)
                 require(
-                    len(some) % len(visits) == 0,
-                    f"{points.shown(int(chosen[some[0]]))}: {counted(len(some), 'reading')}, but "
+                    n % k == 0 and (k in (n, states)),
+                    f"{points.shown(int(chosen[some[0]]))}: {counted(n, 'reading')}, but "
                     f"{log.source} visits the pose under several loads (lines {lines}); give each "
                     "load's points in a file of its own, with load in its [[source]]",
                 )
-            row[chosen[some]] = np.array(visits)[nth]
+            row[chosen[some]] = at[nth]
         used = {key(own[i]) for i in chosen}
         unused -= {int(r) for r in rows if key(names[r]) in used}
     left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))

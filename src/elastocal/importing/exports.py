@@ -215,9 +215,7 @@ _KRL = re.compile(r"(?:(?<![\w$])([$A-Za-z_][\w$]*+(?:\[\s*+\d++\s*+\])?)\s*+=\s
 _KRL_PART = re.compile(r"([A-Za-z_]\w*+(?:\[\s*+\])?)\s++(\S.*)")
 # Above a move and below it in a program of `design`.
 _OF_DESIGN = re.compile("; (?:configuration (.+)|via point|home$)")
-_MEASURED = re.compile(
-    r"; measure configuration (.*), (?:no load|load of \((\S+), (\S+), (\S+)\) N)"
-)
+_MEASURED = re.compile(r"; measure configuration (.*), (?:no|load of \((.+), (.+), (.+)\) N)")
 _RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?\s*+:=")
 _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
@@ -715,11 +713,10 @@ def with_loads_of_names(
     """With the loads that their files are named for, hanging straight down, where nothing else
     states any, and what to tell."""
     made, every = dict(by_role), [r for role in by_role.values() for r in role]
-    stated = any(r.load or "load" in r.texts for r in every)
-    if loads or stated or any(r.forces for r in by_role["points"]):
-        return made, []
     named = {r.source: load_in(Path(r.source).stem) for r in every}
-    if not any(named.values()) and any(r.forces for r in by_role["joints"]):
+    # A log's forces are what was planned: names of files win.
+    forces = [*by_role["points"], *([] if any(named.values()) else by_role["joints"])]
+    if loads or any(r.load or "load" in r.texts for r in every) or any(r.forces for r in forces):
         return made, []
     if not any(named.values()):
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
