@@ -546,10 +546,11 @@ def _corrections(d: Diagnosis) -> Iterator[say.Block]:
     if d.slight:
         at = next((k for k, step in enumerate(d.budget) if step.step == "rest"), 0)
         gone = d.budget[at - 1].heldout_rms - d.budget[at].heldout_rms if at else 0.0
-        told = f", or told by what was found; together {say.length(gone)} of the held-out error"
+        together = f", or told by what was found; together {say.length(gone)} of the held-out error"
+        together *= gone > SLIGHT * d.gap.calibrated
         yield say.Sentence(
             f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each"
-            f"{told * (gone > SLIGHT * d.gap.calibrated)}. They correct the arm and are not findings."
+            f"{together}. They correct the arm and are not findings."
         )
 
 
