@@ -126,17 +126,14 @@ def test_units_in_headers(header, expected):
     assert split_unit(header) == expected
 
 
-@pytest.mark.parametrize(
-    ("values", "units"),
-    [
-        ([1.0, 360.0, 400.0, 2 * np.pi, 2000 * np.pi], ["rev", "deg", "gon", "rad", "mrad"]),
-        ([1.0, 2.54, 25.4, 0.0254, 25400.0], ["in", "cm", "mm", "m", "um"]),
-        ([1.0, 60.0, 3.6e3, 3.6e6, 3.6e9, 3.6e12], ["h", "min", "s", "ms", "us", "ns"]),
-        ([20.0, 293.15, 68.0], ["C", "K", "F"]),
-        ([2.5, 2500.0], ["kN", "N"]),
-        ([2.0, 2000.0, 2e6], ["kNm", "Nm", "Nmm"]),
-    ],
-)
+@pytest.mark.parametrize(("values", "units"), [
+    ([1.0, 360.0, 400.0, 2 * np.pi, 2000 * np.pi], ["rev", "deg", "gon", "rad", "mrad"]),
+    ([1.0, 2.54, 25.4, 0.0254, 25400.0], ["in", "cm", "mm", "m", "um"]),
+    ([1.0, 60.0, 3.6e3, 3.6e6, 3.6e9, 3.6e12], ["h", "min", "s", "ms", "us", "ns"]),
+    ([20.0, 293.15, 68.0], ["C", "K", "F"]),
+    ([2.5, 2500.0], ["kN", "N"]),
+    ([2.0, 2000.0, 2e6], ["kNm", "Nm", "Nmm"]),
+])  # fmt: skip
 def test_the_same_in_every_unit(values, units):
     found = [convert(np.array([v]), u, units[0])[0] for v, u in zip(values, units, strict=True)]
     np.testing.assert_allclose(found, values[0], rtol=1e-14)
