@@ -207,10 +207,9 @@ class SumAnswer:
 
     @property
     def decided(self) -> SumAnswer:
-        """The same without doubtful effects that are not missed at left-out configurations, and
-        without what does harm there, or is not missed and hardly in any draw of what acts: with it
-        the estimates would be other than the shares.  What they may take from others is in the
-        shares still."""
+        """The same without what is not missed at left-out configurations and doubtful, harmful
+        there, or hardly in any draw of what acts: with it the estimates would be other than the
+        shares.  What they may take from others is in the shares still."""
         now = self._left_out[0]
         gone = [k for k in self._doubtful if not pays(self._left_out_without([k])[0], now)]
         answer = self._without(gone)

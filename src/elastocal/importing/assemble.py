@@ -359,9 +359,9 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
                     f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
                     f"{log.line[visits[0]]}; name visits apart, or say which load each belongs to"
                 )
+        runs = _visits(points, chosen, None)
         for k, i in enumerate(chosen):
             taken[key(own[i]), markers[i]].append(k)
-        runs = _visits(points, chosen, None)
         for (name, _), some in taken.items():
             at, n = np.array(known.get(name, [-1])), len(some)
             states = len(np.unique(force[at], axis=0))
@@ -555,7 +555,6 @@ LARGEST_SIGMA_M = 5e-3
 
 
 def plausibility(columns: Columns, table: Measurements, observe: str | None) -> list[str]:
-    """Of columns that are likely in another unit, and pairs that are missing."""
     turning = table.q[:, np.array([kind == "revolute" for kind in table.kinds])]
     turned = float(np.degrees(np.abs(turning).max(initial=0.0)))
     span = float(np.degrees(np.ptp(turning, axis=0).max(initial=0.0)))

@@ -355,7 +355,6 @@ class Records:
         return [stem for stem in FORCES if stem in self.numbers]
 
     def shown(self, i: int) -> str:
-        """Row i for a list in a message."""
         name = self.names[i]
         return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
 
@@ -390,7 +389,6 @@ class Records:
 
     @classmethod
     def stacked(cls, parts: Sequence[Records]) -> Records:
-        """The rows of all parts, which have the same numbers in the same units."""
         stems = dict.fromkeys(stem for part in parts for stem in part.texts)
         return replace(
             parts[0],
@@ -404,7 +402,6 @@ class Records:
 
 
 def joint_stems(numbers: Iterable[str]) -> list[str]:
-    """q1, q2 … among the columns, in order."""
     found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
     return sorted(found, key=lambda stem: int(stem[1:]))
 
