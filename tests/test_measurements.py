@@ -268,7 +268,7 @@ def parquet(tmp_path):
 
     def parquet(columns, **options):
         path = tmp_path / "data.parquet"
-        pandas.DataFrame(columns).to_parquet(path)
+        pandas.DataFrame(columns).set_index([*columns][-1:]).to_parquet(path)
         return read_measurements(path, joint_kinds=("revolute", "revolute"), **options)
 
     return parquet

@@ -41,7 +41,7 @@ def test_cells_may_be_empty_where_the_column_may_be_absent_and_only_there():
 
 
 def test_a_minus_of_text_programs_is_one_of_numbers_and_stays_as_written_in_labels():
-    table = read("name;x_m;y_m\n−1;−1,5;–2\n")
+    table = read("sep=;\nname;x_m;y_m\n−1;−1,5;–2\n")
     assert table.text(0, "name") == "−1"
     assert (table.numbers["x_m"][0], table.numbers["y_m"][0]) == (-1.5, -2)
 

@@ -386,7 +386,8 @@ class Cell:
     tracker: Tracker = keyed(default_factory=Tracker)
     model: ModelSpec = keyed(default_factory=ModelSpec)
     limits: dict[str, Joint] = by_name(
-        takes="[lower, upper] per joint, lower < upper, as in joint1_deg = [-170.0, 170.0]",
+        takes="[lower, upper] per joint, lower < upper, as in joint1_deg = [-170.0, 170.0] (for a "
+        "joint that stands still [design.levels] takes its value, as in joint1_deg = [90])",
         form=dict[str, Joint],
         into=joint_values,
     )

@@ -62,8 +62,12 @@ def csv_lines(
     require(some, f"{source}: empty file; the first line names the columns")
     (number, first), *others = some
     first = first.removeprefix("\ufeff")
-    require(first.strip(), f"{source}: line 1 is blank; the first line must name the columns")
-    delimiter = max(DELIMITERS, key=first.count)
+    stated = re.fullmatch(f'"?sep=([{DELIMITERS}])"?', first.rstrip(" "))  # as Excel has it
+    if stated and others:
+        (number, first), *others = others
+    told = f"{source}: line {number} is blank; the first line must name the columns"
+    require(first.strip(), told)
+    delimiter = stated[1] if stated else max(DELIMITERS, key=first.count)
     header = tuple(name.strip() for name in _split(source, number, first, delimiter))
     blank = " " if delimiter == "\t" else " \t"
     lines = ([(k, t) for k, t in piece if t.strip(blank)] for piece in chain([others], pieces))
@@ -507,6 +511,7 @@ def _parquet(source: str, what: str) -> str:
             ) from None
         except Exception as error:  # it has exceptions of its own
             raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
+    frame = frame.reset_index() if any(frame.index.names) else frame
     cells, text = frame.astype(object).where(frame.notna(), ""), StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(frame.columns)

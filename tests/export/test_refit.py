@@ -140,8 +140,10 @@ def test_with_its_joint_correction_mujoco_does_as_well_as_elastocal(folder):
     found = error_in_mujoco(folder, "corrected.xml", "joints.csv")
     assert found < 1.2 * own_error(folder)
     assert told["marker_rms_with_correction_um"] < 20
-    # Without directions the hysteresis of the joints is left.
+    # Without directions the hysteresis of the joints is left; an arm without has none in its file.
     assert error_in_mujoco(folder, "corrected.xml") > 3 * found
+    export(folder, "plain", "a.urdf", *correction)
+    assert "joint2,joint3" in (text := correction[1].read_text()) and "approach" not in text
 
 
 @pytest.mark.parametrize(

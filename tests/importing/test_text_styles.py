@@ -35,15 +35,10 @@ def check(found):
     np.testing.assert_allclose(found.table.position * 1e3, expected[:, 3:], rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("delimiter", "decimal", "encoding", "thousands"),
-    [
-        (",", ".", "utf-8-sig", ""),
-        ("\t", ",", "cp1252", "."),
-        (";", ".", "utf-16", "'"),
-        (";", ",", "utf-8", " "),
-    ],
-)
+@pytest.mark.parametrize(("delimiter", "decimal", "encoding", "thousands"), [
+    (",", ".", "utf-8-sig", ""), ("\t", ",", "cp1252", "."), (";", ".", "utf-16", "'"),
+    (";", ",", "utf-8", " "),
+])  # fmt: skip
 def test_styles_of_tables(tmp_path, delimiter, decimal, encoding, thousands):
     text = text_of(delimiter, decimal, thousands)
     if thousands == " ":  # as office programs write it
@@ -95,50 +90,50 @@ def test_robot_programs_over_several_lines_in_logs_and_arrays(tmp_path, text, pr
     assert [line for line, _ in found.understood[1]["ignored"]] == lines
 
 
-@pytest.mark.parametrize(
-    ("text", "preset", "message"),
-    [
-        ("MODULE x\nENDMODULE", "kuka", "f: no "),
-        ("MODULE x\nENDMODULE", "abb", "f: no "),
-        ("XP1={A1 1,A2 B-1,A3 2}", "kuka", r"f, line 1: A2 is 'B-1', not a number"),
-        (b"", "kuka", "empty file"),
-        (b"PK\x03\x04abc", "kuka", "workbook"),
-        (b"a\0\0\0\0b,c\0d", "kuka", "NUL characters"),
-    ],
-)
+LOADED = "load of (0, 0, -98.1) N"
+STOP = "; configuration {0}\nPTP {{A1 {0}}}\n{2}; measure configuration {0}, {1}\nWAIT SEC 3\n"
+VISITS = [(2, "no load", ""), (1, "no load", ""), (1, LOADED, "; hang it\nHALT\n"), (2, LOADED, "")]
+
+
+@pytest.mark.parametrize(("points", "force"), {"2112": [0, 0, 1, 1], "1122": [0, 1, 0, 1]}.items())
+def test_a_program_of_design_says_under_which_load(tmp_path, points, force):
+    text = "".join(STOP.format(*visit) for visit in VISITS) + "; home\nPTP {A1 0}\n"
+    names = "[[source]]\npreset = 'leica'\n[[source]]\npreset = 'kuka'\n"
+    table = "Point ID,X mm,Y mm,Z mm\n" + "".join(f"P{name}_M1,1,2,3\n" for name in points)
+    found = imported(tmp_path, {"p.csv": table, "f": text}, names)
+    assert found.table.force[:, 2].tolist() == [-98.1 * f for f in force]
+    with pytest.raises(InputError, match=r"P2_M1 \(line .\): 1 reading,.*lines 2, 16.*a file of"):
+        imported(tmp_path, {"p.csv": table.rpartition("P")[0], "f": text}, names)
+
+
+@pytest.mark.parametrize(("text", "preset", "message"), [
+    ("MODULE x\nENDMODULE", "kuka", "f: no "), ("MODULE x\nENDMODULE", "abb", "f: no "),
+    ("XP1={A1 1,A2 B-1,A3 2}", "kuka", r"f, line 1: A2 is 'B-1', not a number"),
+    (b"", "kuka", "empty file"), (b"PK\x03\x04abc", "kuka", "workbook"),
+    (b"a\0\0\0\0b,c\0d", "kuka", "NUL characters"),
+])  # fmt: skip
 def test_files_without_joint_values(tmp_path, text, preset, message):
     with pytest.raises(InputError, match=message):
         program(tmp_path, text, preset)
 
 
-@pytest.mark.parametrize(
-    ("header", "expected"),
-    [
-        ("X [mm]", ("X", "mm")),
-        ("Z (Millimeters)", ("Z", "mm")),
-        ("x_m", ("x", "m")),
-        ("Y, in", ("Y", "in")),
-        ("T [°F]", ("T", "F")),
-        ("field.position0", ("field.position0", None)),
-        ("[mm]", ("[mm]", None)),
-        ("Point ID", ("Point ID", None)),
-    ],
-)
+@pytest.mark.parametrize(("header", "expected"), {
+    "X [mm]": ("X", "mm"), "Z (Millimeters)": ("Z", "mm"), "x_m": ("x", "m"), "Y, in": ("Y", "in"),
+    "T [°F]": ("T", "F"), "field.position0": ("field.position0", None), "[mm]": ("[mm]", None),
+    "Point ID": ("Point ID", None),
+}.items())  # fmt: skip
 def test_units_in_headers(header, expected):
     assert split_unit(header) == expected
 
 
-@pytest.mark.parametrize(
-    ("values", "units"),
-    [
-        ([1.0, 360.0, 400.0, 2 * np.pi, 2000 * np.pi], ["rev", "deg", "gon", "rad", "mrad"]),
-        ([1.0, 2.54, 25.4, 0.0254, 25400.0], ["in", "cm", "mm", "m", "um"]),
-        ([1.0, 60.0, 3.6e3, 3.6e6, 3.6e9, 3.6e12], ["h", "min", "s", "ms", "us", "ns"]),
-        ([20.0, 293.15, 68.0], ["C", "K", "F"]),
-        ([2.5, 2500.0], ["kN", "N"]),
-        ([2.0, 2000.0, 2e6], ["kNm", "Nm", "Nmm"]),
-    ],
-)
+@pytest.mark.parametrize(("values", "units"), [
+    ([1.0, 360.0, 400.0, 2 * np.pi, 2000 * np.pi], ["rev", "deg", "gon", "rad", "mrad"]),
+    ([1.0, 2.54, 25.4, 0.0254, 25400.0], ["in", "cm", "mm", "m", "um"]),
+    ([1.0, 60.0, 3.6e3, 3.6e6, 3.6e9, 3.6e12], ["h", "min", "s", "ms", "us", "ns"]),
+    ([20.0, 293.15, 68.0], ["C", "K", "F"]),
+    ([2.5, 2500.0], ["kN", "N"]),
+    ([2.0, 2000.0, 2e6], ["kNm", "Nm", "Nmm"]),
+])  # fmt: skip
 def test_the_same_in_every_unit(values, units):
     found = [convert(np.array([v]), u, units[0])[0] for v, u in zip(values, units, strict=True)]
     np.testing.assert_allclose(found, values[0], rtol=1e-14)

@@ -24,7 +24,7 @@ from elastocal.planning.plan import Plan
 from elastocal.planning.poses import ELSEWHERE, everywhere
 from elastocal.planning.relaxation import exact_plan, relax
 from elastocal.planning.search import Checkpoint
-from elastocal.planning.setup import Setup, set_up, share_within
+from elastocal.planning.setup import Setup, clocked, set_up, share_within
 
 CHAIN = kr270_chain()
 Q = random_poses(CHAIN, 60, seed=5)
@@ -101,6 +101,8 @@ def test_the_clock_runs_as_the_order_takes() -> None:
     twice = replace(plan, execution=replace(plan.execution, stops=(*stops, once_more))).table()
     assert sorted(twice.time) == pytest.approx([*times, 9999.0], abs=1e-3)
     assert twice.repeat.sum() == 1
+    later = clocked(plan.execution, replace(twice, approach=None)).stops  # behind what was measured
+    assert [stop.time for stop in later] == pytest.approx([9999.0 + time for time in times])
 
 
 def test_to_find_them_too_costs_something_and_the_certificate_stays() -> None:

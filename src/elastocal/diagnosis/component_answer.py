@@ -207,13 +207,16 @@ class SumAnswer:
 
     @property
     def decided(self) -> SumAnswer:
-        """The same without doubtful effects that are not missed at left-out configurations, and
-        without what does harm there.  What they may take from others is in the shares still."""
+        """The same without what is not missed at left-out configurations and doubtful, harmful
+        there, or hardly in any draw of what acts: with it the estimates would be other than the
+        shares.  What they may take from others is in the shares still."""
         now = self._left_out[0]
         gone = [k for k in self._doubtful if not pays(self._left_out_without([k])[0], now)]
         answer = self._without(gone)
-        harmful = (key for key, gain in answer._not_paying.items() if gain < -HARM)
-        return answer._without([k for key in harmful for k in answer._at_place[key]])
+        missed = ((answer._at_place[key], gain) for key, gain in answer._not_paying.items())
+        harmful = (own for own, gain in missed
+                   if gain < -HARM or np.mean(answer.squares(own) > 0) < CHANCE)  # fmt: skip
+        return answer._without([k for own in harmful for k in own])
 
     @cached_property
     def _doubtful(self) -> list[int]:

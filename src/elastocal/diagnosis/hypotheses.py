@@ -144,6 +144,7 @@ def possible(
     smooth ones, which have their own searches."""
     chain, cell = model.chain, model.cell
     active = {(p.effect, p.where) for p in model.parameters}
+    unread = {f"marker:{n}" for k, n in enumerate(table.marker_names) if k not in table.marker}
     hypotheses: list[Hypothesis] = []
     untested: list[Untested] = []
     for name, effect in CATALOGUE.items():
@@ -155,6 +156,7 @@ def possible(
         places = [
             w for w in effect.places(chain, cell)
             if (name, w) not in active and effect.acts(w, chain, cell)
+            and w not in unread
         ]  # fmt: skip
         settings = {w: effect.settings(w, chain, cell) for w in places}
         # Only a driven effect can be evaluated at many settings; others' stay as the model has

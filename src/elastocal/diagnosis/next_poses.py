@@ -86,9 +86,12 @@ class NextPoses(Result):
 
     @property
     def beside(self) -> float | None:
-        """The bound of identify (m), where it is more than APART times as large."""
+        """The bound of identify (m), where it is more than APART times as large, or alone more than
+        is required."""
         alone = None if self.calibration is None else self.calibration.verdict.at
-        return alone if alone is not None and alone > APART * self.reached else None
+        most = APART * self.reached
+        most = min(most, self.required or most) if self.verdict == "enough" else most
+        return alone if alone is not None and alone > most else None
 
     def __repr__(self) -> str:
         told = f"at most {length(self.reached)} with 95 %"

@@ -586,7 +586,8 @@ def _fitted(
     fit = [k for k, e in enumerate(effects) if (geometry if e in GEOMETRY else yields[k])]
     turns = [k for k, e in enumerate(effects) if e == JointOffset.name and correct]
     assert kept.conditions.visits is not None
-    basis = _basis(kept.conditions.visits.q) if correct else []
+    sided = not {SIDE, "direction", "move"}.isdisjoint(kept.full.model.symbolic.arm.inputs)
+    basis = _basis(kept.conditions.visits.q, sided) if correct else []
     bent = [JointCorrection({(j, of): (at, by)})(rows.q, rows.approach)[:, j] - rows.q[:, j]
             for j, of, at, by in basis]  # fmt: skip
     least = np.array([*(model.parameters[k].lower for k in fit), *[-np.inf] * len(basis)])
@@ -617,12 +618,12 @@ def _fitted(
     return replace(part, x=np.array([values[n] for n in part.model.names])), correction
 
 
-def _basis(measured: Array) -> list[Curve]:
-    """Curves of every joint against every joint's angle, linear between KNOTS places, and with the
-    side that it came from, each with the coefficient one."""
+def _basis(measured: Array, sided: bool) -> list[Curve]:
+    """Curves of every joint against every joint's angle, linear between KNOTS places, and where the
+    arm is `sided` with the side that it came from, each with the coefficient one."""
     places = np.linspace(measured.min(axis=0), measured.max(axis=0), KNOTS)
     moving = np.flatnonzero(np.ptp(measured, axis=0) > MOVED)
     joints, ends = range(measured.shape[1]), np.array([-1.0, 1.0])
     bent = [(j, f"{JOINT}{i + 1}", places[:, i], hat)
             for j in joints for i in moving for hat in np.eye(KNOTS)]  # fmt: skip
-    return [*bent, *((j, f"{SIDE}{j + 1}", ends, ends) for j in joints)]
+    return [*bent, *((j, f"{SIDE}{j + 1}", ends, ends) for j in joints if sided)]

@@ -124,7 +124,8 @@ def _found(result: Calibration, of_solution: list[Finding]) -> Iterator[Finding]
     if mostly := mostly_prior(shares):
         yield _note("mostly_prior", parameters=mostly, share=tuple(shares[n] for n in mostly))
     if (summary := result.residual_summary) is not None:
-        yield shape_of(summary)
+        shape = shape_of(summary)  # its remedy, a robust fit, takes no knowledge
+        yield replace(shape, remedy="") if result.prior_share or result.active else shape
         if n := sum(g.n_deviating for g in summary.groupings):
             yield _note("scatter_unlike_noise_model", groups=n)
     yield from _test(result)

@@ -26,7 +26,7 @@ from elastocal.importing import exports
 from elastocal.importing.exports import FORCES, Records, joint_stems
 from elastocal.importing.mapping_file import JoinTable, JointsTable, MappingTable, SourceTable
 from elastocal.measurements import Measurements, families, read_measurements
-from elastocal.messages import InputError, length, listed, quoted, require, rounded
+from elastocal.messages import InputError, counted, length, listed, quoted, require, rounded
 from elastocal.model.chain import beyond_limits
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Labels, column, csv_text
@@ -346,18 +346,36 @@ def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
             "configuration in [source.columns], and a pattern in [source.names]",
         )
     q, row = log.q, np.full(len(points), -1)
-    key = _keys(own, names) or _key
+    force = np.column_stack([np.zeros(len(log)), *(log.numbers[stem] for stem in log.forces)])
+    markers, key = points.texts.get("marker", own), _keys(own, names) or _key
     unused: set[int] = set(range(len(log)))
     for _, chosen, rows in _loads_apart(points, log):
-        known: dict[str, int] = {}
+        known, taken = defaultdict[str, list[int]](list), defaultdict[tuple, list[int]](list)
         for r in rows:
-            first = known.setdefault(key(names[r]), int(r))
-            if first != r and not np.array_equal(q[first], q[r]):
+            (visits := known[key(names[r])]).append(int(r))
+            if not np.array_equal(q[visits[0]], q[r]):
                 raise InputError(
                     f"{log.where(int(r))}: pose {names[r]} has other joint values than in line "
-                    f"{log.line[first]}; name visits apart, or say which load each belongs to"
+                    f"{log.line[visits[0]]}; name visits apart, or say which load each belongs to"
                 )
-        row[chosen] = [known.get(key(own[i]), -1) for i in chosen]
+        runs = _visits(points, chosen, None)
+        for k, i in enumerate(chosen):
+            taken[key(own[i]), markers[i]].append(k)
+        for (name, _), some in taken.items():
+            at, n = np.array(known.get(name, [-1])), len(some)
+            states = len(np.unique(force[at], axis=0))
+            at = at[: None if states > 1 else 1]
+            nth = np.unique(runs[some], return_inverse=True)[1]
+            if nth[-1] + 1 != (k := len(at)):  # as many each, if none is a half of a load's
+                nth = np.arange(n) * k // n
+                lines = listed((str(log.line[r]) for r in at), SHOWN)
+                require(
+                    n % k == 0 and (k in (n, states)),
+                    f"{points.shown(int(chosen[some[0]]))}: {counted(n, 'reading')}, but "
+                    f"{log.source} visits the pose under several loads (lines {lines}); give each "
+                    "load's points in a file of its own, with load in its [[source]]",
+                )
+            row[chosen[some]] = at[nth]
         used = {key(own[i]) for i in chosen}
         unused -= {int(r) for r in rows if key(names[r]) in used}
     left_out = tuple(points.shown(int(i)) for i in np.flatnonzero(row < 0))
@@ -536,7 +554,6 @@ LARGEST_SIGMA_M = 5e-3
 
 
 def plausibility(columns: Columns, table: Measurements, observe: str | None) -> list[str]:
-    """Of columns that are likely in another unit, and pairs that are missing."""
     turning = table.q[:, np.array([kind == "revolute" for kind in table.kinds])]
     turned = float(np.degrees(np.abs(turning).max(initial=0.0)))
     span = float(np.degrees(np.ptp(turning, axis=0).max(initial=0.0)))
@@ -615,6 +632,10 @@ def import_files(
     if log is not None:
         lack = f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         require(log.q.shape[1], lack)
+        if log.forces and ("load" in points.texts or points.forces):
+            warnings.append(f"{log.source}: its loads are not taken, as the points state theirs")
+            kept = {stem: v for stem, v in log.numbers.items() if stem not in FORCES}
+            log = replace(log, numbers=kept)
         joined = join(points, log, table.join)
         points = _with_joint_values(points, log, joined)
     columns, kinds, doubts = assemble(where, points, table)

@@ -213,7 +213,9 @@ NO_JOINTS["robtarget"] = "no joint values"
 # is looked through once, not from each of its letters.
 _KRL = re.compile(r"(?:(?<![\w$])([$A-Za-z_][\w$]*+(?:\[\s*+\d++\s*+\])?)\s*+=\s*+)?\{([^{}]*+)\}")
 _KRL_PART = re.compile(r"([A-Za-z_]\w*+(?:\[\s*+\])?)\s++(\S.*)")
-_OF_DESIGN = re.compile("; (?:configuration (.+)|via point)")  # above a move of its programs
+# Above a move and below it in a program of `design`.
+_OF_DESIGN = re.compile("; (?:configuration (.+)|via point|home$)")
+_MEASURED = re.compile(r"; measure configuration (.*), (?:no|load of \((.+), (.+), (.+)\) N)")
 _RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?\s*+:=")
 _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
@@ -223,12 +225,13 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
     aggregate of A1, A2 … (and E1 …); FRAME, POS and E6POS (X, Y, Z) are passed over.  RAPID: every
     jointtarget [[rax_1 … rax_6], [eax_a … eax_f]], an array's members named P{1}, P{2} …;
     robtargets hold no joint values and o_jointtarget is the position before a correction: both are
-    passed over, and named, as are via points of a program of `design`, whose comments name poses.
-    """
+    passed over, and named, as are via points of a program of `design`, whose comments name poses
+    and loads."""
     axes, mark, read, what = {
         "krl": (KRL_AXES, ";", _krl, "no {A1 …, A2 …} with joint values"),
         "rapid": (RAPID_AXES, "!", _rapid, "no jointtarget [[…], […]]"),
     }[kind]
+    hung = [f"{stem}_N" for stem in FORCES]
     # Comments, outside quotation marks, go.
     bare = re.compile(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""")
     whole = "\n".join(found[0] for line in lines if (found := bare.match(line)))
@@ -248,11 +251,14 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
                 )
         if own := _OF_DESIGN.match(lines[line - 2] if line > 1 else ""):
             if own[1] is None:
-                ignored.append((line, "a via point, not measured"))
+                ignored.append((line, "home or a via point, not measured"))
                 continue
             name = name or own[1]
         kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
-        rows.append((line, [name, *(kept.get(axis, "") for axis in axes)]))
+        for load in filter(None, map(_MEASURED.match, lines[line : line + 3])):
+            if own and load[1] == own[1]:  # at once, or after a stop to change the load
+                kept |= dict(zip(hung, load.groups("0")[1:], strict=True))
+        rows.append((line, [name, *(kept.get(axis, "") for axis in (*axes, *hung))]))
     passed_over = f" ({len(ignored)} Cartesian positions passed over)" if ignored else ""
     if not rows:
         raise InputError(
@@ -260,9 +266,10 @@ def program_rows(source: str, lines: list[str], kind: str) -> Rows:
             "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
-    used = [0, *(i for i in range(1, len(axes) + 1) if any(cells[i] for _, cells in rows))]
+    header = ("name", *axes, *hung)
+    used = [i for i in range(len(header)) if not i or any(cells[i] for _, cells in rows)]
     rows = [(line, [cells[i] for i in used]) for line, cells in rows]
-    return Rows(tuple(("name", *axes)[i] for i in used), rows, ignored, kind.upper())
+    return Rows(tuple(header[i] for i in used), rows, ignored, kind.upper())
 
 
 # Offset into the text, name, and the values by axis or why there are none.
@@ -348,7 +355,6 @@ class Records:
         return [stem for stem in FORCES if stem in self.numbers]
 
     def shown(self, i: int) -> str:
-        """Row i for a list in a message."""
         name = self.names[i]
         return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
 
@@ -383,7 +389,6 @@ class Records:
 
     @classmethod
     def stacked(cls, parts: Sequence[Records]) -> Records:
-        """The rows of all parts, which have the same numbers in the same units."""
         stems = dict.fromkeys(stem for part in parts for stem in part.texts)
         return replace(
             parts[0],
@@ -397,7 +402,6 @@ class Records:
 
 
 def joint_stems(numbers: Iterable[str]) -> list[str]:
-    """q1, q2 … among the columns, in order."""
     found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
     return sorted(found, key=lambda stem: int(stem[1:]))
 
@@ -706,9 +710,11 @@ def with_loads_of_names(
     """With the loads that their files are named for, hanging straight down, where nothing else
     states any, and what to tell."""
     made, every = dict(by_role), [r for role in by_role.values() for r in role]
-    if loads or any(r.load or "load" in r.texts or r.forces for r in every):
-        return made, []
     named = {r.source: load_in(Path(r.source).stem) for r in every}
+    # A log's forces are what was planned: names of files win.
+    forces = [*by_role["points"], *([] if any(named.values()) else by_role["joints"])]
+    if loads or any(r.load or "load" in r.texts for r in every) or any(r.forces for r in forces):
+        return made, []
     if not any(named.values()):
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
         told += [f"column {name} of {r.source}" for r in every

@@ -176,6 +176,7 @@ def notes_of(robot: Robot, chain: Chain) -> list[str]:
     return found + jaw_told(chain, moved)
 
 
+NO_MASSES = "the file has no masses; if weights bend joints, state them and set true"
 FEW_KINDS = 3  # links of each mass, on average, from which on nobody has weighed them
 
 
@@ -218,7 +219,7 @@ def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
     yield f"{kind} = {toml_value(Path(os.path.relpath(path, folder)).as_posix())}"
     if kind == "dh" and path.suffix.lower() == ".csv":
         yield f'dh_convention = "{robot.dh_convention}"' + " " * 7 + '# or "modified" (Craig)'
-        yield '# masses = "links.csv"               # link masses, for weights: docs, File formats'
+        yield '# masses = "links.csv"           # link, mass_kg, com_x_m, com_y_m, com_z_m: weights'
     for name in ("base", "flange", "ur_model", "joint_names"):
         if (value := getattr(robot, name)) is not None:
             yield f"{name} = {toml_value(value)}"
@@ -319,7 +320,7 @@ def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]
     names += [f"{JointCompliance.name}:joint{i}" for i in sprung]
     effects = [f'"{name}",' for name in names]
     weighed = bool(chain.masses) and not placeholder_masses(chain)
-    told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"
+    told = "masses of the robot's file bend the joints" if weighed else NO_MASSES
     if chain.masses and not weighed:
         told = "the file's masses look like placeholders"
     if any("gravity" in note or "mass of" in note for note in chain.notes):

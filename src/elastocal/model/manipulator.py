@@ -200,7 +200,7 @@ class Model(ByValue):
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
         source, text = path, None
         if not isinstance(path, str | Path):
-            source, text = "DataFrame", path.to_csv(index=False)
+            source, text = "DataFrame", path.to_csv(index=any(path.index.names))
         return read_measurements(
             source, joint_kinds=self.chain.kinds, marker_names=markers, observe=observe, text=text
         )

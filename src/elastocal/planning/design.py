@@ -95,6 +95,7 @@ from elastocal.planning.setup import (
     Setup,
     applied,
     chosen_states,
+    clocked,
     promised,
     set_up,
     share_within,
@@ -233,6 +234,8 @@ class _Design:
         )
         open_ = tuple(name for name in effects if needs[name] and name not in functions)
         unknown = tuple(name for name in open_ if done or "temperature" in needs[name])
+        table = self.options.done if unknown else None  # times go on behind those of it
+        self.dated = None if table is None or table.time is None else table
         self._drop(
             unknown,
             f"the plan is made for the other parameters and holds {listed(unknown)} at nominal: "
@@ -263,6 +266,8 @@ class _Design:
 
     def run(self) -> Plan:
         plan = self._chosen()
+        if self.dated is not None:
+            plan = replace(plan, execution=clocked(plan.execution, self.dated))
         if self.conditions is None:
             return plan
         whole, fixed = self.conditions

@@ -19,7 +19,7 @@ from scipy.optimize import brentq, minimize
 
 from elastocal.cell import Cell
 from elastocal.identification.start import fixed_and_free
-from elastocal.measurements import STILL
+from elastocal.measurements import STILL, Measurements
 from elastocal.messages import InsufficientDataError, length, listed, require, rounded, wish
 from elastocal.model.chain import joint_index
 from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
@@ -285,10 +285,13 @@ def share_within(
 OPEN = frozenset({"time", "temperature", "approach"})
 
 
-def clocked(execution: Execution) -> Execution:
-    """With the time of each stop, in s from the beginning to the middle of its readings, and the
-    sign of each joint's last motion on the way to it, 0 where it has not moved yet."""
+def clocked(execution: Execution, done: Measurements | None = None) -> Execution:
+    """With the time of each stop, in s from the beginning, or the last of those `done`, to the
+    middle of its readings, and the sign of each joint's last motion on the way to it, 0 where it
+    has not moved yet, where those done say it."""
     motion, stops = execution.motion, []
+    start = 0.0 if done is None or done.time is None else float(done.time.max())
+    plain = done is not None and done.approach is None
     last = execution.stops[0].q if motion.home is None else motion.home
     sign = np.zeros(len(last), dtype=np.int64)
     for stop, begun in zip(execution.stops, execution.arrivals, strict=True):
@@ -296,8 +299,8 @@ def clocked(execution: Execution) -> Execution:
             step = q - last
             sign = np.where(np.abs(step) > STILL, np.sign(step), sign).astype(np.int64)
             last = q
-        came = sign if stop.approach is None else stop.approach
-        stops.append(replace(stop, time=float(begun) + motion.dwell / 2, approach=came))
+        came = sign if stop.approach is None and not plain else stop.approach
+        stops.append(replace(stop, time=start + begun + motion.dwell / 2, approach=came))
     return replace(execution, stops=tuple(stops))
 
 

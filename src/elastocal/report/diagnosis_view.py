@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from elastocal.diagnosis.component_answer import SLIGHT
 from elastocal.diagnosis.diagnosis import (
     NORMAL_95,
     STRUCTURE,
@@ -543,9 +544,13 @@ def _corrections(d: Diagnosis) -> Iterator[say.Block]:
         "deviation) and the length over which smooth ones change."
     ))  # fmt: skip
     if d.slight:
+        at = next((k for k, step in enumerate(d.budget) if step.step == "rest"), 0)
+        gone = d.budget[at - 1].heldout_rms - d.budget[at].heldout_rms if at else 0.0
+        together = f", or told by what was found; together {say.length(gone)} of the held-out error"
+        together *= gone > SLIGHT * d.gap.calibrated
         yield say.Sentence(
-            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each. "
-            "They correct the arm and are not findings."
+            f"{added_text(d.slight)}: probably less than a hundredth of the remaining error each"
+            f"{together}. They correct the arm and are not findings."
         )
 
 
