@@ -145,16 +145,17 @@ class SumAnswer:
         return np.asarray(self.moved.T @ self.moved / self._left_out[1].sum())
 
     @cached_property
-    def _poses(self) -> tuple[IntArray, Array]:
-        """Rows that show what new poses may be like, and how often each of their configurations is
-        drawn among NEW_POSES (configurations, draws)."""
+    def _poses(self) -> tuple[IntArray, Array, Array]:
+        """Rows that show what new poses may be like, the share of each of their configurations in
+        what poses there may be, and how often it is drawn among NEW_POSES (configurations, draws).
+        """
         rows = np.nonzero(self._rows)[0]
         known = np.unique(rows)
         some = known[np.linspace(0, len(known) - 1, min(MOST_POSES, len(known))).astype(int)]
         kept: IntArray = np.flatnonzero(np.isin(rows, some))
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
-        return kept, self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
+        return kept, share.T, self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
 
     def squares(self, members: Sequence[int]) -> Array:
         """Mean squares (draws,) in m² of what these components do together."""
@@ -315,7 +316,7 @@ class SumAnswer:
         """Readings without noise (rows, draws) of the configurations that are kept, each left out.
         θ* is drawn about the fit to the others, as uncertain as that is: what is read there then
         has the covariance P_cc⁻¹."""
-        kept, _ = self._poses
+        kept = self._poses[0]
         at, configuration = self.at, np.nonzero(self._rows)[0][kept]
         moved = self._wide.X[self._rows][kept] @ (self._drawn - at.beta[:, None])
         uncertain = np.linalg.inv(at.P) - self.found.data.V(self.found.noise)
@@ -333,13 +334,28 @@ class SumAnswer:
     def _error_without(self, gone: Sequence[int]) -> Array:
         """Mean square (draws,) in m² by which new poses err with these in no model."""
         left = self._predicted(*self._fitted_without(gone))[:, None] - self._true  # (rows, draws)
-        kept, times = self._poses
+        kept, share, times = self._poses
         rows = np.nonzero(self._rows)[0][kept]
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         each = (times * np.add.reduceat(left**2, starts, axis=0)).sum(axis=0)
         count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
         each /= (times * count[:, None]).sum(axis=0)
+        by_fit = self._by_fit(gone)[rows[starts]]
+        each *= np.exp((by_fit - by_fit.mean()) @ share / (count @ share) / each.mean())
         return np.asarray(each + self.supported.unexplained**2)
+
+    def _by_fit(self, gone: Sequence[int]) -> Array:
+        """By how much (C,) in m² a pose counts beside its own error, as the fit that errs at the
+        others hangs on it: infinitesimal jackknife of the mean square.  Without pose j, too, the
+        error a_c where c is left out grows by P_cc⁻¹ P_cj P_jj⁻¹ u_j, P_cj = −H_c H_jᵀ."""
+        at, index = self._fitted, self._index(gone) + self._own
+        Q, _ = linalg.qr(at.beta_deviation[:, index], mode="economic")
+        H = at.H - (at.H @ Q) @ Q.T
+        P, u = self._fitted_without(gone)
+        a = (each_left_out(self.at.P, self.at.u) - each_left_out(P, u)) * self._rows
+        of_error = np.einsum("cm,cmp->cp", each_left_out(P, a), H)
+        of_pose = np.einsum("cm,cmp->cp", each_left_out(P, u), H)
+        return np.asarray(2 * ((of_error.sum(axis=0) - of_error) * of_pose).sum(axis=1))
 
     @cached_property
     def _error(self) -> Array:
