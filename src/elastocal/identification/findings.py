@@ -572,7 +572,7 @@ SENTENCES = {
         "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
         "and {dof_pure} degrees of freedom, {p}): the arm does not return to the same "
         "place, or an effect is missing. The intervals do not include it and are too narrow: "
-        "use {count}intervals by cr2; measure more configurations rather than more repeats."
+        "{use}measure more configurations rather than more repeats."
     ),
     "drift": (
         "Base or tracker drift during the session ({sigma_um} µm{along}, by the "
@@ -633,8 +633,10 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         words["p"] = size_of(f.number("p")) if "p" in words else ""
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
         words |= _shown(f) if within else {}
-        default = "the default method, whose noise model has this scatter, or "
-        words["count"] = "" if result.noise.estimated else default
+        default = "the default method, whose noise model has this scatter"
+        use = [default] * (not result.noise.estimated)
+        use += ["intervals by cr2"] * (not (result.prior_share or result.active))
+        words["use"] = f"use {', or '.join(use)}; " if use else ""
         ask = f.remedy.startswith("Ask")
         words["look"] = "Look for missing effects (diagnose)" if ask else "Repeat some poses"
         words["remedy"] = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy

@@ -467,6 +467,8 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
                 raise UnknownNameError.of("limit", name, found)
             if most is not None and not found[name] <= most:
                 value = length(found[name]) if math.isfinite(found[name]) else "not known"
+                if name == "test" and self.test is None:
+                    value += f" without readings to test ({option('test')})"
                 told.append(f"{name}: {value} where at most {rounded(most * 1e6)} µm is required")
         return tuple(told)
 
