@@ -258,14 +258,18 @@ class SumAnswer:
         return squared_lengths(self.found.data, each_left_out(*self._fitted_without(gone)))
 
     def _fitted_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
-        """P (C, m, m) of each configuration and u = P r (C, m) without these components.  Their
-        coefficients have the posterior covariance DᵀD, D = L⁻¹ there, and the mean β̂; with D = QR
-        and Z = HQ, P grows by ZZᵀ and u by Z R⁻ᵀβ̂."""
-        at, index = self._fitted, self._index(gone) + self._own
-        Q, R = linalg.qr(at.beta_deviation[:, index], mode="economic")
-        Z = (at.H.reshape(-1, len(Q)) @ Q).reshape(*at.u.shape, len(index))
-        less = linalg.solve_triangular(R, at.beta[index], trans="T")
+        """P (C, m, m) of each configuration and u = P r (C, m) without these components, of mean β̂:
+        P grows by ZZᵀ and u by Z R⁻ᵀβ̂."""
+        at, (_, R, Z) = self._fitted, self._turned(gone)
+        less = linalg.solve_triangular(R, at.beta[self._index(gone) + self._own], trans="T")
         return at.P + Z @ Z.transpose(0, 2, 1), at.u + Z @ less
+
+    def _turned(self, gone: Sequence[int]) -> tuple[Array, Array, Array]:
+        """Q and R of D, where these components' coefficients have the posterior covariance DᵀD,
+        D = L⁻¹ there, and Z = HQ."""
+        at = self._fitted
+        Q, R = linalg.qr(at.beta_deviation[:, self._index(gone) + self._own], mode="economic")
+        return Q, R, (at.H.reshape(-1, len(Q)) @ Q).reshape(*at.u.shape, len(R))
 
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
@@ -325,36 +329,41 @@ class SumAnswer:
             np.bincount(configuration, each) for each in ((moved**2).mean(axis=1), variance)
         )
         grown = np.sqrt(np.maximum(left_out / np.maximum(own, 1e-300), 1.0))
-        return self._predicted(at.P, at.u)[:, None] + moved * grown[configuration, None]
+        return self._predicted(self._of_all)[:, None] + moved * grown[configuration, None]
 
-    def _predicted(self, P: Array, u: Array) -> Array:
+    @cached_property
+    def _of_all(self) -> Array:
+        """Residuals (C, m) of configurations left out of the fit of everything."""
+        return each_left_out(self.at.P, self.at.u)
+
+    def _predicted(self, left_out: Array) -> Array:
         """Readings (rows,) of the configurations that are kept, each by a fit to the others."""
-        return (self.found.data.r - each_left_out(P, u))[self._rows][self._poses[0]]
+        return (self.found.data.r - left_out)[self._rows][self._poses[0]]
 
     def _error_without(self, gone: Sequence[int]) -> Array:
         """Mean square (draws,) in m² by which new poses err with these in no model."""
-        left = self._predicted(*self._fitted_without(gone))[:, None] - self._true  # (rows, draws)
+        P, u = self._fitted_without(gone)
+        left_out = each_left_out(P, u)
+        left = self._predicted(left_out)[:, None] - self._true  # (rows, draws)
         kept, share, times = self._poses
         rows = np.nonzero(self._rows)[0][kept]
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         each = (times * np.add.reduceat(left**2, starts, axis=0)).sum(axis=0)
         count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
         each /= (times * count[:, None]).sum(axis=0)
-        by_fit = self._by_fit(gone)[rows[starts]]
+        by_fit = self._by_fit(gone, P, left_out)[rows[starts]]
         each *= np.exp((by_fit - by_fit.mean()) @ share / (count @ share) / each.mean())
         return np.asarray(each + self.supported.unexplained**2)
 
-    def _by_fit(self, gone: Sequence[int]) -> Array:
+    def _by_fit(self, gone: Sequence[int], P: Array, left_out: Array) -> Array:
         """By how much (C,) in m² a pose counts beside its own error, as the fit that errs at the
         others hangs on it: infinitesimal jackknife of the mean square.  Without pose j, too, the
-        error a_c where c is left out grows by P_cc⁻¹ P_cj P_jj⁻¹ u_j, P_cj = −H_c H_jᵀ."""
-        at, index = self._fitted, self._index(gone) + self._own
-        Q, _ = linalg.qr(at.beta_deviation[:, index], mode="economic")
-        H = at.H - (at.H @ Q) @ Q.T
-        P, u = self._fitted_without(gone)
-        a = (each_left_out(self.at.P, self.at.u) - each_left_out(P, u)) * self._rows
-        of_error = np.einsum("cm,cmp->cp", each_left_out(P, a), H)
-        of_pose = np.einsum("cm,cmp->cp", each_left_out(P, u), H)
+        error a_c where c is left out grows by P_cc⁻¹ P_cj e_j, P_cj = −H_c H_jᵀ, e as `left_out`.
+        """
+        Q, _, Z = self._turned(gone)
+        H = self._fitted.H - Z @ Q.T
+        errors = each_left_out(P, (self._of_all - left_out) * self._rows)
+        of_error, of_pose = (np.einsum("cm,cmp->cp", one, H) for one in (errors, left_out))
         return np.asarray(2 * ((of_error.sum(axis=0) - of_error) * of_pose).sum(axis=1))
 
     @cached_property
