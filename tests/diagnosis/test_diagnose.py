@@ -121,21 +121,6 @@ def test_where_another_effect_looks_the_same_the_answer_is_both(name: str) -> No
     assert (d.effects[0].effect, d.effects[0].where) == found[0]
 
 
-@pytest.mark.long  # of every day is the golden diagnose_nothing
-def test_nothing_is_claimed_on_an_arm_without_faults_though_all_is_tried() -> None:
-    d = diagnosed()
-    assert d.verdict == "nothing_significant"
-    assert d.effects == () and d.indistinguishable == () and d.location is None
-    assert d.probability_nothing > 0.5
-    assert d.noise.stated_factor == pytest.approx(1.0, abs=0.15)
-    assert all(c.probability < 0.2 for c in d.candidates)
-    assert min(t.p_family for t in d.structure) > 0.05
-    tried = [(c.effect, c.where) for c in d.candidates]
-    assert {f.effect for f in FAULTS.values()} <= {effect for effect, _ in tried}
-    assert {("gear_eccentricity", f"joint{j}") for j in range(1, 7)} <= set(tried)
-    assert len(set(tried)) == len(tried)
-
-
 WITHHELD = {
     "gear_eccentricity:joint4": ("transmission", "joint4 angle"),
     "marker_slip:marker:M2": ("tool", "time"),

@@ -12,6 +12,7 @@ import pytest
 
 import elastocal as ec
 from elastocal import Diagnosis
+from elastocal.cell_tables import EffectChoice
 from elastocal.model.effects.catalogue import effect_of
 
 CASES = Path(__file__).parents[1] / "cases"
@@ -79,6 +80,18 @@ def test_in_a_sorted_table_a_step_is_no_jump() -> None:
     why = ec.diagnose(case / "cell.toml", moved)
     assert not any("jump" in c.effect for c in why.candidates)
     assert why.verdict == "unknown_effect"
+
+
+def test_what_only_the_prior_holds_of_a_cause_is_no_number() -> None:
+    """Masses wrong at four links: gravity shows one moment of each, and that well."""
+    arm = ec.Model(CASES.parents[1] / "experiment_design/blind_diagnosis/example/cell.toml")
+    true = arm.with_effects((*arm.cell.model.effects, EffectChoice("link_mass_error")))
+    values = {f"link{k}.moment_z": 4.0 for k in range(3, 7)}
+    table = ec.simulate(true, arm.read(arm.cell.path.with_name("data.csv")), values=values)
+    told = {p.name: p for e in ec.diagnose(arm, table).effects for p in e.parameters}
+    known = {name: p for name, p in told.items() if p.std < np.inf}
+    assert values.keys() <= known.keys() < told.keys()
+    assert all(abs(p.value - values.get(n, 0.0)) < 4 * p.std for n, p in known.items())
 
 
 def test_no_weight_bends_an_upright_first_joint() -> None:

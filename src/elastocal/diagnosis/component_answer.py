@@ -57,6 +57,19 @@ TOLD = 0.02  # share of the gap from which it matters which of several effects i
 SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
 
 
+# A parameter whose deviation grows by more under a prior so much weaker is undetermined.
+WEAKER, HELD_BY_PRIOR = 1e-3, 2.0
+
+
+def held_by_prior(D: Array, precision: Array) -> BoolArray:
+    """Which coefficients (k,) of posterior covariance DᵀD are known by their own prior, of this
+    precision (k,), alone."""
+    covariance = D.T @ D
+    without = np.linalg.inv(covariance) - (1 - WEAKER) * np.diag(precision)
+    grown = np.diag(np.linalg.inv(without)) / np.diag(covariance)
+    return np.asarray(grown > HELD_BY_PRIOR**2)
+
+
 def pays(without: Array, now: Array) -> bool:
     """Whether the squared errors of left-out configurations say that a name lowers the error."""
     return bool(without.sum() > (1 + PAYS) ** 2 * now.sum())
@@ -592,12 +605,11 @@ class SumAnswer:
         if c.hypothesis is None or any(p.shrunk for p in c.hypothesis.parameters):
             return
         span, sizes = self.found.spans[k], self.dataset.sizes[c.hypothesis.key]
-        mean = self._fitted.beta[span]
-        std = np.linalg.norm(self._fitted.beta_deviation[:, span], axis=0)
-        for p, size, m, s in zip(c.hypothesis.parameters, sizes, mean, std, strict=True):
-            yield FittedParameter(
-                f"{c.where}.{p.key}", float(p.nominal + m * size), p.unit, float(s * size)
-            )
+        mean, D = sizes * self._fitted.beta[span], self._fitted.beta_deviation[:, span]
+        std = sizes * np.linalg.norm(D, axis=0)
+        std[held_by_prior(D, self.found.data.precision[span])] = np.inf
+        for p, m, s in zip(c.hypothesis.parameters, mean.tolist(), std.tolist(), strict=True):
+            yield FittedParameter(f"{c.where}.{p.key}", p.nominal + m, p.unit, s)
 
     def budget(self, first: Sequence[BudgetStep]) -> tuple[BudgetStep, ...]:
         steps: list[BudgetStep] = list(first)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import special
 
 from elastocal.diagnosis.baseline import NoisyData, Projection, project
-from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer
+from elastocal.diagnosis.component_answer import DRAWS, NAMED, SumAnswer, held_by_prior
 from elastocal.diagnosis.diagnosis import (
     Candidate,
     Curve,
@@ -112,8 +112,6 @@ TRANSLATIONS = ((" x", "m"), (" y", "m"), (" z", "m"))
 TURNS = ((" rx", "rad"), (" ry", "rad"), (" rz", "rad"))
 COMPONENTS = {1: (("", "rad"),), 3: TRANSLATIONS, 6: TRANSLATIONS + TURNS}  # name and unit
 
-# A parameter whose deviation grows by more under a prior so much weaker is undetermined.
-WEAKER, HELD_BY_PRIOR = 1e-3, 2.0
 FARTHEST = 10.0  # times what was found that a time constant may be, or part of it
 
 
@@ -234,12 +232,9 @@ class FewAnswer(SumAnswer):
         variance, chosen = (D**2).sum(axis=0), self.selected.chosen
         for _, p, estimates in self._constants[k]:  # which are estimated, too
             variance += p @ (estimates - chosen.at.beta[chosen.spans[k]]) ** 2
-        std = np.sqrt(variance)
-        if self._is_sought(c.hypothesis):
-            # The prior is about one of many geometries: what is known by it alone is not known.
-            without = np.linalg.inv(D.T @ D) - (1 - WEAKER) * np.diag(self._wide.precision[span])
-            std[np.diag(np.linalg.inv(without)) > (HELD_BY_PRIOR * std) ** 2] = np.inf
-        for p, first, last, s in zip(c.hypothesis.parameters, *each, size * std, strict=True):
+        std = size * np.sqrt(variance)
+        std[held_by_prior(D, self._wide.precision[span])] = np.inf
+        for p, first, last, s in zip(c.hypothesis.parameters, *each, std, strict=True):
             name = f"{c.where}.{p.key}"
             value = self._refitted.get(name, p.nominal + float(first))
             yield FittedParameter(name, value + float(last - first), p.unit, float(s))
