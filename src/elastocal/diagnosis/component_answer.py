@@ -600,13 +600,15 @@ class SumAnswer:
                     yield p.key, size * s
 
     def _parameters(self, k: int) -> Iterator[FittedParameter]:
-        """Estimates of a component's parameters, where they are few and not shrunk."""
+        """Estimates of a component's parameters, where they are few and not shrunk; deviations by
+        draws, which know no sizes either, nor whether what is hidden is there."""
         c = self.found.components[k]
         if c.hypothesis is None or any(p.shrunk for p in c.hypothesis.parameters):
             return
         span, sizes = self.found.spans[k], self.dataset.sizes[c.hypothesis.key]
         mean, D = sizes * self._fitted.beta[span], self._fitted.beta_deviation[:, span]
-        std = sizes * np.linalg.norm(D, axis=0)
+        apart = self._drawn[span] - self._fitted.beta[span, None]
+        std = sizes * np.sqrt((apart**2).mean(axis=1))
         std[held_by_prior(D, self.found.data.precision[span])] = np.inf
         for p, m, s in zip(c.hypothesis.parameters, mean.tolist(), std.tolist(), strict=True):
             yield FittedParameter(f"{c.where}.{p.key}", p.nominal + m, p.unit, s)
