@@ -15,7 +15,15 @@ from scipy.special import expit, softmax
 
 from elastocal.diagnosis.baseline import NoisyData, Projection, Weighted, project
 from elastocal.diagnosis.component_search import exchanged, imitators, size_of_fellows
-from elastocal.diagnosis.components import Component, FittedSum, drawn, presence_cost
+from elastocal.diagnosis.components import (
+    GONE,
+    LARGEST,
+    Component,
+    FittedSum,
+    at_maximum,
+    drawn,
+    presence_cost,
+)
 from elastocal.diagnosis.diagnosis import (
     LARGE,
     ComponentShare,
@@ -230,7 +238,20 @@ class SumAnswer:
         missed = ((answer._at_place[key], gain) for key, gain in answer._not_paying.items())
         harmful = (own for own, gain in missed
                    if gain < -HARM or np.mean(answer.squares(own) > 0) < CHANCE)  # fmt: skip
-        return answer._without([k for own in harmful for k in own])
+        return answer._without([k for own in harmful for k in own])._sized
+
+    @property
+    def _sized(self) -> SumAnswer:
+        """The same with sizes by draws: the rms of what each is where it is there.  Of two that look
+        alike the most probable sizes may give one all that both do: by them sums are compared, but
+        an eccentricity that stands for a sag is no estimate."""
+        found, sizes = self.found, self.found.sizes.size.copy()
+        for k, (c, span) in enumerate(zip(found.components, found.spans, strict=True)):
+            squares = (self._drawn[span] ** 2).mean(axis=0)
+            if c.hypothesis is not None and not c.settings and squares.any():
+                sizes[k] = 0.5 * np.log(squares[squares > 0].mean())
+        at = replace(found.sizes, size=np.clip(sizes, GONE, LARGEST))
+        return replace(self, found=replace(at_maximum(found.sums, at), score=found.score))
 
     @cached_property
     def _doubtful(self) -> list[int]:
