@@ -242,9 +242,9 @@ class SumAnswer:
 
     @property
     def _sized(self) -> SumAnswer:
-        """The same with sizes by draws: the rms of what each is where it is there.  Of two that look
-        alike the most probable sizes may give one all that both do: by them sums are compared, but
-        an eccentricity that stands for a sag is no estimate."""
+        """The same with sizes by draws: the rms of what each is where it is there.  Of two that
+        look alike the most probable sizes may give one all that both do: sums are compared by them,
+        but an eccentricity that stands for a sag is no estimate."""
         found, sizes = self.found, self.found.sizes.size.copy()
         for k, (c, span) in enumerate(zip(found.components, found.spans, strict=True)):
             squares = (self._drawn[span] ** 2).mean(axis=0)
