@@ -68,8 +68,8 @@ CASES: dict[str, tuple[str, str]] = {
         "joint 'q1' mimics 'q2' and lies between base and flange; coupled joints are not supp",
     ),
     "floating": (
-        arm(replace={'type="revolute"': 'type="floating"'}),
-        "joint 'q1' is floating and lies between base and flange",
+        arm(replace={'name="q3" type="revolute"': 'name="q3" type="floating"'}),
+        "joint 'q3' is floating and lies between base and flange",
     ),
     "many joints": (arm(10), r"10 moving joints between 'l0' and 'l10' \(q1, .*q10\); 4 to 9"),
     "two arms": (

@@ -266,9 +266,8 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
         told = " and ".join(words)
         if words == [MIRRORED]:
             # So does an arm that has a plane of symmetry where joints turn the other way round.
-            same = (f" or {w[0]}" for fit, _, w, _ in likely
-                    if len(w) == 1 and w[0].startswith(TURNED) and fit < NO_WORSE * left)  # fmt: skip
-            told += next(same, "")
+            alike = (w[0] for fit, _, w, _ in likely if len(w) == 1 and fit < NO_WORSE * left)
+            told += next((f" or {one}" for one in alike if one.startswith(TURNED)), "")
         told = told.replace("{", "{{").replace("}", "}}")
         yield f"{told} they would fit to {{}}", other
 

@@ -29,14 +29,14 @@ from elastocal.model.effects.statics import JointCompliance, feels_weight, usual
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load
-from elastocal.model.urdf import TRACKER, Tree, check_urdf, xacro_left
+from elastocal.model.urdf import TRACKER, Tree, check_urdf, is_called, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("elastocal_flange", "attachment_site", "flange", "tool0", "ee_site")
-WORLDS = (TRACKER, "world")  # roots that are no part of a robot
+WORLDS = (TRACKER, "world", "map", "odom")  # roots that are no part of a robot
 MOST_SITES = 8  # listed as markers; of more most are something else
 THICKNESS = 15.0  # reach over a link's radius
 
@@ -122,18 +122,18 @@ def robot_of(
     if kind == "urdf":
         tree = check_urdf(path)
         start, end = tree.ends(base, flange or None)
-        return Robot.from_urdf(path, _own_base(tree, end) if base is None else start, end)
+        return Robot.from_urdf(path, _own_base(tree, start, end) if base is None else start, end)
     arm = MjcfArm.read(path, base, flange)
     there = arm.tree.places(arm.base, arm.flange) if flange is None else ()
-    found = (site for site in FLANGE_SITES if site in there)
-    start = _own_base(arm.tree, arm.flange) if base is None else base
+    found = (site for name in FLANGE_SITES for site in there if is_called(site, name))
+    start = _own_base(arm.tree, arm.base, arm.flange) if base is None else base
     return Robot.from_mjcf(path, start, next(found, arm.flange))
 
 
-def _own_base(tree: Tree, flange: str) -> str:
-    """The root, or where that is no part of the robot what is fixed to it."""
+def _own_base(tree: Tree, base: str, flange: str) -> str:
+    """The base, or where that is no part of the robot what is fixed to it."""
     first = tree.ways[tree.link_of(flange)[0]][0]
-    return tree.root if first.moves or tree.root not in WORLDS else first.child
+    return base if first.moves or base != tree.root or base not in WORLDS else first.child
 
 
 def first_cell(robot: Robot, folder: Path) -> str:
@@ -323,7 +323,7 @@ def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]
     told = "masses of the robot's file bend the joints" if weighed else NO_MASSES
     if chain.masses and not weighed:
         told = "the file's masses look like placeholders"
-    if any("gravity" in note or "mass of" in note for note in chain.notes):
+    if any("gravity " in note or "mass of" in note for note in chain.notes):
         told = "a choice: see the notes above"
     # In mm, fives; the links get thinner towards the wrist.
     thick = max(5 * round(reach * 1e3 / THICKNESS / 5), 5)

@@ -15,6 +15,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
+from itertools import takewhile
 from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -350,22 +351,33 @@ class Tree:
         """The first and the last link, None for those that are found.  `choose`: whether a flange
         is found among several links that it could be: a cell that leaves the choice open may have
         meant another frame."""
-        base = self.root if base is None else self.find("base", base, self.root)
+        start = self.root if base is None else self.find("base", base, self.root)
         if flange is None:
-            found = self.last_link(base)
-            able = [k for k in self._leaves(base) if len(self._moving(base, k)) >= MIN_JOINTS]
+            found = self.last_link(start)
+            able = [k for k in self._leaves(start) if len(self._moving(start, k)) >= MIN_JOINTS]
             require(
                 choose or len(able) < 2,
                 f"{self.path}: several links could be the flange: "
                 f"{listed(sorted({*able, found}))}; name the right one as `flange` (init takes "
                 f"'{found}')",
             )
-            return base, found
+            return base or self._first_link(found), found
         usual = ""
         if flange not in self.links and flange not in self.frames:
             with suppress(InputError):  # of several arms, each with an end of its own
-                usual = self.last_link(base)
-        return base, self.find("flange", flange, usual)
+                usual = self.last_link(start)
+        flange = self.find("flange", flange, usual)
+        return base or self._first_link(flange), flange
+
+    def _first_link(self, flange: str) -> str:
+        """The root, or what floats or drives about below it with the arm on it."""
+        fixed = [*takewhile(lambda joint: not joint.moves, self.ways[self.link_of(flange)[0]])]
+        free = [k for k, joint in enumerate(fixed) if joint.kind != "fixed"]
+        if not free:
+            return self.root
+        joint, *rest = fixed[free[-1] :]
+        # A body of MuJoCo stands without a name behind its joint.
+        return rest[0].child if rest and not rest[0].name else joint.child
 
     def last_link(self, base: str) -> str:
         """The link below `base` from which on fingers, or frames that none moves, branch off.  Of
@@ -399,7 +411,7 @@ class Tree:
                 for leaf in leaves if sizes[leaf] == most]  # fmt: skip
         common = [link for link in ways[0] if all(link in way for way in ways)]
         if len(self._moving(base, common[-1])) == most and len(ways) > 1:
-            named = (way[-1] for name in FLANGES for way in ways if way[-1] == name)
+            named = (way[-1] for name in FLANGES for way in ways if is_called(way[-1], name))
             return next(named, common[-1])
         # Fingers of unequal length, as a thumb has: no link is common to those with most joints.
         for link in common:
@@ -431,6 +443,7 @@ class Tree:
         for joint in joints:
             bounded = joint.moves and joint.kind != "continuous"
             lower, upper = joint.limit or (-math.inf, math.inf)
+            left_out = " (a URDF takes 0 for one left out)" if 0.0 in (lower, upper) else ""
             for wrong, told in (
                 (not joint.moves and joint.kind != "fixed",
                  f" is {joint.kind} and lies between base and flange; only {', '.join(MOVING)} and "
@@ -443,7 +456,7 @@ class Tree:
                  'velocity="0"/> or make it continuous'),
                 (lower >= upper and bounded,
                  f": limits lower={lower:g}, upper={upper:g} leave no room to move; lower must be "
-                 "below upper (a URDF takes 0 for one left out)"),
+                 f"below upper{left_out}"),
             ):  # fmt: skip
                 require(not wrong, f"{self.path}: joint '{joint.name}'{told}")
         moving = [joint for joint in joints if joint.moves]
@@ -503,6 +516,11 @@ class Tree:
             )
         end = T @ self.link_of(flange)[1]
         return Chain(self.name, tuple(joints), end, masses if moments[:, 3].any() else ())
+
+
+def is_called(link: str, name: str) -> bool:
+    """As it is, or behind a prefix: ur5e_tool0, robot1/tool0."""
+    return link == name or link.endswith(tuple(f"{mark}{name}" for mark in "_/-:"))
 
 
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
