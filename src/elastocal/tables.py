@@ -220,7 +220,6 @@ CALLED = {
     r"(?:f|force)([xyz])": r"force_\1",
     r"(?:m|tau|trq|torque)(\d+)": r"torque_\1",
 }
-UNIT_BEHIND = re.compile(r"(.+?)\s*[\[(]\s*(\w+)\s*[\])]")  # "theta (deg)"
 # The columns of a table by their families, each in the order of its stems.
 Columns = Mapping[str, tuple[Column, ...]]
 Choose = Callable[[Sequence[str]], Columns]  # by the header
@@ -323,15 +322,13 @@ def _unknown(
             ways.setdefault(stem, []).extend(family.columns(stem))
     if text in ways:
         return f"column {quoted(text)} has no unit; write {' or '.join(ways[text])}"
-    stem, _, unit = text.rpartition("_")
-    if stem in ways and unit in OTHER_UNITS:
+    stem, _, unit = re.sub(r"\W+", "_", text).strip("_").rpartition("_")  # "theta (deg)" too
+    unit = unit if unit in OTHER_UNITS else unit.lower()
+    if unit in OTHER_UNITS and column(stem, unit) not in ways.get(stem, [column(stem, unit)]):
         return (
             f"column {quoted(text)}: the unit {unit} is not taken here; write "
             f"{' or '.join(ways[stem])}"
         )
-    if split := UNIT_BEHIND.fullmatch(text):
-        stem, unit = split.groups()
-    unit = unit if unit in OTHER_UNITS else unit.lower()
     name = (stem if stem and unit in OTHER_UNITS else text).lower().replace("_", "")
     meant = (found.expand(own) for way, own in called.items() if (found := re.fullmatch(way, name)))
     # Where all are told, a unit in common makes no name like another.

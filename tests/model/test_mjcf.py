@@ -46,12 +46,10 @@ def test_the_flange_is_where_mujoco_has_it(base, flange, kind, tmp_path):
 
 
 def test_fingers_leave_the_hand_as_the_flange(tmp_path):
-    foot = '<body name="foot" pos="0.2 -0.1 0.3" euler="30 0 0">'
-    floating = ARM.replace(foot, f"{foot}<freejoint/>")
-    arm = MjcfArm.read(write_arm(tmp_path, floating))
-    assert (arm.base, arm.flange) == ("foot", "hand")
-    arm = MjcfArm.read(write_arm(tmp_path))
-    assert (arm.base, arm.flange) == ("world", "hand")
+    floating = ARM.replace('euler="30 0 0">', 'euler="30 0 0"><freejoint/>')
+    for text, base in ((floating, "foot"), (ARM, "world")):
+        arm = MjcfArm.read(write_arm(tmp_path, text))
+        assert (arm.base, arm.flange) == (base, "hand")
     chain, sites = arm.chain, set(arm.tree.places(arm.base, arm.flange))
     assert [j.name for j in chain.joints] == ["a1", "a2", "a3", "a4", "joint5"]
     assert chain.kinds == ("revolute", "revolute", "prismatic", "revolute", "revolute")

@@ -22,7 +22,7 @@ from elastocal.cell_tables import SOURCES, Convention, Robot
 from elastocal.config import toml_key, toml_value
 from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
-from elastocal.model.chain import Chain, clashing, jaw_told, names_told
+from elastocal.model.chain import Chain, clashing, extent, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometry, MarkerPosition
 from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
@@ -168,10 +168,13 @@ def notes_of(robot: Robot, chain: Chain) -> list[str]:
     moved = ""
     if robot.urdf is not None and robot.flange is not None:
         moved = robot.flange if check_urdf(robot.urdf).parent_joint[robot.flange].moves else ""
+    weightless = [chain.joints[i].name for i, body in enumerate(chain.masses) if body.mass == 0]
+    if weightless and not any("mass of" in note for note in found):
+        found.append(f"the file has no mass for what {listed(weightless)} alone move: taken as 0")
     if doubt := placeholder_masses(chain):
         found.append(
-            f"{doubt}, which looks like placeholders. Weights would bend the joints wrongly, so "
-            "link_gravity is off; put in the masses of the data sheet and switch it on"
+            f"{doubt}, which looks like placeholders or a mistake. Weights would bend the joints "
+            "wrongly, so link_gravity is off; put in the masses of the data sheet and switch it on"
         )
     return found + jaw_told(chain, moved)
 
@@ -181,8 +184,14 @@ FEW_KINDS = 3  # links of each mass, on average, from which on nobody has weighe
 
 
 def placeholder_masses(chain: Chain) -> str:
-    """Many links of one mass, or all together far from what an arm of that length weighs; "" where
-    nothing speaks against them."""
+    """Many links of one mass, or all together far from what an arm of that length weighs, or a
+    centre farther from its joint than the arm is long; "" where nothing speaks against them."""
+    length, far = extent(chain), [float(np.linalg.norm(body.com)) for body in chain.masses]
+    if max(far, default=0.0) > length and "prismatic" not in chain.kinds:
+        return (
+            f"the file has the centre of mass of link {far.index(max(far)) + 1} {max(far):.3g} m "
+            f"from its joint, and an arm of {length:.3g} m"
+        )
     masses = [f"{body.mass:.4g}" for body in chain.masses]
     if masses and len(set(masses)) * FEW_KINDS <= len(masses):
         mass, k = Counter(masses).most_common(1)[0]

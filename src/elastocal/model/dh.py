@@ -210,18 +210,15 @@ CALLED = {
 }  # fmt: skip
 
 
-# αᵢ₋₁ and aᵢ₋₁, as tables of Craig's convention call them.
 OF_THE_LINK_BEFORE = re.compile(r"(?i)(alpha|α|a)_?\W?(i? ?[-−] ?1|i_?m_?1|i_?minus_?1|prev).*")
 
 
 def _no_table(what: str, header: str) -> str | None:
     if of_link := OF_THE_LINK_BEFORE.fullmatch(header):
+        told = f"column {quoted(header)} is of the link before, as in Craig's tables: call it "
         name = of_link[1].lower().replace("α", "alpha")
-        return (
-            f"column {quoted(header)} is of the link before, as in a modified table (Craig): call "
-            f"it {name}_…, with its unit, and give {option('convention', 'modified')} (in a cell: "
-            '[robot] dh_convention = "modified")'
-        )
+        how = f'{option("convention", "modified")}, or [robot] dh_convention = "modified"'
+        return f"{told}{name}_… (with its unit), and state {how}"
     if not header.startswith(("<", "version https://git-lfs")):
         return None
     kind = "a web page or XML" if header.startswith("<") else "a pointer of Git LFS"

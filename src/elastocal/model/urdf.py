@@ -371,13 +371,11 @@ class Tree:
 
     def _first_link(self, flange: str) -> str:
         """The root, or what floats or drives about below it with the arm on it."""
-        fixed = [*takewhile(lambda joint: not joint.moves, self.ways[self.link_of(flange)[0]])]
-        free = [k for k, joint in enumerate(fixed) if joint.kind != "fixed"]
-        if not free:
-            return self.root
-        joint, *rest = fixed[free[-1] :]
+        still = [*takewhile(lambda joint: not joint.moves, self.ways[self.link_of(flange)[0]])]
+        free = [k for k, joint in enumerate(still) if joint.kind != "fixed"]
         # A body of MuJoCo stands without a name behind its joint.
-        return rest[0].child if rest and not rest[0].name else joint.child
+        own = [j.child for k in free[-1:] for j in still[k : k + 2] if j is still[k] or not j.name]
+        return own[-1] if own else self.root
 
     def last_link(self, base: str) -> str:
         """The link below `base` from which on fingers, or frames that none moves, branch off.  Of
@@ -629,12 +627,12 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
         origin=pose_at(_vector(where, tag, "origin", "xyz"), rotation_from_rpy(rpy)),
         axis=axis / length if length else axis,
         limit=limit,
-        follows=None if mimic is None else mimic.get("joint"),
+        follows=None if mimic is None else mimic.get("joint").strip(),
     )
 
 
 def _end(where: str, joint: Tag, side: str, links: Collection[str]) -> str:
-    name = joint.of(side, "link") or ""
+    name = (joint.of(side, "link") or "").strip()
     require(bool(name), f'{where} has no {side} link; add <{side} link="…"/>')
     if name not in links:
         hint = f"{did_you_mean(name, links)}; name an existing link or add it"

@@ -118,7 +118,13 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
     with said_of(f"mesh of body '{name}'"):
         check_regular(path, "mesh", MESH_BYTES)
     try:
-        size = np.array(scale) * _own_unit(path)
+        # COLLADA files state the unit of their lengths, which coal does not look at.
+        unit = (
+            DAE_UNIT.search(path.read_bytes()[:MESH_HEAD])
+            if path.suffix.lower() == ".dae"
+            else None
+        )
+        size = np.array(scale) * (float(unit[1]) if unit else 1.0)
         return outward(np.array(coal.MeshLoader().load(str(path), size).vertices()))
     except QhullError:
         raise InputError(f"mesh '{path}' of body '{name}' is flat: it encloses no volume") from None
@@ -126,13 +132,6 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
         raise InputError(
             f"mesh '{path}' of body '{name}' cannot be read: {error}; STL, OBJ and DAE can"
         ) from None
-
-
-def _own_unit(path: Path) -> float:
-    """m per unit, which COLLADA files state of themselves and coal does not look at."""
-    head = path.read_bytes()[:MESH_HEAD] if path.suffix.lower() == ".dae" else b""
-    stated = DAE_UNIT.search(head)
-    return float(stated[1]) if stated else 1.0
 
 
 def outward(cloud: Array) -> tuple[Array, NDArray[np.int64]]:
