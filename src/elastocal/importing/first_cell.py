@@ -29,11 +29,12 @@ from elastocal.model.effects.statics import JointCompliance, feels_weight, usual
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load
-from elastocal.model.urdf import TRACKER, Tree, check_urdf, is_called, xacro_left
+from elastocal.model.urdf import TRACKER, Tree, XmlFile, check_urdf, is_called, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
+OF_ROOT = {"robot": "urdf", "mujoco": "mjcf"}  # whatever the ending says
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("elastocal_flange", "attachment_site", "flange", "tool0", "ee_site")
 WORLDS = (TRACKER, "world", "map", "odom")  # roots that are no part of a robot
@@ -119,6 +120,8 @@ def robot_of(
             require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
         return replace(Robot.from_dh(path, convention), ur_model=ur_model)
     require(convention == "standard", f"{option('convention')} is for DH tables; {is_for}")
+    what = "a URDF" if kind == "urdf" else "an MJCF file"
+    kind = OF_ROOT.get(XmlFile.read(path, "robot file", what).root.name, kind)
     if kind == "urdf":
         tree = check_urdf(path)
         start, end = tree.ends(base, flange or None)

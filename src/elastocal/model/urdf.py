@@ -225,6 +225,7 @@ MOVING = ("revolute", "continuous", "prismatic")
 # Names of flanges, the usual first.
 FLANGES = ("tool0", "flange", "ee_link", "tcp")
 MOST_IN_A_FINGER = 5  # joints
+LEAST_MASS = 1e-6  # kg of all links; MuJoCo takes no moving body without a mass
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
 TRACKER = "elastocal_tracker"  # the root that it puts above a robot with --base-frame
@@ -513,7 +514,8 @@ class Tree:
                 LinkMass(float(m[3]), m[:3] / m[3] if m[3] > 0 else np.zeros(3)) for m in moments
             )
         end = T @ self.link_of(flange)[1]
-        return Chain(self.name, tuple(joints), end, masses if moments[:, 3].any() else ())
+        masses = masses if moments[:, 3].sum() > LEAST_MASS else ()
+        return Chain(self.name, tuple(joints), end, masses)
 
 
 def is_called(link: str, name: str) -> bool:
