@@ -120,8 +120,8 @@ def robot_of(
             require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
         return replace(Robot.from_dh(path, convention), ur_model=ur_model)
     require(convention == "standard", f"{option('convention')} is for DH tables; {is_for}")
-    what = "a URDF" if kind == "urdf" else "an MJCF file"
-    kind = OF_ROOT.get(XmlFile.read(path, "robot file", what).root.name, kind)
+    what = ("URDF file", "a URDF") if kind == "urdf" else ("MuJoCo model", "an MJCF file")
+    kind = OF_ROOT.get(XmlFile.read(path, *what).root.name, kind)
     if kind == "urdf":
         tree = check_urdf(path)
         start, end = tree.ends(base, flange or None)
