@@ -76,8 +76,7 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
 
 
 def _usual(model: Model, p: Parameter) -> float:
-    """The compliance that arms have where `identify` expects one (`load_ratio`); 0 elsewhere.  The
-    loads of the cell wind no joint up so far that the arm would not carry them."""
+    """The compliance that arms have where `identify` expects one (`load_ratio`); 0 elsewhere."""
     i, chain, cell = index(p.where), model.chain, model.cell
     if chain.kinds[i] != "revolute" or not statics.weight_torque(chain, i) > 0:
         return 0.0

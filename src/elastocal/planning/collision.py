@@ -119,12 +119,8 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
         check_regular(path, "mesh", MESH_BYTES)
     try:
         # COLLADA files state the unit of their lengths, which coal does not look at.
-        unit = (
-            DAE_UNIT.search(path.read_bytes()[:MESH_HEAD])
-            if path.suffix.lower() == ".dae"
-            else None
-        )
-        size = np.array(scale) * (float(unit[1]) if unit else 1.0)
+        head = path.read_bytes()[:MESH_HEAD] if path.suffix.lower() == ".dae" else b""
+        size = np.array(scale) * float((DAE_UNIT.search(head) or (0, 1.0))[1])
         return outward(np.array(coal.MeshLoader().load(str(path), size).vertices()))
     except QhullError:
         raise InputError(f"mesh '{path}' of body '{name}' is flat: it encloses no volume") from None
@@ -180,8 +176,7 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         require(
             len(link.all("collision")) == read[link.get("name")],
             f"{where}: {path}: a <collision> of link '{link.get('name')}' cannot be read; it takes "
-            "box size, cylinder radius and length, sphere radius, or mesh filename and scale (3 "
-            "numbers)",
+            "box size, cylinder radius and length, sphere radius, mesh filename (scale: 3 numbers)",
         )
     if not geometry.ngeoms:
         raise InputError(
