@@ -30,6 +30,7 @@ from elastocal.messages import (
     did_you_mean,
     is_label,
     listed,
+    nearest,
     plain_minus,
     printable,
     quoted,
@@ -321,19 +322,22 @@ def _unknown(
             ways.setdefault(stem, []).extend(family.columns(stem))
     if text in ways:
         return f"column {quoted(text)} has no unit; write {' or '.join(ways[text])}"
-    stem, _, unit = text.rpartition("_")
-    if stem in ways and unit in OTHER_UNITS:
+    stem, _, unit = re.sub(r"\W+", "_", text).strip("_").rpartition("_")  # "theta (deg)" too
+    unit = unit if unit in OTHER_UNITS else unit.lower()
+    if unit in OTHER_UNITS and column(stem, unit) not in ways.get(stem, [column(stem, unit)]):
         return (
             f"column {quoted(text)}: the unit {unit} is not taken here; write "
             f"{' or '.join(ways[stem])}"
         )
-    name = (stem if unit in OTHER_UNITS else text).lower().replace("_", "")
+    name = (stem if stem and unit in OTHER_UNITS else text).lower().replace("_", "")
     meant = (found.expand(own) for way, own in called.items() if (found := re.fullmatch(way, name)))
-    own = ways.get(next(meant, ""), [])
-    near = next((way for way in own if way.endswith(f"_{unit}")), own[0] if own else "")
-    hint = f" (did you mean '{near}'?)" if own and not {*own} & {*header} else ""
+    # Where all are told, a unit in common makes no name like another.
+    own = ways.get(next(meant, (nearest(name, ways) or "") if valid else ""), [])
+    bare = name == text.lower()
+    near = " or ".join(f"'{way}'" for way in own if bare or way.endswith(f"_{unit}"))
+    hint = f" (did you mean {near or repr(own[0])}?)" if own and not {*own} & {*header} else ""
     if not own:
-        hint = did_you_mean(text, [way for each in ways.values() for way in each]) or valid
+        hint = valid or did_you_mean(text, [way for each in ways.values() for way in each])
     return (
         f"unknown column {quoted(text)}{hint}; correct the name, or start "
         "it with '#', '_' or 'note' to have it ignored"

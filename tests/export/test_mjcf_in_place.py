@@ -102,7 +102,10 @@ def test_a_file_written_elsewhere_finds_its_meshes_from_there(places, tmp_path):
 NEW = {
     "two joints on a body": ('<joint name="b4" axis="0 0 1"/>', "shares its body"),
     "include": ('<include file="more.xml"/>', "do not all stand in the file"),
+    "a spring": ('<site name="hook"/>', "its tendon 'pull' pulls at the arm"),
 }
+PULL = """<tendon><spatial name="pull" stiffness="9"><site site="hook"/><site site="eye"/></spatial>
+</tendon>"""
 
 
 @pytest.mark.parametrize("name", NEW)
@@ -112,7 +115,8 @@ def test_what_the_file_cannot_take_goes_into_a_new_one(name, tmp_path):
         '<mujocoinclude><body name="more"><geom size="0.1"/></body></mujocoinclude>'
     )
     text = LOADABLE.replace('<joint name="a4"/>', f'<joint name="a4"/>{more}')
-    text = text.split("<keyframe>")[0] + "</mujoco>"
+    text = text.split("<keyframe>")[0] + (PULL if "hook" in more else "") + "</mujoco>"
+    text = text.replace("<worldbody>", '<worldbody><site name="eye" pos="0 0 2"/>')
     _, done = corrected(tmp_path, "", SPRINGS, text=text, in_place=False)
     assert any("cannot take" in w and reason in w for w in done.warnings), done.warnings
 
@@ -130,6 +134,7 @@ HINDERED = {
                 "</default>"),
     "site": ("</default>", '<site type="box" size="1 1 1" euler="1 2 3"/></default>'),
     "gravcomp": ('<body name="l2"', '<body gravcomp="1" name="l2"'),
+    "wind": ("<option ", '<option wind="9 0 0" density="9"/><option '),
     "no gravity": ("<option ", '<option><flag gravity="disable"/></option><option '),
     "no actuation": ("<option ", '<option><flag actuation="disable"/></option><option '),
 }  # fmt: skip
@@ -143,5 +148,6 @@ def test_what_the_file_sets_otherwise_does_not_hinder_the_arm(kind, tmp_path):
     last = LOADABLE.rpartition(old) if old == "</default>" else LOADABLE.partition(old)
     text = last[0] + new + last[2]
     _, done = corrected(tmp_path, 'base = "foot"', SPRINGS, "link_gravity = true", text)
-    told = {"gravcomp": "gravcomp of l2 is 0", "no gravity": "gravity is switched on"}
+    told = {"gravcomp": "gravcomp of l2 is 0", "no gravity": "gravity is switched on",
+            "wind": "wind is 0 in this file"}  # fmt: skip
     assert any(told.get(kind, "") in w for w in done.warnings)

@@ -147,11 +147,14 @@ def test_the_cells_limits_narrow_the_robots():
 
 
 def test_small_angles_in_degrees_taken_for_radians(model):
-    """±5° read as ±5 rad: no turn is wound, but most lines lie beyond the limits."""
+    """±5° read as ±5 rad: no turn is wound.  Readings that another count of a joint explains."""
     q = np.random.default_rng(0).uniform(-5, 5, (20, 3))
     q[:, 0] = np.linspace(3.5, 6, 20)
     told = "most lines are beyond.*probably degrees given as radians .or the reverse., or another"
     refused(model, table_for(model, q=q), InputError, told)
+    arm, table, _ = campaign(PLACED)
+    told = "beyond its limits.*with coupling { joint = 3, of = 2, factor = -1 } they would fit to"
+    refused(arm, replace(table, q=table.q @ [[1, 0, 0], [0, 1, 1], [0, 0, 1]]), InputError, told)
 
 
 def test_fewer_equations_than_parameters(model):

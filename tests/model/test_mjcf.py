@@ -46,8 +46,10 @@ def test_the_flange_is_where_mujoco_has_it(base, flange, kind, tmp_path):
 
 
 def test_fingers_leave_the_hand_as_the_flange(tmp_path):
-    arm = MjcfArm.read(write_arm(tmp_path))
-    assert arm.flange == "hand"
+    floating = ARM.replace('euler="30 0 0">', 'euler="30 0 0"><freejoint/>')
+    for text, base in ((floating, "foot"), (ARM, "world")):
+        arm = MjcfArm.read(write_arm(tmp_path, text))
+        assert (arm.base, arm.flange) == (base, "hand")
     chain, sites = arm.chain, set(arm.tree.places(arm.base, arm.flange))
     assert [j.name for j in chain.joints] == ["a1", "a2", "a3", "a4", "joint5"]
     assert chain.kinds == ("revolute", "revolute", "prismatic", "revolute", "revolute")
@@ -82,10 +84,9 @@ REFUSED = {
         "mass and inertia of moving bodies.*'b5'",
     ),
     "no arm": ("<mujoco><worldbody/></mujoco>", "0 moving joints between"),
-    "free": (
-        ARM.replace('<body name="foot" pos="0.2 -0.1 0.3" euler="30 0 0">',
-                    '<body name="foot"><freejoint name="float"/>'),
-        "'float' is free and lies between base and flange",
+    "a ball": (
+        ARM.replace('<joint name="a4"', '<joint name="a4" type="ball" range="0 9"'),
+        "'a4' is a ball joint and lies between base and flange",
     ),
 }  # fmt: skip
 

@@ -32,8 +32,7 @@ def test_kinds_limits_and_default_axis(tmp_path: Path) -> None:
     np.testing.assert_allclose(chain.joints[0].axis, [1, 0, 0])  # URDF's default
     np.testing.assert_allclose(chain.joints[1].axis, [0, 0.6, 0.8])
     np.testing.assert_allclose(chain.joints[2].axis, [0, 0, -1])
-    assert (chain.joints[0].lower, chain.joints[0].upper) == (-1, 2)
-    assert (chain.joints[1].lower, chain.joints[1].upper) == (-np.inf, np.inf)
+    assert [(j.lower, j.upper) for j in chain.joints[:2]] == [(-1, 2), (-np.inf, np.inf)]
     assert chain.masses == ()
 
 
@@ -68,8 +67,8 @@ CASES: dict[str, tuple[str, str]] = {
         "joint 'q1' mimics 'q2' and lies between base and flange; coupled joints are not supp",
     ),
     "floating": (
-        arm(replace={'type="revolute"': 'type="floating"'}),
-        "joint 'q1' is floating and lies between base and flange",
+        arm(replace={'name="q3" type="revolute"': 'name="q3" type="floating"'}),
+        "joint 'q3' is floating and lies between base and flange",
     ),
     "many joints": (arm(10), r"10 moving joints between 'l0' and 'l10' \(q1, .*q10\); 4 to 9"),
     "two arms": (
@@ -157,14 +156,12 @@ THUMB = slide("t1", "hand", "thumb1") + slide("t2", "thumb1", "thumb2")
         (HAND + slide("jl", "hand", "lf") + slide("jr", "hand", "rf") + frame("cam", "link_3"),
          "hand"),
         (frame("camera", "link_6"), "tool0"),
+        (frame("cam", "link_6") + frame("r1/tool0", "link_6"), "r1/tool0"),
         (slide("rod", "link_2", "rod"), "tool0"),
     ],
 )  # fmt: skip
 def test_the_flange_is_the_link_before_fingers_branch_off(extra, flange, tmp_path):
-    text = urdf(extra).replace(frame("tool0", "link_6", "0.05 0 0"), "") if "hand" in extra else (
-        urdf(extra)
-    )  # fmt: skip
-    assert flange_of(tmp_path, text)[0] == flange
+    assert flange_of(tmp_path, urdf(extra))[0] == flange
 
 
 @pytest.mark.parametrize("rpy", ["0 0 0", "-1.5707963267948966 0 0", "3.141592653589793 0 0.5"])
@@ -197,34 +194,18 @@ def test_limits_that_stand_for_none_are_none(limits, tmp_path):
         (urdf(scale=1000), "m before joint 1 is too long"),
         (urdf(scale=1e-3), "1.6 mm long together"),
         (urdf(frame("cam", "link_3", rpy="0 90 0")), "90 rad is more than two turns"),
-    ],
-)
-def test_units_that_cannot_be_meant_are_refused(text, told, tmp_path):
-    code, _, err = told_by_init(write(tmp_path, text))
-    assert code == 2 and told in err
-
-
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
         ("warning: something\n" + urdf(), "'warning: something' stands before <?xml"),
         ("\n" + urdf(), "blanks stand before <?xml"),
         (urdf() + "done\n", "'done' stands after the end of the robot"),
-        (
-            urdf()
-            .replace("\n", "")
-            .replace("?>", "?>\n\n")
-            .replace("link_3", "ï")
-            .encode("latin-1"),
-            "line 3 has the byte 0xef, which is not UTF-8",
-        ),
+        (urdf().replace("?>", "?>\n").replace("link_3", "ï").encode("latin-1"),
+         "line 3 has the byte 0xef, which is not UTF-8"),
         ("<!DOCTYPE html><html><body>404</body></html>", "is a web page"),
         ("version https://git-lfs.github.com/spec/v1\noid sha256:1\n", "git lfs pull"),
         (urdf(name="$(arg prefix)joint_{}"), "run xacro first: xacro arm.urdf > expanded.urdf"),
         (urdf(frame("f", "link_2", "0 0 $(optenv X 1)")), "run xacro first"),
         (urdf().replace("link_3", "${prefix}link_3"), "run xacro first"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_urdf_is_told_with_what_to_do(text, told, tmp_path):
     code, _, err = told_by_init(write(tmp_path, text))
     assert code == 2 and told in err
@@ -235,9 +216,8 @@ def test_a_xacro_is_to_be_expanded_and_declared_encodings_are_read(tmp_path):
     assert code == 2 and "xacro arm.urdf.xacro > arm.urdf" in err
     text = urdf().replace('"1.0"?>', '"1.0" encoding="latin-1"?>').replace("arm", "ärm")
     assert told_by_init(write(tmp_path, text, encoding="latin-1"))[0] == 0
-    text = '<robot name="arm"><gazebo><p file="$(find x)/y"/></gazebo>' + urdf().partition(
-        '<robot name="arm">'
-    )[2]  # fmt: skip
+    gazebo = '<gazebo><p file="$(find x)/y"/></gazebo><link name="base_link"/>'
+    text = urdf().replace('<link name="base_link"/>', gazebo)
     assert told_by_init(write(tmp_path, text))[0] == 0
 
 
@@ -275,7 +255,5 @@ def test_names_of_the_file_may_be_used_and_a_clash_is_no_shift(tmp_path):
 
 
 def test_a_last_joint_that_looks_like_a_jaw_is_told(tmp_path):
-    text = urdf(slide("grip", "link_6", "tool0"))
-    flange, out = flange_of(tmp_path, text)
-    assert flange == "tool0"
-    assert "last joint 'grip' looks like a jaw of a gripper" in out
+    flange, out = flange_of(tmp_path, urdf(slide("grip", "link_6", "tool0")))
+    assert flange == "tool0" and "last joint 'grip' looks like a jaw of a gripper" in out

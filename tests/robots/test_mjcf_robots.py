@@ -103,15 +103,20 @@ def test_a_missing_mesh_is_named_and_only_its_bodies_lose_their_mass(tmp_path):
     assert [body.mass for body in chain.masses][-1] == 4.0
 
 
+JAW = """<body name="f"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+<joint name="grip" type="slide" axis="0 1 0" range="0 0.04"/></body>"""
+
+
 @pytest.mark.parametrize(
     ("parts", "told"),
     [
+        ({"at_end": JAW}, "'grip' looks like a jaw"),
         ({"limits": "-170 170"}, "more than 27 turns"),
         ({"limits": "-2.9 2.9", "compiler": ""}, "widest range"),
         ({"at_end": '<site name="s" euler="0 90 0"/>'}, "90 rad is more than two turns"),
     ],
 )
-def test_units_that_cannot_be_meant_are_told(parts, told, tmp_path):
+def test_units_and_joints_that_cannot_be_meant_are_told(parts, told, tmp_path):
     code, out, err = told_by_init(arm(tmp_path, **parts))
     assert told in out + err and (code == 2) == (told not in out)
 
@@ -121,12 +126,3 @@ def test_mujoco_warns_in_the_words_of_the_tool(tmp_path, recwarn):
     code, out, err = told_by_init(path)
     assert code == 0 and "Note: MuJoCo warns: " in out and "UserWarning" not in out + err
     assert not [one for one in recwarn if "settotalmass" in str(one.message)]
-
-
-def test_a_jaw_alone_is_told(tmp_path):
-    jaw = (
-        '<body name="f"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-        '<joint name="grip" type="slide" axis="0 1 0" range="0 0.04"/></body>'
-    )
-    code, out, err = told_by_init(arm(tmp_path, at_end=jaw))
-    assert code == 0 and "'grip' looks like a jaw" in out, err

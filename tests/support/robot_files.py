@@ -36,7 +36,8 @@ def urdf(
             f'<limit lower="{limits[0]}" upper="{limits[1]}" effort="1" velocity="1"/></joint>'
         )
         parent = f"link_{i}"
-    parts.append(frame("tool0", "link_6", f"{0.05 * scale:g} 0 0") if "tool0" not in extra else "")
+    if "tool0" not in extra and "hand" not in extra:
+        parts.append(frame("tool0", "link_6", f"{0.05 * scale:g} 0 0"))
     return f'<?xml version="1.0"?>\n<robot name="arm">{"".join(parts)}{extra}</robot>\n'
 
 

@@ -56,7 +56,7 @@ from elastocal.diagnosis.verdict import (
 from elastocal.files import atomic_writer, is_plugin_file, read_text
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.identify import misread_for_a_while
-from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.mistakes import likely_mistake, refuse_nonsense
 from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty
 from elastocal.identification.scrutiny import BudgetStep, autocorrelation
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
@@ -223,7 +223,7 @@ def _diagnosed(
     model: Model, table: Measurements, options: DiagnosisOptions, progress: Progress
 ) -> Diagnosis:
     given, source = model, table.source
-    check_table(model, table)
+    check_table(model, table, likely_mistake)
     if (n := len(np.unique(table.configuration))) < FEWEST:
         raise InsufficientDataError(
             f"{source}: {n} configurations are too few to tell a missing effect from noise; "

@@ -548,6 +548,8 @@ def corrected_mjcf(
     flange."""
     assert robot.mjcf is not None
     text = _MjcfText(MjcfArm.read(robot.mjcf, robot.base, robot.flange), pieces)
+    if pulling := text.arm.pulling(text):
+        raise NotInPlace(f"its tendon '{pulling[0]}' pulls at the arm, which the model does not")
     if AXES in text.arm.tree.frames:
         raise NotInPlace("an earlier export made it, with actuators for springs")
     if pieces.springs_at(f"link{pieces.chain.n_joints}"):
@@ -672,6 +674,9 @@ class _MjcfText(XmlFile):
         wanted = up @ [0.0, 0.0, -STANDARD_GRAVITY]
         if np.abs(self.model.opt.gravity - wanted).max() >= SMALLEST:
             self.set_in(self.tags[0], "option", {"gravity": numbers(wanted)})
+        if self.model.opt.wind.any():
+            self.set_in(self.tags[0], "option", {"wind": "0 0 0"})
+            told.append("wind is 0 in this file, which would bend the springs")
         for b in (held := self.arm.weightless()):
             self.set(self.bodies[b], {"gravcomp": "0"})
         if held:

@@ -26,7 +26,7 @@ from elastocal.identification.least_squares import (
     told_by_one,
     variance_of,
 )
-from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.mistakes import likely_mistake, refuse_nonsense
 from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
@@ -101,9 +101,9 @@ def identify(
     data cannot determine the model.
     """
     options = options or Options()
-    check_table(model, table)
+    check_table(model, table, likely_mistake)
     if test is not None:
-        check_rows(model, test)
+        check_rows(model, test, likely_mistake)
     table, told = without_copies(table)
     observed = observe(table, model.observe)
     again = copied(observed)

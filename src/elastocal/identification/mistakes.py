@@ -112,6 +112,12 @@ def nominal_fit(
     return NominalFit(error, f"{said}{';' if better else ','} {best}", better and near <= POOR)
 
 
+def likely_mistake(model: Model, table: Measurements) -> str:
+    """The mistake that, undone, makes readings fit the nominal arm; "" where there is none."""
+    fit = nominal_fit(model.chain, model.cell, table)
+    return fit.warning if fit is not None and fit.mended else ""
+
+
 def _some(table: Measurements) -> Measurements:
     light = np.flatnonzero(~np.any(table.force != 0, axis=1))
     rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
@@ -162,6 +168,12 @@ def rotations_off(angles: Array, of: str) -> str:
 
 MOST_SIGNS = 7  # joints of which every choice of signs is tried; of more, up to two
 TURNS = (90, -90, 180)
+TURNED = "with the sign of"
+MIRRORED = (
+    "with two columns of the positions swapped, or the sign of one turned round (now they make a "
+    "left-handed frame),"
+)
+NO_WORSE = 1.5
 
 
 @dataclass(frozen=True)
@@ -192,7 +204,7 @@ def joint_maps(chain: Chain) -> list[JointMap]:
     for turned in chain_of(*(combinations(range(n), k) for k in range(1, most + 1))):
         names = f"joint{'s' * (len(turned) > 1)} {listed([str(j + 1) for j in turned])}"
         D = np.diag(np.where(np.isin(np.arange(n), turned), -1.0, 1.0))
-        told = f"with the sign of {names} turned round"
+        told = f"{TURNED} {names} turned round"
         signs.append(JointMap((told,), D, mistakes=len(turned)))
     for j in range(1, n):
         for factor in (1.0, -1.0) if kinds[j] == kinds[j - 1] else ():
@@ -236,7 +248,7 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
         turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
         swapped = np.column_stack([position[:, :2] * turned[:, None], level])
         points += [(swapped, ("with zenith angles read as elevations or the other way round",))]
-    found: list[tuple[float, float, Alternative]] = []
+    found: list[tuple[float, float, list[str], Measurements]] = []
     for place, of_angles in points:
         fits = LinearFits(flange, place, table.marker)
         for k in np.flatnonzero(np.isfinite(fits.left)):
@@ -245,13 +257,19 @@ def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[
             # To mirror the frame beside turned signs is no simpler than to turn others.
             count = maps[k].mistakes + len(more) + (0 < len(more) < len(words))
             if words:
-                told = " and ".join(words).replace("{", "{{").replace("}", "}}")
-                other = (f"{told} they would fit to {{}}", replace(table, q=q[k], position=undone))
-                found.append((float(fits.left[k]), count, other))
+                other = replace(table, q=q[k], position=undone)
+                found.append((float(fits.left[k]), count, words, other))
     found.sort(key=lambda one: one[0])
     likely = [one for one in found if one[0] <= POOR] or found[:2]
     likely.sort(key=lambda one: one[1])  # of equally many mistakes the better fit stays first
-    yield from (other for _, _, other in likely[:CONFIRMED])
+    for left, _, words, other in likely[:CONFIRMED]:
+        told = " and ".join(words)
+        if words == [MIRRORED]:
+            # So does an arm that has a plane of symmetry where joints turn the other way round.
+            alike = (w[0] for fit, _, w, _ in likely if len(w) == 1 and fit < NO_WORSE * left)
+            told += next((f" or {one}" for one in alike if one.startswith(TURNED)), "")
+        told = told.replace("{", "{{").replace("}", "}}")
+        yield f"{told} they would fit to {{}}", other
 
 
 def _of_positions(
@@ -264,8 +282,7 @@ def _of_positions(
         words.append(
             "with azimuths counted the other way (azimuth = … in [[source]])"
             if spherical
-            else "with two columns of the positions swapped, or the sign of one turned round (now "
-            "they make a left-handed frame),"
+            else MIRRORED
         )
     unit = next((u for u in UNITS if abs(scale / u[0] - 1) < OF_A_UNIT), None)
     if unit is not None:

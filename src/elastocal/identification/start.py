@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from typing import Literal, get_args
@@ -407,10 +408,13 @@ OVERSHOOT = np.radians(0.5)  # controllers overshoot soft limits by a little
 SAME = 1e-9
 SOME = 2**14  # readings that are enough to tell their unit
 
+# What may be wrong with a table whose joint values no arm can take; "" where nothing tells.
+Mistake = Callable[[Model, Measurements], str]
 
-def check_table(model: Model, table: Measurements) -> None:
+
+def check_table(model: Model, table: Measurements, mistake: Mistake) -> None:
     """A table to fit: as any table, and more than one pose (InsufficientDataError)."""
-    check_rows(model, table)
+    check_rows(model, table, mistake)
     if (table.q == table.q[:1]).all():
         raise InsufficientDataError(
             f"{table.source}: all {len(table)} rows hold the same pose; measure at different "
@@ -418,7 +422,7 @@ def check_table(model: Model, table: Measurements) -> None:
         )
 
 
-def check_rows(model: Model, table: Measurements) -> None:
+def check_rows(model: Model, table: Measurements, mistake: Mistake) -> None:
     n = model.chain.n_joints
     if table.q.shape[1] != n:
         raise InputError(
@@ -430,11 +434,11 @@ def check_rows(model: Model, table: Measurements) -> None:
         if values is not None and not np.isfinite(values).all():
             k = int(np.argwhere(~np.isfinite(values))[0][0])
             raise InputError(f"{table.source}, line {table.row[k]}: {name} is not finite")
-    check_limits(model, table)
+    check_limits(model, table, mistake)
     _check_units(model, table)
 
 
-def check_limits(model: Model, table: Measurements) -> None:
+def check_limits(model: Model, table: Measurements, mistake: Mistake | None = None) -> None:
     revolute = np.array([k == "revolute" for k in model.chain.kinds])
     wound = np.abs(table.q[:, revolute]) > 4 * np.pi
     if wound.any():
@@ -448,13 +452,13 @@ def check_limits(model: Model, table: Measurements) -> None:
         )
     if (beyond := beyond_limits(model.cell, model.chain, table.q, OVERSHOOT, 4)) is not None:
         rows, _, told = beyond
-        hint = "correct the line or the limits"
-        if 2 * len(rows) > len(table):
+        hint = "" if mistake is None else mistake(model, table)
+        if not hint and 2 * len(rows) > len(table):
             hint = "most lines are beyond: probably degrees given as radians (or the reverse), or "
-            hint += "another robot"
+            hint += "another zero of the joint or another robot"
         raise InputError(
             f"{table.source}, line {table.row[rows[0]]}: {told} ({len(rows)} of {len(table)} "
-            f"lines); {hint}"
+            f"lines); {hint or 'correct the line or the limits'}"
         )
 
 

@@ -22,21 +22,22 @@ from elastocal.cell_tables import SOURCES, Convention, Robot
 from elastocal.config import toml_key, toml_value
 from elastocal.files import atomic_writer
 from elastocal.messages import InputError, listed, option, printable, require
-from elastocal.model.chain import Chain, clashing, jaw_told, names_told
+from elastocal.model.chain import Chain, clashing, extent, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.geometry import BaseFrame, JointOffset, LinkGeometry, MarkerPosition
 from elastocal.model.effects.statics import JointCompliance, feels_weight, usual_over_stated_mass
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import highest_origins, reach_of, suitable_load
-from elastocal.model.urdf import TRACKER, Tree, check_urdf, xacro_left
+from elastocal.model.urdf import TRACKER, Tree, XmlFile, check_urdf, is_called, xacro_left
 from elastocal.units import Array, pose_at, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
+OF_ROOT = {"robot": "urdf", "mujoco": "mjcf"}  # whatever the ending says
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("elastocal_flange", "attachment_site", "flange", "tool0", "ee_site")
-WORLDS = (TRACKER, "world")  # roots that are no part of a robot
+WORLDS = (TRACKER, "world", "map", "odom")  # roots that are no part of a robot
 MOST_SITES = 8  # listed as markers; of more most are something else
 THICKNESS = 15.0  # reach over a link's radius
 
@@ -119,21 +120,23 @@ def robot_of(
             require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
         return replace(Robot.from_dh(path, convention), ur_model=ur_model)
     require(convention == "standard", f"{option('convention')} is for DH tables; {is_for}")
+    what = ("URDF file", "a URDF") if kind == "urdf" else ("MuJoCo model", "an MJCF file")
+    kind = OF_ROOT.get(XmlFile.read(path, *what).root.name, kind)
     if kind == "urdf":
         tree = check_urdf(path)
         start, end = tree.ends(base, flange or None)
-        return Robot.from_urdf(path, _own_base(tree, end) if base is None else start, end)
+        return Robot.from_urdf(path, _own_base(tree, start, end) if base is None else start, end)
     arm = MjcfArm.read(path, base, flange)
     there = arm.tree.places(arm.base, arm.flange) if flange is None else ()
-    found = (site for site in FLANGE_SITES if site in there)
-    start = _own_base(arm.tree, arm.flange) if base is None else base
+    found = (site for name in FLANGE_SITES for site in there if is_called(site, name))
+    start = _own_base(arm.tree, arm.base, arm.flange) if base is None else base
     return Robot.from_mjcf(path, start, next(found, arm.flange))
 
 
-def _own_base(tree: Tree, flange: str) -> str:
-    """The root, or where that is no part of the robot what is fixed to it."""
+def _own_base(tree: Tree, base: str, flange: str) -> str:
+    """The base, or where that is no part of the robot what is fixed to it."""
     first = tree.ways[tree.link_of(flange)[0]][0]
-    return tree.root if first.moves or tree.root not in WORLDS else first.child
+    return base if first.moves or base != tree.root or base not in WORLDS else first.child
 
 
 def first_cell(robot: Robot, folder: Path) -> str:
@@ -168,10 +171,13 @@ def notes_of(robot: Robot, chain: Chain) -> list[str]:
     moved = ""
     if robot.urdf is not None and robot.flange is not None:
         moved = robot.flange if check_urdf(robot.urdf).parent_joint[robot.flange].moves else ""
+    weightless = [chain.joints[i].name for i, body in enumerate(chain.masses) if body.mass == 0]
+    if weightless and not any("mass of" in note for note in found):
+        found.append(f"the file has no mass for what {listed(weightless)} alone move: taken as 0")
     if doubt := placeholder_masses(chain):
         found.append(
-            f"{doubt}, which looks like placeholders. Weights would bend the joints wrongly, so "
-            "link_gravity is off; put in the masses of the data sheet and switch it on"
+            f"{doubt}, which looks like placeholders or a mistake. Weights would bend the joints "
+            "wrongly, so link_gravity is off; put in the masses of the data sheet and switch it on"
         )
     return found + jaw_told(chain, moved)
 
@@ -181,8 +187,14 @@ FEW_KINDS = 3  # links of each mass, on average, from which on nobody has weighe
 
 
 def placeholder_masses(chain: Chain) -> str:
-    """Many links of one mass, or all together far from what an arm of that length weighs; "" where
-    nothing speaks against them."""
+    """Many links of one mass, or all together far from what an arm of that length weighs, or a
+    centre farther from its joint than the arm is long; "" where nothing speaks against them."""
+    length, far = extent(chain), [float(np.linalg.norm(body.com)) for body in chain.masses]
+    if max(far, default=0.0) > length and "prismatic" not in chain.kinds:
+        return (
+            f"the file has the centre of mass of link {far.index(max(far)) + 1} {max(far):.3g} m "
+            f"from its joint, and an arm of {length:.3g} m"
+        )
     masses = [f"{body.mass:.4g}" for body in chain.masses]
     if masses and len(set(masses)) * FEW_KINDS <= len(masses):
         mass, k = Counter(masses).most_common(1)[0]
@@ -323,7 +335,7 @@ def _guesses(chain: Chain, reach: float, T: Array, whose: str) -> dict[str, Any]
     told = "masses of the robot's file bend the joints" if weighed else NO_MASSES
     if chain.masses and not weighed:
         told = "the file's masses look like placeholders"
-    if any("gravity" in note or "mass of" in note for note in chain.notes):
+    if any("gravity " in note or "mass of" in note for note in chain.notes):
         told = "a choice: see the notes above"
     # In mm, fives; the links get thinner towards the wrist.
     thick = max(5 * round(reach * 1e3 / THICKNESS / 5), 5)

@@ -181,7 +181,7 @@ def plausible(chain: Chain, source: object) -> Chain:
     for place, T in zip(places, ends, strict=True):
         length = float(np.linalg.norm(T[:3, 3]))
         told = f"{source}: {length:g} m before {place} is too long for a link; correct it"
-        require(length <= MAX_LENGTH, told)
+        require(length <= MAX_LENGTH, f"{told}, or if lengths are in mm, state them in m")
     whole = extent(chain)
     for good, size, meant in (
         (whole <= MAX_LENGTH, f"{whole:g} m",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import configparser
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -201,15 +202,23 @@ def _closer(table: RawTable, chain: Chain) -> Chain:
 
 # Other people's names of columns, as of `match_columns`.
 CALLED = {
-    "q?min|q?low|lb|qlimmin|limitmin|lowerlimit|jmin": "lower",
-    "q?max|q?high|ub|qlimmax|limitmax|upperlimit|jmax": "upper",
+    "(q|j|joint|angle|theta)?(lim|limit)?(min|low|lower|lb)(limit|angle)?": "lower",
+    "(q|j|joint|angle|theta)?(lim|limit)?(max|high|upper|ub)(limit|angle)?": "upper",
     "theta|θ|θ0|offset|q0|thetaoffset": "theta0",
     "α": "alpha", "β": "beta", "r": "a", "name": "joint", "sigma|kind": "type",
     "direction|flip|dir": "sign",
 }  # fmt: skip
 
 
+OF_THE_LINK_BEFORE = re.compile(r"(?i)(alpha|α|a)_?\W?(i? ?[-−] ?1|i_?m_?1|i_?minus_?1|prev).*")
+
+
 def _no_table(what: str, header: str) -> str | None:
+    if of_link := OF_THE_LINK_BEFORE.fullmatch(header):
+        told = f"column {quoted(header)} is of the link before, as in Craig's tables: call it "
+        name = of_link[1].lower().replace("α", "alpha")
+        how = f'{option("convention", "modified")}, or [robot] dh_convention = "modified"'
+        return f"{told}{name}_… (with its unit), and state {how}"
     if not header.startswith(("<", "version https://git-lfs")):
         return None
     kind = "a web page or XML" if header.startswith("<") else "a pointer of Git LFS"

@@ -94,6 +94,10 @@ class MjcfArm:
         tree = _tree(path, spec.modelname or path.stem, model, bodies, unweighed)
         arm = cls(model, tree, *tree.ends(base, flange), bodies, unweighed, tuple(told))
         arm.check_open()
+        if pulling := arm.pulling(file):
+            spring = f"tendon {listed(map(repr, pulling), 4)} of the file pulls at the arm"
+            why = "which is not read; if the arm has such a spring, fit gravity_compensator"
+            arm = replace(arm, told=(*arm.told, f"{spring}, {why}"))
         return arm
 
     @cached_property
@@ -115,6 +119,16 @@ class MjcfArm:
     @property
     def flange_in_body(self) -> Array:
         return self.tree.link_of(self.flange)[1]
+
+    def pulling(self, file: XmlFile) -> list[str]:
+        """Tendons of a file that are springs from one link of the arm, or its base, to another."""
+        found = []
+        for tag in (tag for one in file.root.all("tendon") for tag in one.all("spatial")):
+            sites = (self.tree.frames.get(site.get("site")) for site in tag.all("site"))
+            ends = {self._carriers.get(site[0], (-1,))[0] for site in sites if site}
+            if len(ends) > 1 and any(_numbers(tag.get("stiffness"))):
+                found.append(tag.get("name"))
+        return found
 
     def weightless(self) -> list[int]:
         """Moved bodies whose weight `gravcomp` of the file carries."""

@@ -15,6 +15,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
+from itertools import takewhile
 from pathlib import Path
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
@@ -224,6 +225,7 @@ MOVING = ("revolute", "continuous", "prismatic")
 # Names of flanges, the usual first.
 FLANGES = ("tool0", "flange", "ee_link", "tcp")
 MOST_IN_A_FINGER = 5  # joints
+LEAST_MASS = 1e-6  # kg of all links; MuJoCo takes no moving body without a mass
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
 TRACKER = "elastocal_tracker"  # the root that it puts above a robot with --base-frame
@@ -350,22 +352,31 @@ class Tree:
         """The first and the last link, None for those that are found.  `choose`: whether a flange
         is found among several links that it could be: a cell that leaves the choice open may have
         meant another frame."""
-        base = self.root if base is None else self.find("base", base, self.root)
+        start = self.root if base is None else self.find("base", base, self.root)
         if flange is None:
-            found = self.last_link(base)
-            able = [k for k in self._leaves(base) if len(self._moving(base, k)) >= MIN_JOINTS]
+            found = self.last_link(start)
+            able = [k for k in self._leaves(start) if len(self._moving(start, k)) >= MIN_JOINTS]
             require(
                 choose or len(able) < 2,
                 f"{self.path}: several links could be the flange: "
                 f"{listed(sorted({*able, found}))}; name the right one as `flange` (init takes "
                 f"'{found}')",
             )
-            return base, found
+            return base or self._first_link(found), found
         usual = ""
         if flange not in self.links and flange not in self.frames:
             with suppress(InputError):  # of several arms, each with an end of its own
-                usual = self.last_link(base)
-        return base, self.find("flange", flange, usual)
+                usual = self.last_link(start)
+        flange = self.find("flange", flange, usual)
+        return base or self._first_link(flange), flange
+
+    def _first_link(self, flange: str) -> str:
+        """The root, or what floats or drives about below it with the arm on it."""
+        still = [*takewhile(lambda joint: not joint.moves, self.ways[self.link_of(flange)[0]])]
+        free = [k for k, joint in enumerate(still) if joint.kind != "fixed"]
+        # A body of MuJoCo stands without a name behind its joint.
+        own = [j.child for k in free[-1:] for j in still[k : k + 2] if j is still[k] or not j.name]
+        return own[-1] if own else self.root
 
     def last_link(self, base: str) -> str:
         """The link below `base` from which on fingers, or frames that none moves, branch off.  Of
@@ -399,7 +410,7 @@ class Tree:
                 for leaf in leaves if sizes[leaf] == most]  # fmt: skip
         common = [link for link in ways[0] if all(link in way for way in ways)]
         if len(self._moving(base, common[-1])) == most and len(ways) > 1:
-            named = (way[-1] for name in FLANGES for way in ways if way[-1] == name)
+            named = (way[-1] for name in FLANGES for way in ways if is_called(way[-1], name))
             return next(named, common[-1])
         # Fingers of unequal length, as a thumb has: no link is common to those with most joints.
         for link in common:
@@ -431,6 +442,7 @@ class Tree:
         for joint in joints:
             bounded = joint.moves and joint.kind != "continuous"
             lower, upper = joint.limit or (-math.inf, math.inf)
+            left_out = " (a URDF takes 0 for one left out)" if 0.0 in (lower, upper) else ""
             for wrong, told in (
                 (not joint.moves and joint.kind != "fixed",
                  f" is {joint.kind} and lies between base and flange; only {', '.join(MOVING)} and "
@@ -443,7 +455,7 @@ class Tree:
                  'velocity="0"/> or make it continuous'),
                 (lower >= upper and bounded,
                  f": limits lower={lower:g}, upper={upper:g} leave no room to move; lower must be "
-                 "below upper (a URDF takes 0 for one left out)"),
+                 f"below upper{left_out}"),
             ):  # fmt: skip
                 require(not wrong, f"{self.path}: joint '{joint.name}'{told}")
         moving = [joint for joint in joints if joint.moves]
@@ -502,7 +514,13 @@ class Tree:
                 LinkMass(float(m[3]), m[:3] / m[3] if m[3] > 0 else np.zeros(3)) for m in moments
             )
         end = T @ self.link_of(flange)[1]
-        return Chain(self.name, tuple(joints), end, masses if moments[:, 3].any() else ())
+        masses = masses if moments[:, 3].sum() > LEAST_MASS else ()
+        return Chain(self.name, tuple(joints), end, masses)
+
+
+def is_called(link: str, name: str) -> bool:
+    """As it is, or behind a prefix: ur5e_tool0, robot1/tool0."""
+    return link == name or link.endswith(tuple(f"{mark}{name}" for mark in "_/-:"))
 
 
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
@@ -611,12 +629,12 @@ def _joint(where: str, name: str, tag: Tag, links: Collection[str]) -> FileJoint
         origin=pose_at(_vector(where, tag, "origin", "xyz"), rotation_from_rpy(rpy)),
         axis=axis / length if length else axis,
         limit=limit,
-        follows=None if mimic is None else mimic.get("joint"),
+        follows=None if mimic is None else mimic.get("joint").strip(),
     )
 
 
 def _end(where: str, joint: Tag, side: str, links: Collection[str]) -> str:
-    name = joint.of(side, "link") or ""
+    name = (joint.of(side, "link") or "").strip()
     require(bool(name), f'{where} has no {side} link; add <{side} link="…"/>')
     if name not in links:
         hint = f"{did_you_mean(name, links)}; name an existing link or add it"

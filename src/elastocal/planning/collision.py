@@ -3,6 +3,8 @@ collision and sight in whole batches of poses, and moves certified free of colli
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -23,9 +25,12 @@ from elastocal.messages import InputError, check_known, require, said_of
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 from elastocal.model.evaluate import BatchFunction
+from elastocal.model.urdf import urdf_file
 from elastocal.units import Array, BoolArray, pose_at
 
 MESH_BYTES = 100_000_000
+MESH_HEAD = 100_000
+DAE_UNIT = re.compile(rb"""<unit\b[^>]*\bmeter\s*=\s*["']([^"']+)""")
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
 
 
@@ -113,7 +118,10 @@ def _mesh_hull(path: Path, scale: tuple[float, ...], name: str) -> tuple[Array, 
     with said_of(f"mesh of body '{name}'"):
         check_regular(path, "mesh", MESH_BYTES)
     try:
-        return outward(np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices()))
+        # COLLADA files state the unit of their lengths, which coal does not look at.
+        head = path.read_bytes()[:MESH_HEAD] if path.suffix.lower() == ".dae" else b""
+        size = np.array(scale) * float((DAE_UNIT.search(head) or (0, 1.0))[1])
+        return outward(np.array(coal.MeshLoader().load(str(path), size).vertices()))
     except QhullError:
         raise InputError(f"mesh '{path}' of body '{name}' is flat: it encloses no volume") from None
     except Exception as error:  # assimp's failures surface as several kinds
@@ -162,6 +170,14 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
             "where the URDF looks for them (beside it, or in a package directory above it), or "
             "give link_radius_mm instead"
         ) from None
+    # What the reader cannot make out it leaves out, and the arm would strike with it.
+    read = Counter(model.frames[item.parentFrame].name for item in geometry.geometryObjects)
+    for link in urdf_file(path).root.all("link"):
+        require(
+            len(link.all("collision")) == read[link.get("name")],
+            f"{where}: {path}: a <collision> of link '{link.get('name')}' cannot be read; it takes "
+            "box size, cylinder radius and length, sphere radius, mesh filename (scale: 3 numbers)",
+        )
     if not geometry.ngeoms:
         raise InputError(
             f"{where}: {path} has no <collision> elements; give link_radius_mm instead"

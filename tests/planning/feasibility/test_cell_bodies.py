@@ -57,18 +57,28 @@ SHAPES = {
 }
 
 
+# 9 units of half a metre, which the file states of itself.
+DAE = """<COLLADA><asset><unit meter="0.5"/></asset><library_geometries><geometry id="g"><mesh>
+<source id="p"><float_array id="a" count="12">0 0 0 18 0 0 0 18 0 0 0 18</float_array>
+<technique_common><accessor source="#a" count="4" stride="3"><param name="X"/><param name="Y"/>
+<param name="Z"/></accessor></technique_common></source><vertices id="v"><input semantic="POSITION"
+source="#p"/></vertices><triangles count="2"><input semantic="VERTEX" source="#v"/><p>0 1 2 0 1 3
+</p></triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s">
+<node><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
 def write_urdf(folder, mesh):
-    links = '<link name="pedestal"><collision><geometry><box size="1 1 1"/></geometry>'
-    links += "</collision></link>"
+    box = '<geometry><box size="1 1 1"/></geometry>'
+    links = f'<link name="pedestal"><collision>{box}</collision></link>'
     joints = '<joint name="fix" type="fixed"><parent link="base"/><child link="pedestal"/>'
     joints += '<origin xyz="0 0 -0.5"/></joint>'
     for i, shape in SHAPES.items():
         parent = "base" if i == 1 else f"l{i - 1}"
         links += f'<link name="l{i}"><collision><origin xyz="0 0 0.1"/><geometry>'
         links += shape.format(mesh=mesh) + "</geometry></collision></link>"
-        joints += (
-            f'<joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="l{i}"/>'
-        )
+        joints += f'<joint name="j{i}" type="revolute"><parent link="{parent}"/>'
+        joints += f'<child link="l{i}"/>'
         joints += '<origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>'
         joints += '<limit lower="-1" upper="1" effort="0" velocity="0"/></joint>'
     path = folder / "arm.urdf"
@@ -86,10 +96,8 @@ def test_urdf_geometry_is_carried_by_the_joints_of_the_chain(tmp_path):
     """In a URDF whose base is itself lifted and whose gripper moves: both stand still."""
     folder = tmp_path / "arm_description" / "urdf"
     folder.mkdir(parents=True)
-    (folder.parent / "part.obj").write_text(
-        "v 0 0 0\nv 9 0 0\nv 0 9 0\nv 0 0 9\nf 1 2 3\nf 1 2 4\n"
-    )
-    found = urdf_named(write_urdf(folder, "package://arm_description/part.obj"))
+    (folder.parent / "part.dae").write_text(DAE)
+    found = urdf_named(write_urdf(folder, "package://arm_description/part.dae"))
     carriers = {name: body.carrier for name, body in found.items()}
     assert carriers == {
         "pedestal_0": WORLD, "l1_0": 0, "l2_0": 1, "l3_0": 2, "l4_0": 3, "finger_0": 3,
@@ -102,8 +110,13 @@ def test_urdf_geometry_is_carried_by_the_joints_of_the_chain(tmp_path):
 
 
 def test_a_missing_mesh_of_the_urdf_is_an_input_error(tmp_path):
+    path = write_urdf(tmp_path, "package://arm_description/nowhere.stl")
     with pytest.raises(InputError, match=r"nowhere\.stl.*put the mesh files"):
-        urdf_named(write_urdf(tmp_path, "package://arm_description/nowhere.stl"))
+        urdf_named(path)
+    # urdfdom leaves such a body out.
+    path.write_text(path.read_text().replace('scale="0.001 0.001 0.001"', 'scale="0.001"'))
+    with pytest.raises(InputError, match="a <collision> of link 'l4' cannot be read; it takes"):
+        urdf_named(path)
 
 
 def test_a_urdf_without_collision_elements_says_so():
