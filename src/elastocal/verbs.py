@@ -187,7 +187,7 @@ def design_request(
     Raises InputError that names the keyword.
     """
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.model.manipulator import Model
+    from elastocal.model.manipulator import Model, measurements_of
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.poses import read_pins, shares_of
 
@@ -207,7 +207,7 @@ def design_request(
     known = None if all(file is None for file in files) else Model(cell)
     if augment is not None and known is not None:
         own = model if isinstance(model, Model) else known
-        done = _table("augment", own, augment)
+        done = measurements_of(own, "augment", augment)
         known = own.with_markers_of(done)
         cell = cell if own is known else replace(cell, tool=known.cell.tool)
     stated, notes = (None, ()) if known is None else _prior_of(knowledge, known)
@@ -467,6 +467,7 @@ def identify(
     from elastocal.identification.identify import identify as run
     from elastocal.identification.start import Options
     from elastocal.measurements import read_matrix
+    from elastocal.model.manipulator import measurements_of
 
     if isinstance(covariance, str | Path):
         covariance = read_matrix(covariance, "noise covariance")
@@ -483,8 +484,8 @@ def identify(
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = _table("data", made, data)
-    kept_back = None if test is None else _table("test", made, test)
+    table = measurements_of(made, "data", data)
+    kept_back = None if test is None else measurements_of(made, "test", test)
     made = made.with_markers_of(*(t for t in (table, kept_back) if t is not None))
     prior = _gaussian(prior)
     if known is not None:
@@ -547,6 +548,7 @@ def diagnose(
     """
     from elastocal.diagnosis.diagnose import DiagnosisOptions
     from elastocal.diagnosis.diagnose import diagnose as run
+    from elastocal.model.manipulator import measurements_of
 
     options = DiagnosisOptions(cast(int, seed), _names("without", without), false_alarm)
     if extra_poses is not None:
@@ -554,7 +556,7 @@ def diagnose(
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = _table("data", made, data)
+    table = measurements_of(made, "data", data)
     made = made.with_markers_of(table)
     found = run(made, table, options, tell)
     if extra_poses is None or not found.open:
@@ -662,9 +664,10 @@ def _targets(
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
     placed = oriented or (found.ndim == 2 and found.shape[1] == 3)
-    right = placed and len(found) > 0 and bool(np.isfinite(found).all())
-    told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found an array of shape"
-    require(right, f"{option('targets')} {told} {np.shape(targets)}")
+    right = placed and len(found) > 0
+    told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found"
+    require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
+    require(bool(np.isfinite(found).all()), f"{option('targets')} {told} NaN or infinity")
     if oriented:
         return targets_at("targets", found[:, :3, 3], found[:, :3, :3], frame, force)
     return targets_at("targets", found, None, frame, force)
@@ -713,19 +716,6 @@ def _checked_cell(given: Any, name: str = "model") -> Cell | str | Path:
         return given
     told = "takes a Model, a Cell or the path of a cell file"
     raise InputError(f"{option(name)} {told}; found {type(given).__name__}")
-
-
-def _table(name: str, model: Model, given: Table) -> Measurements:
-    from elastocal.measurements import Measurements
-
-    if isinstance(given, Measurements):
-        return given
-    if isinstance(given, str | Path) or hasattr(given, "to_csv"):
-        return model.read(given)
-    raise InputError(
-        f"{option(name)} takes measurements (Model.read, Model.table) or the path of their table; "
-        f"found {type(given).__name__}"
-    )
 
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:

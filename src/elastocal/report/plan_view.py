@@ -424,6 +424,7 @@ def next_lines(found: NextPoses) -> Told:
     doubts = [
         f"{say.effect_at_places(effect, [where])} ({say.probability(p)})"
         for effect, where, p in found.doubts[:3]
+        if not say.probability(p).startswith("<")
     ]
     if doubts:
         rivals = found.diagnosis is not None and found.diagnosis.open
