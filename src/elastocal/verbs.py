@@ -669,6 +669,10 @@ def _targets(
     require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
     require(bool(np.isfinite(found).all()), f"{option('targets')} {told} NaN or infinity")
     if oriented:
+        R, last = found[:, :3, :3], found[:, 3] - [0, 0, 0, 1]
+        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() + np.abs(last).max()
+        told = "takes poses whose rotation is a rotation matrix, above a last row of 0 0 0 1"
+        require(off < 1e-6 and (np.linalg.det(R) > 0).all(), f"{option('targets')} {told}")
         return targets_at("targets", found[:, :3, 3], found[:, :3, :3], frame, force)
     return targets_at("targets", found, None, frame, force)
 
