@@ -381,6 +381,4 @@ def require(condition: object, message: str) -> None:
 def check_known(name: str, there: Collection[str], told: str, them: str = "there are") -> None:
     """Behind what is `told` of an unknown name stand the nearest of what is `there`, and all."""
     if name not in there:
-        raise InputError(
-            f"{told}{did_you_mean(str(name), there)}; {them} {listed(there) or 'none'}"
-        )
+        raise InputError(f"{told}{did_you_mean(name, there)}; {them} {listed(there) or 'none'}")

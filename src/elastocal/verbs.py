@@ -226,7 +226,6 @@ def design_request(
 
 
 def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
-    """[design] of the cell with what is asked for, checked by it, in its place."""
     import numpy as np
 
     from elastocal import cell_tables as wish
@@ -276,7 +275,6 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and arrays of numpy as those of Python, which a cell is made of."""
     if isinstance(value, Mapping):
         return {key: _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -287,7 +285,6 @@ def _plain(value: Any) -> Any:
 def _prior_of(
     knowledge: Knowledge | str | Path | None, model: Model
 ) -> tuple[GaussianPrior | None, tuple[str, ...]]:
-    """What a knowledge file says that counts for a plan, and a sentence on what does not."""
     from elastocal.identification.knowledge import Constraints
 
     known = knowledge_of(knowledge)

@@ -193,7 +193,6 @@ def next_poses(
 
 
 def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell:
-    """The cell that asks for a batch in the table's load states, chosen for the test poses."""
     spec = cell.design
     return replace(cell, design=replace(
         spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,

@@ -115,7 +115,8 @@ class Model(ByValue):
             "[tracker] anchor_m = [x, y, z] in the data's frame",
         )
         chain = load_chain(cell)
-        self._assemble(chain, numbered(cell, chain), (), backend)
+        chosen = None if backend is None else chosen_backend(backend)
+        self._assemble(chain, numbered(cell, chain), (), chosen)
 
     @classmethod
     def assembled(
@@ -147,7 +148,6 @@ class Model(ByValue):
         return _arrived, made_of, {"_markers_stated": self._markers_stated}
 
     def _compared(self) -> Mapping[str, Any]:
-        """The robot's numbers and all that the cell says, but for names and places of files."""
         cell = {k: v for k, v in vars(self.cell).items() if k not in ("name", "path", "robot")}
         extra = [(effect.name, place) for effect, place in self._extra]
         return cell | {"chain": self.chain, "extra": extra, "backend": self.symbolic.backend}

@@ -168,7 +168,6 @@ def _weighted(plan: Plan) -> bool:
 
 
 def _rho(plan: Plan) -> float:
-    """ρ₀ in µm, also where the criterion weighs it with the error elsewhere."""
     e = plan.everywhere
     return plan.reported if e is None or not e.share else e.test_poses * 1e6
 

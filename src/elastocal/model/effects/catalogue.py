@@ -25,7 +25,7 @@ from elastocal.model import rigid
 from elastocal.model.chain import Chain
 from elastocal.model.effects import geometry, smooth, statics
 from elastocal.model.effects.base import Arm, Effect, Parameter, check, row_inputs
-from elastocal.model.evaluate import BatchFunction, chosen_backend
+from elastocal.model.evaluate import BatchFunction
 from elastocal.model.observations import observe
 from elastocal.units import Array
 
@@ -214,7 +214,7 @@ class SymbolicArm:
         for effect, place, own in bound:
             effect.read(arm, place, own)
         self.arm = arm
-        self.backend = backend and chosen_backend(backend)
+        self.backend = backend
         self.parameters = tuple(known.values())
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
         # The reading h of one row (3, 6 or 1 components) in inputs, X and θ.
