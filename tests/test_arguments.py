@@ -41,10 +41,28 @@ def poses(model: ec.Model) -> np.ndarray:
     return np.clip(lower, -2, 2) + span * np.random.default_rng(1).random((20, len(lower)))
 
 
-ABSURD = [10**12, -1.5, np.nan, 1e300, "", b"x", [], [[]], {}, {1: 2}, 1j, len, np.array(3)]
+ABSURD = [
+    10**12,
+    -1.5,
+    np.nan,
+    1e300,
+    "",
+    b"x",
+    [],
+    [[]],
+    {},
+    {1: 2},
+    1j,
+    len,
+    np.array(3),
+    np.zeros((4, 4)),
+]
 CALLS: dict[str, Any] = {
     "table": (["q", "force", "position"], lambda m, d, f, **k: m.table(**{"q": d.q[:2]} | k)),
     "pose": (["q", "x", "load"], lambda m, d, f, **k: m.pose(**{"q": d.q[0]} | k)),
+    "Model": (["backend"], lambda m, d, f, **k: ec.Model(m.cell, **k)),
+    "uncertainty": (["table"], lambda m, d, f, **k: f.uncertainty(**k)),
+    "plot": (["kind"], lambda m, d, f, **k: f.plot(**k)),
     "predict": (["table", "x"], lambda m, d, f, **k: m.predict(**{"table": d} | k)),
     "B": (["table", "x"], lambda m, d, f, **k: m.B(**{"table": d} | k)),
     "simulate": (
@@ -98,6 +116,11 @@ def test_what_cannot_be_is_an_error_that_names_the_argument(
                 with pytest.raises(ec.ElastocalError) as told:
                     run(model, data, fit, **{name: value})
             assert len(str(told.value)) < 2000
+
+
+def test_a_misspelt_argument_is_told_with_its_function(model: ec.Model) -> None:
+    with pytest.raises(TypeError, match=r"^identify\(\) .* 'tset' \(did you mean 'test'\?\)$"):
+        ec.identify(model, "data.csv", tset="test.csv")
 
 
 def test_what_the_caller_does_to_its_array_later_is_its_own(model: ec.Model) -> None:

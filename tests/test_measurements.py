@@ -53,7 +53,6 @@ def table(*rows, header=HEADER):
 
 
 def extended(columns, values):
-    """The smallest table with further columns."""
     return table(f"{ROW},{values}", header=f"{HEADER},{columns}")
 
 

@@ -238,7 +238,6 @@ def _strings(path: Path) -> Iterator[str]:
 
 
 def options(path: Path) -> set[int]:
-    """What `option` is called with."""
     calls = [n for n in nodes(path) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
     return {id(word) for n in calls if n.func.id == "option" for word in n.args}
 

@@ -37,7 +37,6 @@ AGAIN = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
 
 
 def interpreter(version: str) -> str | None:
-    """A Python of this version that runs, or None."""
     pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
     named = [shutil.which(f"python{version}"), *sorted(pyenv.glob(f"{version}.*/bin/python"))]
     for found in filter(None, named):
@@ -60,7 +59,6 @@ def run(folder: Path, *words: object) -> str:
 
 
 def tried(python: str, folder: Path) -> str:
-    """Install and run; returns what was made with what."""
     source = folder / "source"  # pip builds where the sources are
     shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))
     for name in ("pyproject.toml", "README.md", "LICENSE"):

@@ -27,7 +27,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ForwardRef, TypeVar
 
-from elastocal.messages import GONE, InputError, option, quoted, require
+from elastocal.messages import GONE, InputError, did_you_mean, option, quoted, require
 
 if TYPE_CHECKING:
     from pandas import DataFrame as DataFrame  # for those who import it from here
@@ -349,7 +349,12 @@ def checked_arguments(function: F) -> F:
         for name in kwargs:
             key = f"{function.__name__}.{name}"
             require(key not in GONE, f"{option(name)} is gone: {GONE.get(key)}")
-        bound = signature.bind(*args, **kwargs)
+        try:
+            bound = signature.bind(*args, **kwargs)
+        except TypeError as error:
+            unknown = [name for name in kwargs if name not in signature.parameters]
+            near = did_you_mean(unknown[0], signature.parameters) if unknown else ""
+            raise TypeError(f"{function.__qualname__}() {error}{near}") from None
         given = bound.arguments
         check(given, simple)
         if hasattr(given.get("seed"), "integers"):

@@ -331,7 +331,6 @@ _adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}  # by what is kept besid
 
 
 def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any:
-    """Tables within what stands at a spot are read one by one."""
     members = list(alternatives(kind))
     for member in members:
         inner, origin = get_args(member), get_origin(member)

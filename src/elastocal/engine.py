@@ -38,7 +38,6 @@ class Parts:
 
     @cached_property
     def _wide(self) -> Array:
-        """All loadings of a cluster side by side (C, m, k·r)."""
         C, k, m, r = self.loading.shape
         return np.ascontiguousarray(self.loading.swapaxes(1, 2)).reshape(C, m, k * r)
 

@@ -125,7 +125,6 @@ class Measurements(Result):
         return len(self.row)
 
     def _compared(self) -> Mapping[str, Any]:
-        """What a file of it would say, and which kinds its joints are."""
         return self.columns() | {"": self.kinds}
 
     def __hash__(self) -> int:
@@ -164,7 +163,6 @@ class Measurements(Result):
         return columns
 
     def _repr_html_(self) -> str:
-        """The first and last rows, as notebooks show a data frame."""
         return str(self.to_dataframe()._repr_html_())
 
     def take(self, index: NDArray | slice) -> Measurements:

@@ -175,7 +175,6 @@ def register_criterion(criterion: C) -> C:
 
 
 def _registered(register: Callable[[T], Any], what: T) -> T:
-    """What was registered, so that a criterion's class can be decorated."""
     try:
         register(what)
         files.REGISTERED.add(what if isinstance(what, type) else type(what))

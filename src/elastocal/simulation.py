@@ -217,12 +217,12 @@ def _read(
     n = len(rows)
     if model.observe == "distance":
         length = model.predict(replace(rows, distance=np.ones(n)), x)
-        check_equilibrium(rows, length[:, None], remedy)
+        check_equilibrium(model, rows, length[:, None], remedy)
         sigma = (model.cell.tracker.distance_sigma or 0.0) if noise else 0.0
         return replace(rows, distance=length + sigma * _standard(model, rng, (n,)))
     # A pose model asks each row for the measured rotation it is compared with; any will do here.
     rotation, position = model.target_poses(replace(rows, rotation=np.zeros((n, 3))), x)
-    check_equilibrium(rows, position, remedy)
+    check_equilibrium(model, rows, position, remedy)
     exact = replace(rows, position=position)
     if model.observe == "pose":
         turn = rotation

@@ -187,7 +187,7 @@ def design_request(
     Raises InputError that names the keyword.
     """
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.model.manipulator import Model
+    from elastocal.model.manipulator import Model, measurements_of
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.poses import read_pins, shares_of
 
@@ -207,7 +207,7 @@ def design_request(
     known = None if all(file is None for file in files) else Model(cell)
     if augment is not None and known is not None:
         own = model if isinstance(model, Model) else known
-        done = _table("augment", own, augment)
+        done = measurements_of(own, "augment", augment)
         known = own.with_markers_of(done)
         cell = cell if own is known else replace(cell, tool=known.cell.tool)
     stated, notes = (None, ()) if known is None else _prior_of(knowledge, known)
@@ -226,7 +226,6 @@ def design_request(
 
 
 def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
-    """[design] of the cell with what is asked for, checked by it, in its place."""
     import numpy as np
 
     from elastocal import cell_tables as wish
@@ -276,7 +275,6 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Numbers and arrays of numpy as those of Python, which a cell is made of."""
     if isinstance(value, Mapping):
         return {key: _plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
@@ -287,7 +285,6 @@ def _plain(value: Any) -> Any:
 def _prior_of(
     knowledge: Knowledge | str | Path | None, model: Model
 ) -> tuple[GaussianPrior | None, tuple[str, ...]]:
-    """What a knowledge file says that counts for a plan, and a sentence on what does not."""
     from elastocal.identification.knowledge import Constraints
 
     known = knowledge_of(knowledge)
@@ -467,6 +464,7 @@ def identify(
     from elastocal.identification.identify import identify as run
     from elastocal.identification.start import Options
     from elastocal.measurements import read_matrix
+    from elastocal.model.manipulator import measurements_of
 
     if isinstance(covariance, str | Path):
         covariance = read_matrix(covariance, "noise covariance")
@@ -483,8 +481,8 @@ def identify(
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = _table("data", made, data)
-    kept_back = None if test is None else _table("test", made, test)
+    table = measurements_of(made, "data", data)
+    kept_back = None if test is None else measurements_of(made, "test", test)
     made = made.with_markers_of(*(t for t in (table, kept_back) if t is not None))
     prior = _gaussian(prior)
     if known is not None:
@@ -547,6 +545,7 @@ def diagnose(
     """
     from elastocal.diagnosis.diagnose import DiagnosisOptions
     from elastocal.diagnosis.diagnose import diagnose as run
+    from elastocal.model.manipulator import measurements_of
 
     options = DiagnosisOptions(cast(int, seed), _names("without", without), false_alarm)
     if extra_poses is not None:
@@ -554,7 +553,7 @@ def diagnose(
     tell = progress or _silent
     tell("reading")
     made = _model(model)
-    table = _table("data", made, data)
+    table = measurements_of(made, "data", data)
     made = made.with_markers_of(table)
     found = run(made, table, options, tell)
     if extra_poses is None or not found.open:
@@ -662,10 +661,15 @@ def _targets(
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
     placed = oriented or (found.ndim == 2 and found.shape[1] == 3)
-    right = placed and len(found) > 0 and bool(np.isfinite(found).all())
-    told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found an array of shape"
-    require(right, f"{option('targets')} {told} {np.shape(targets)}")
+    right = placed and len(found) > 0
+    told = "takes positions (n, 3) in m, poses (n, 4, 4) or a file; found"
+    require(right, f"{option('targets')} {told} an array of shape {np.shape(targets)}")
+    require(bool(np.isfinite(found).all()), f"{option('targets')} {told} NaN or infinity")
     if oriented:
+        R, last = found[:, :3, :3], found[:, 3] - [0, 0, 0, 1]
+        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max() + np.abs(last).max()
+        told = "takes poses whose rotation is a rotation matrix, above a last row of 0 0 0 1"
+        require(off < 1e-6 and (np.linalg.det(R) > 0).all(), f"{option('targets')} {told}")
         return targets_at("targets", found[:, :3, 3], found[:, :3, :3], frame, force)
     return targets_at("targets", found, None, frame, force)
 
@@ -713,19 +717,6 @@ def _checked_cell(given: Any, name: str = "model") -> Cell | str | Path:
         return given
     told = "takes a Model, a Cell or the path of a cell file"
     raise InputError(f"{option(name)} {told}; found {type(given).__name__}")
-
-
-def _table(name: str, model: Model, given: Table) -> Measurements:
-    from elastocal.measurements import Measurements
-
-    if isinstance(given, Measurements):
-        return given
-    if isinstance(given, str | Path) or hasattr(given, "to_csv"):
-        return model.read(given)
-    raise InputError(
-        f"{option(name)} takes measurements (Model.read, Model.table) or the path of their table; "
-        f"found {type(given).__name__}"
-    )
 
 
 def knowledge_of(given: Knowledge | str | Path | None, physical: bool = False) -> Knowledge | None:

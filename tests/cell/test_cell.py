@@ -72,7 +72,6 @@ WHOLE = Path(__file__).with_name("whole.toml").read_text(encoding="utf-8")
 
 
 def whole(folder: Path) -> Cell:
-    """The same in Python, whose units are SI."""
     quarter, yaw = np.pi / 2, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     um, table = 1e-6, np.eye(4)
     table[:3, :3], table[:3, 3] = yaw, [1, 0, 2]

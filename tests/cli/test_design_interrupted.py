@@ -24,7 +24,6 @@ GOING_ON = "resuming the interrupted design"
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """plan.csv of the design that is not interrupted."""
     folder = tmp_path_factory.mktemp("whole")
     cell = write_cell(folder)
     assert design(cell).exit_code == 0
@@ -32,7 +31,6 @@ def whole(tmp_path_factory):
 
 
 def interrupt_after(monkeypatch, saves):
-    """Ctrl-C right after so many states were saved."""
     save, count = search.atomic_write, [0]
 
     def saving(path, state):

@@ -187,6 +187,29 @@ def test_a_bad_plug_in_is_one_sentence_with_file_and_line(code: str, tmp_path: P
 
 
 @pytest.mark.parametrize(
+    ("right", "wrong", "told"),
+    [
+        ("0.0, 5e-5", "0.0, -5e-5", "typical size above 0 or None; found 0.0, -5e-05"),
+        ('p["lobes_sin"] * ca', 'p["lobes_sin"] ** 2 * ca', r"shape \(1, 1\), linear in the param"),
+        ('return p["lobes_sin"]', 'return 1 + p["lobes_sin"]', "p and zero where they are"),
+        (
+            "3 * arm",
+            "np.nan * arm",
+            "no static equilibrium .* or three_lobes of a plug-in gives no",
+        ),
+    ],
+)
+def test_what_an_effect_declares_is_checked(
+    right: str, wrong: str, told: str, folder: Path, tmp_path: Path
+) -> None:
+    code = (folder / "three_lobes.py").read_text(encoding="utf-8").replace(right, wrong)
+    (tmp_path / "three_lobes.py").write_text(f"{code}\nimport numpy as np\n", encoding="utf-8")
+    shutil.copyfile(folder / "with.toml", tmp_path / "cell.toml")
+    result = run("identify", tmp_path / "cell.toml", folder / "data.csv", "-q")
+    assert result.exit_code == 2 and re.search(told, result.stderr), result.stderr
+
+
+@pytest.mark.parametrize(
     ("entry", "told"),
     [
         ("absent.py", r"names .*absent\.py: no such file"),

@@ -23,10 +23,11 @@ from support.registered import forgotten, write_example
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.cell_tables import CartesianNoise
+from elastocal.cell_tables import CartesianNoise, Nominal
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.verdict import confirm, unheard_of
 from elastocal.files import load_plugins
+from elastocal.identification.scrutiny import gap_budget
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 
@@ -75,6 +76,21 @@ def test_an_effect_is_named_with_its_place_size_and_time(name: str) -> None:
     # Three axes of tracker noise, and what the joints' scatter adds.
     assert np.sqrt(3) * SIGMA < 1.1 * rms[-1] and rms[-1] < 3 * np.sqrt(3) * SIGMA
     assert d.noise.faulty == ()
+
+
+def test_geometry_alone_has_no_part_in_the_sag_of_soft_joints() -> None:
+    """Of diagnosis, page and parameter sets, as a model without compliances has it."""
+    fitted = ("base_frame", "joint_offset", "marker_position", "link_geometry")
+    stiff, soft = (
+        Model.assembled(kr270_chain(), cell(names, nominal=Nominal(), link_gravity=False))
+        for names in (fitted, (*fitted, "joint_compliance"))
+    )
+    values = {f"joint{j}.compliance": 4e-6 for j in (4, 5, 6)}
+    table = ec.simulate(soft, plan(soft.chain, 40, 1), draw=1.0, values=values, seed=1)
+    true = ec.identify(stiff, table, outliers="keep").heldout_rms
+    fit = ec.identify(soft, table)
+    for steps in (ec.diagnose(soft, table).budget, gap_budget(fit).steps, fit.parameter_sets()):
+        assert steps[1].heldout_rms == pytest.approx(true, rel=0.01)
 
 
 def test_an_interval_holds_the_values_at_other_likely_time_constants() -> None:

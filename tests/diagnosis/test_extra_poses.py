@@ -36,7 +36,6 @@ def planned(model: Model, table: Measurements, rivals: Mapping[Key, float], most
 
 
 def diagnosis_of(model: Model, table: Measurements, rivals: Mapping[Key, float]) -> Any:
-    """Such a verdict: what a plan reads of it."""
     return SimpleNamespace(
         calibrated=fit_baseline(with_recorded_drivers(model, table), table),
         verdict="ambiguous",

@@ -16,7 +16,6 @@ LAG = {"joint2.move_lag": 6e-4}
 
 
 def lagging() -> ec.Model:
-    """The case's arm, with a lag of joint 2."""
     plain = ec.Model(CELL)
     return plain.with_effects((*plain.cell.model.effects, "move_lag:joint2"))
 
@@ -35,7 +34,6 @@ def sided() -> Measurements:
 
 
 def shuffled(table: Measurements) -> Measurements:
-    """Its configurations in another order."""
     order = np.random.default_rng(7).permutation(table.configuration.max() + 1)
     rows = np.argsort(order[table.configuration], kind="stable")
     moved = table.take(rows)

@@ -18,7 +18,6 @@ RIGID = ("base_frame", "joint_offset", "marker_position")
 
 
 def with_faults(table: Measurements, rows: np.ndarray) -> Measurements:
-    """A millimetre off in some direction."""
     error = np.random.default_rng(4).normal(size=(len(rows), 3))
     position = table.position.copy()
     position[rows] += 1e-3 * error / np.linalg.norm(error, axis=1, keepdims=True)

@@ -32,7 +32,6 @@ BARE = {name for name in ec.__all__ if name.endswith("Error")}
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """The files of the demo."""
     made = tmp_path_factory.mktemp("examples")
     run_demo(made)
     return made

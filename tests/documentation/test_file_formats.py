@@ -32,7 +32,6 @@ def section(heading):
 
 
 def keys(value):
-    """Every key of nested JSON, those apart that the arm names."""
     if isinstance(value, dict):
         for key, inside in value.items():
             yield re.sub(r"^q[2-9]_", "q1_", key)  # "q1_deg …" on the page

@@ -21,7 +21,6 @@ def house():
 
 @pytest.fixture(scope="module")
 def uses(house):
-    """Read from every module of the package once."""
     return house.uses()
 
 

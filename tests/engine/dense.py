@@ -93,7 +93,6 @@ def _block_diagonal(blocks: np.ndarray) -> np.ndarray:
 
 
 def shared_part(name: str, r: Readings) -> np.ndarray:
-    """V_k (rows, rows) of the shared effect of that name."""
     by = BY[name.removeprefix("common to each ").removesuffix(" (rotation)")]
     same = np.all([(lab := getattr(r, b))[:, None] == lab[None, :] for b in by], axis=0)
     size = r.size

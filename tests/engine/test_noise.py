@@ -17,7 +17,6 @@ BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 
 
 def drawn(kind, rng, r):
-    """Residuals under a noise of that kind, in m."""
     z = rng.normal(size=r.e.shape)
     name, _, shared = kind.partition("+")
     if name == "independent":

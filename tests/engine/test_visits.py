@@ -32,7 +32,6 @@ def readings(seed=0, configurations=20, repeats=1):
 
 
 def covariance(r, joints=0.0, drift=0.0):
-    """V (rows, rows) from its definition."""
     n = len(r)
     visit = r.visits.visit[:, 0]
     G = r.visits.motion[:, 0].reshape(3 * n, -1)

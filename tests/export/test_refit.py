@@ -84,7 +84,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def own_error(folder: Path) -> float:
-    """µm rms at the poses kept back, by elastocal itself."""
     return float(json.loads((folder / "full.json").read_text())["test"]["rms_um"])
 
 

@@ -128,7 +128,6 @@ def be_child(
 
 
 def put_old(outputs: Iterable[str], folder: Path) -> None:
-    """An old file under every output's name."""
     for name in outputs:
         (folder / name).write_bytes(OLD_BESIDE if name.endswith(".json") else OLD)
 
@@ -189,7 +188,6 @@ def complaints(ended: Ended, before: dict[str, bytes | None], folder: Path) -> I
 
 
 def malformed(name: str, content: bytes) -> str | None:
-    """What is wrong with a written file of this name, or None."""
     ending = name.rpartition(".")[2].lower()
     try:
         text = content.decode("utf-8")

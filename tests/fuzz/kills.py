@@ -116,7 +116,6 @@ class Victim:
         return f"{harm} {where}", found, harm != "killed" or ended.code < 0
 
     def wrong(self) -> Iterator[str]:
-        """What stands in the folder now that must not."""
         there = seen(self.folder)
         for name, content in self.inputs.items():
             if there.get(name) != content:
@@ -133,7 +132,6 @@ class Victim:
                 yield f"{name} is left"
 
     def wrongly_ended(self, ended: Ended, harm: str) -> Iterator[str]:
-        """All outputs, or a message and none of them."""
         there, stopped = seen(self.folder), harm == "interrupted"
         new = [name for name in self.sizes if there.get(name) not in (OLD, OLD_BESIDE)]
         whole = len(new) == len(self.sizes)

@@ -109,7 +109,6 @@ def thinned_ur5(folder: Path) -> None:
 
 
 def names(folder: Path) -> dict[str, Any]:
-    """What the packages offer by name."""
     import elastocal.plugins
 
     return {
@@ -142,7 +141,6 @@ def model(folder: Path) -> dict[str, Any]:
 
 
 def identified(folder: Path) -> dict[str, Any]:
-    """The fields of a calibration that the documentation uses."""
     fit = ec.identify("placed.toml", "placed.csv", fixed="joint2.compliance", test="june.csv")
     one = fit["joint3.offset"]
     fit.save("saved.json")
@@ -164,7 +162,6 @@ def identified(folder: Path) -> dict[str, Any]:
 
 
 def diagnosed(folder: Path) -> dict[str, Any]:
-    """The fields of a diagnosis that the documentation uses."""
     why = ec.diagnose(
         "placed.toml", "june.csv", false_alarm=0.1, without=["backlash", "frame_jump"]
     )
@@ -198,7 +195,6 @@ def compensated(folder: Path) -> dict[str, Any]:
 
 
 def compared(folder: Path) -> dict[str, Any]:
-    """January's arm and June's."""
     january, june = (ec.read_calibrated("placed.toml", f"{n}.json") for n in ("placed", "june"))
     found = ec.compare(january, june, load=[0, 0, -1000])
     return {"repr": repr(found), "p": found.p, "level": found.level,
@@ -257,7 +253,6 @@ def published(folder: Path) -> dict[str, Any]:
 
 
 def told(folder: Path) -> dict[str, Any]:
-    """What every kind of verdict prints."""
     from support.diagnoses import VERDICTS
 
     return {f"text {name}": _printed(found) for name, found in VERDICTS.items()}

@@ -17,7 +17,6 @@ def added(name: str, text: str, command: str = QUICK) -> Mistake:
 
 
 def asked(name: str, wishes: str) -> Mistake:
-    """With other wishes for a plan, and no prior."""
     loads = "[design]\nloads_N = [[0, 0, 0], [0, 0, -98]]\n"
     wished = loads if "loads_N" not in wishes else "[design]\n"
     old = f'{loads}prior = "typical"'

@@ -86,7 +86,6 @@ def _step(step: Step, folder: Path) -> dict[str, Any]:
 
 
 def states(folder: Path) -> dict[str, bytes]:
-    """What each file of a folder holds, by its digest."""
     files = (path for path in folder.rglob("*") if path.is_file())
     return {
         path.relative_to(folder).as_posix(): hashlib.sha1(path.read_bytes()).digest()
@@ -249,7 +248,6 @@ def compare(name: str, golden: Golden, found: list[dict[str, Any]]) -> list[Diff
 
 
 def report(name: str, golden: Golden, told: Sequence[Difference], most: int = 40) -> str:
-    """The differences of a golden, as a reader wants them."""
     steps = [s if isinstance(s, str) else s.__name__ for s in golden.steps]
     lines = [f"{name} differs in {len(told)} places"]
     for difference in told[:most]:
@@ -265,7 +263,6 @@ def report(name: str, golden: Golden, told: Sequence[Difference], most: int = 40
 
 
 def dumped(value: Any, indent: int = 0, width: int = 340) -> str:
-    """JSON with one line for whatever fits on one."""
     line = json.dumps(value, ensure_ascii=False)
     if len(line) + indent <= width or not isinstance(value, dict | list):
         return line

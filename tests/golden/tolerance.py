@@ -116,7 +116,6 @@ def _size(values: list[Any]) -> float:
 
 
 def label(record: Any, index: int) -> str:
-    """What a reader knows an entry of a list by."""
     if isinstance(record, dict):
         parts = [record[k] for k in NAMED_BY if isinstance(record.get(k), str)]
         if parts:

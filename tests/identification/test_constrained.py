@@ -25,7 +25,6 @@ NONE = Constraints()
 def solve(
     B: np.ndarray, y: np.ndarray, names: Sequence[str], stated: Constraints = NONE
 ) -> Minimum:
-    """The least |y − B x|² under the constraints."""
     return minimise(B, y, stated.resolve(names))
 
 

@@ -24,7 +24,6 @@ TRACKER = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
 
 
 def fitted(seed: int):
-    """A fit, and the true values behind its readings."""
     model, table, x = campaign(GEOMETRY, POSES, seed, tracker=TRACKER)
     return identify(model, table), x
 

@@ -106,7 +106,6 @@ EXACT_FIT = {"Wampler1", "Wampler2"}
 
 
 def read(name):
-    """B, y of the model, certified values."""
     certified = LINEAR[name]
     table = np.loadtxt(FOLDER / f"{name}.csv", delimiter=",", skiprows=1)
     y, predictors = table[:, 0], table[:, 1:]

@@ -59,7 +59,6 @@ def readings(
 
 @lru_cache
 def campaign():
-    """Readings, others for a test, and the calibration."""
     model, rng = arm(), np.random.default_rng(1)
     x = true(model, rng)
     table, test = readings(model, x, 80, rng), readings(model, x, 200, rng, 0.0)

@@ -31,7 +31,6 @@ def wide(path: Path, degrees: np.ndarray, points: np.ndarray, head: str, unit: s
 
 @pytest.fixture(scope="module")
 def readings(tmp_path_factory):
-    """The folder of the cell, joint values and points."""
     folder = tmp_path_factory.mktemp("cell")
     return folder, *kr270_readings(folder)[1:]
 

@@ -55,7 +55,6 @@ POINTS = np.array(
 
 
 def casadi_values(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> np.ndarray:
-    """(n, rows, columns): one CasADi call per row."""
     function = ca.Function("f", inputs, [output])
     n = max(len(v) for v in values if v.ndim == 2)
     rows = [[v[i] if v.ndim == 2 else v for v in values] for i in range(n)]
@@ -114,12 +113,10 @@ MANY = np.linspace(0.1, 2.0, 2 * FEW + 2).reshape(FEW + 1, 2)  # too many for Ca
 
 @pytest.fixture(autouse=True)
 def fresh(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No choice of another test."""
     monkeypatch.delenv("ELASTOCAL_BACKEND", raising=False)
 
 
 def by_numpy(f: BatchFunction) -> bool:
-    """Whether numpy's instructions were asked for."""
     return "_by_numpy" in vars(f)
 
 

@@ -139,7 +139,6 @@ def complex_step(c: Case, k: int) -> NDArray:
 
 
 def central_difference(c: Case, k: int) -> NDArray:
-    """∂prediction/∂x_k, fourth order."""
     step = difference_step(c, k)
     slope = np.zeros(len(c.prediction))
     for weight, n in ((8.0, 1), (-1.0, 2)):

@@ -39,7 +39,6 @@ def kr270(*effects: str, **model) -> Model:
 
 
 def positions(model: Model, poses: Array, force: Array) -> Array:
-    """Marker positions (poses, markers, 3) in m."""
     return model.predict(table_of(poses, force)).reshape(len(poses), -1, 3)
 
 

@@ -25,7 +25,6 @@ def problem_of(name, seed, N=12, n=4, p=5, prior=0.0):
 
 
 def all_values(problem):
-    """Φ of every plan."""
     parts = [
         list(combinations(np.flatnonzero(problem.group == g), share))
         for g, share in enumerate(problem.shares)

@@ -81,7 +81,6 @@ def shifted() -> Case:
 
 @pytest.fixture(scope="session")
 def hostile() -> Case:
-    """Marker names with markup."""
     effects = ("base_frame", "marker_position")
     return make_case((SCRIPT, MARKUP), effects, faulty=1, drop=True)
 

@@ -73,7 +73,6 @@ def texts(hostile: Any, plan: Any) -> dict[str, str]:
 def opened(
     browser: Any, texts: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Opened]:
-    """Every page, open and drawn."""
     folder = tmp_path_factory.mktemp("pages")
     return {kind: show(browser, folder / f"{kind}.html", text) for kind, text in texts.items()}
 

@@ -26,7 +26,6 @@ NAMES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
 
 
 def stated(result: Any, entries: CertificateEntries = ENTRIES) -> Any:
-    """The result of a cell with these entries."""
     model = copy.copy(result.model)
     object.__setattr__(model, "cell", replace(model.cell, certificate=entries))
     return replace(result, model=model)

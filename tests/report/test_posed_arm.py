@@ -115,7 +115,6 @@ def cell():
 
 
 def plan_at(cell, q, group, group_names, names=None):
-    """What a picture takes of a plan."""
     stops = [SimpleNamespace(pose=k, again=0) for k in range(len(q))]
     return SimpleNamespace(
         model=SimpleNamespace(cell=cell, chain=kr270_chain()), q=q, group=np.asarray(group),

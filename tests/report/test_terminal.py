@@ -32,7 +32,6 @@ def printed(width: int, *arguments: Any, **how: Any) -> str:
 
 
 def cells(table: ShownTable) -> list[dict[str, str]]:
-    """Rows of a table, column header → text."""
     return [dict(zip(table.heads, row, strict=True)) for row in table.rows]
 
 

@@ -34,7 +34,6 @@ def steps(result: Any) -> list[str]:
 
 @pytest.fixture(scope="module")
 def fine(case: Any) -> Any:
-    """A result that nothing speaks against."""
     return replace(
         case.result,
         noise=replace(case.result.noise, lack_of_fit=None, ratio_to_stated=1.0),

@@ -25,7 +25,6 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(small):
-    """The study run once, in order, in one process."""
     results = small.parent / "whole"
     assert run_study(small, results).done == 12
     return numbers(results)

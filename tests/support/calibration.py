@@ -126,7 +126,6 @@ def campaign(
 
 
 def with_values(model: Model, values: dict[str, float]) -> Array:
-    """Nominal values with some replaced, by name."""
     x = model.nominal.copy()
     for name, value in values.items():
         x[model.names.index(name)] = value

@@ -103,7 +103,6 @@ def value_of(setup: Setup, q: NDArray) -> float:
 
 
 def as_table(q: NDArray) -> Measurements:
-    """Poses (N, n), one row each, for expand_plan."""
     n = len(q)
     return Measurements(
         source="poses", row=np.arange(n) + 2, q=q, configuration=np.arange(n),

@@ -72,13 +72,11 @@ def elastocal(*arguments: object, **environment: str) -> Result:
 
 
 def design(cell: Path, *extra: object, output: str = "plan.csv", quiet: bool = True) -> Result:
-    """`design --effort quick` of a cell, into its folder."""
     how = ["--effort", "quick", *(["-q"] if quiet else [])]
     return elastocal("design", cell, "-o", cell.parent / output, *how, *extra)
 
 
 def planned(cell: Path, *extra: object, output: str = "plan.csv") -> dict[str, Any]:
-    """plan.json of a design that must end well."""
     result = design(cell, *extra, output=output)
     assert result.exit_code == 0, result.stderr
     return dict(json.loads((cell.parent / output).with_suffix(".json").read_text("utf-8")))

@@ -73,7 +73,6 @@ FAULTS = {f"{f.effect}:{f.where}": f for f in (
 def cell(
     effects: Sequence[str] = FITTED, observe: Any = "position", sigma: float = SIGMA, **model: Any
 ) -> Cell:
-    """A KR 270-2 with its stated tracker noise."""
     model.setdefault("nominal", Nominal(joint_compliance=COMPLIANCE))
     model.setdefault("link_gravity", True)
     tracker = Tracker(

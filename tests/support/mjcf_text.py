@@ -15,7 +15,6 @@ LOADABLE = ARM.replace('<geom type="mesh" mesh="hull"/>', "").replace(
 
 
 def write_arm(folder: Path, text: str = ARM) -> Path:
-    """arm.xml in `folder`."""
     path = folder / "arm.xml"
     path.write_text(text, encoding="utf-8")
     return path

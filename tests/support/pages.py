@@ -60,7 +60,6 @@ class Page(HTMLParser):
 
     @property
     def data(self) -> list[str]:
-        """What the page holds as JSON."""
         return [text for kind, text in self.scripts if kind == "application/json"]
 
     def check_harmless(self, source: str) -> None:

@@ -31,7 +31,6 @@ EXAMPLES = {
 
 
 def write_example(folder: Path, file: str) -> Path:
-    """The page's file, in a folder."""
     path = folder / file
     path.write_text(example(EXAMPLES[file], file), encoding="utf-8")
     return path

@@ -42,7 +42,6 @@ def urdf(
 
 
 def frame(name: str, parent: str, xyz: str = "0 0 0", rpy: str = "0 0 0") -> str:
-    """A link fixed to another."""
     return (
         f'<link name="{name}"/><joint name="{name}_joint" type="fixed"><parent link="{parent}"/>'
         f'<child link="{name}"/><origin xyz="{xyz}" rpy="{rpy}"/></joint>'

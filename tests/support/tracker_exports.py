@@ -40,7 +40,6 @@ def kr270_readings(folder: Path, poses: int = 10) -> tuple[Cell, np.ndarray, np.
 
 
 def krl(degrees: np.ndarray) -> str:
-    """A .dat file with one E6AXIS per pose."""
     tail = ",E1 0.0,E2 0.0,E3 0.0,E4 0.0,E5 0.0,E6 0.0"
     lines = ["&ACCESS RVO", "DEFDAT CALIB PUBLIC", "; poses of the campaign {not one}"]
     for i, q in enumerate(degrees, start=1):
@@ -71,7 +70,6 @@ def spatialanalyzer(points: np.ndarray, unit: str = "mm") -> str:
 
 
 def delimited(points: np.ndarray, header: str, delimiter: str = ",", decimal: str = ".") -> str:
-    """Name, x, y, z under a header."""
     lines = [header]
     for i, pose in enumerate(points, start=1):
         for marker, p in zip(MARKERS, pose, strict=True):

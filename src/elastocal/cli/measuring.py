@@ -139,7 +139,6 @@ def _target(text: str) -> float:
 
 
 def _candidates(text: str) -> int | str | list[int | str]:
-    """--candidates 500, taught.csv or taught.csv,500."""
     if text.isdecimal():
         return int(text)
     path, comma, number = text.rpartition(",")

@@ -103,7 +103,6 @@ class SumAnswer:
 
     @cached_property
     def _fitted(self) -> Projection:
-        """The estimates without what is hidden, as a cell has them that lacks it."""
         return project(self.found.data, self.found.noise)
 
     @cached_property
@@ -112,7 +111,6 @@ class SumAnswer:
 
     @cached_property
     def _wide(self) -> NoisyData:
-        """The data of the sum with the columns of what is hidden last."""
         data = self.found.data
         for c in self.hidden:
             precision = np.full(c.width, np.exp(-2 * size_of_fellows(self.found, c)))
@@ -121,7 +119,6 @@ class SumAnswer:
 
     @cached_property
     def _spans(self) -> tuple[slice, ...]:
-        """Of all components' coefficients, the fitted columns not counted."""
         widths = [c.width for c in self._every]
         return spans_of(widths, sum(widths))
 
@@ -136,7 +133,6 @@ class SumAnswer:
 
     @cached_property
     def _rows(self) -> BoolArray:
-        """Rows (C, m) that count and are positions (or distances)."""
         data = self.found.data
         of_size = np.arange(data.r.shape[1]) % data.blocks.size < 3
         return np.asarray(~data.left_out & of_size[None, :])
@@ -342,7 +338,6 @@ class SumAnswer:
         return [k for k, c in enumerate(self._every) if _kind(c) == name]
 
     def _by(self, key: Callable[[Component], Any]) -> dict[Any, list[int]]:
-        """The components' numbers by what `key` says of each, without those that it denies."""
         groups: dict[Any, list[int]] = {}
         for k, c in enumerate(self.found.components):
             if own := key(c):
@@ -371,7 +366,6 @@ class SumAnswer:
         return each_left_out(self.at.P, self.at.u)
 
     def _predicted(self, left_out: Array) -> Array:
-        """Readings (rows,) of the configurations that are kept, each by a fit to the others."""
         return (self.found.data.r - left_out)[self._rows][self._poses[0]]
 
     def _error_without(self, gone: Sequence[int]) -> Array:
@@ -570,7 +564,6 @@ class SumAnswer:
 
     @cached_property
     def _present(self) -> Array:
-        """Probability (K,) that there is anything at a component's place."""
         return np.asarray(expit(self.found.earned - self.found.sums.pool.costs(self.found.spread)))
 
     def _probability(self, k: int) -> float:
@@ -582,7 +575,6 @@ class SumAnswer:
         return there
 
     def _settings(self, members: list[int]) -> dict[str, float]:
-        """The constants of the effect at its place that these components stand for."""
         found = [self.found.components[k] for k in members]
         sizes, lengths = self.found.sizes.size, self.found.sizes.length
         settings: dict[str, float] = {}

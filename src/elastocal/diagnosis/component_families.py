@@ -237,7 +237,6 @@ Search = Callable[[Any, Grams, str], Tried | None]
 
 
 def _followed_by(dataset: DiagnosisData, found: FittedSum, where: str) -> Iterator[str]:
-    """What a place may follow and does not in the sum: the time, and joints that move."""
     follow = ["time"] if recorded(dataset.table, "time") else []
     if not where.startswith("marker"):
         turning = turning_joints(dataset.base.model.chain)
@@ -262,7 +261,6 @@ def _step(effect: ResidualStep, grams: Grams, where: str) -> Tried | None:
 
 
 def _response(torque: Array, effect: JointResponse, grams: Grams, where: str) -> Tried | None:
-    """Of a joint by its `torque` (n_rows, joints) or by its last motion."""
     dataset, i = grams.dataset, index(where)
     table, cell = dataset.table, dataset.base.model.cell
     if not all(recorded(table, need) for need in effect.needed(cell)):

@@ -344,7 +344,6 @@ TRIED = 3  # families that are tried, the best first, before a search is given u
 
 
 def _wider(found: FittedSum, more: Sequence[Component]) -> FittedSum:
-    """The sum with these as well, or what is left of them; as it is where that is no better."""
     wider = exchanged(found, [], more) if more else found
     return wider if wider.score > found.score + GAINED else found
 
@@ -571,7 +570,6 @@ def _kinds_that_show(
 
 
 def _with_together(dataset: DiagnosisData, without: Container[str]) -> DiagnosisData:
-    """The data with the effects, whose columns they have, that are judged in the sum alone."""
     base, kept = dataset.base, list(dataset.hypotheses)
     # Lines are sought as ripples are, whether or not one may be named.
     if GearSpectrum.name in without:

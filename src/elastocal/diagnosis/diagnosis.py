@@ -526,7 +526,6 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
 
 
 def _kept_back(has: str) -> str:
-    """What to do with a written cell that has more than the data can explain."""
     return (
         f"The cell that {option('cell_out')} writes has {has} only where it does better on poses "
         f"kept back (identify with {option('test')})."

@@ -290,7 +290,6 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
 
 
 def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
-    """Play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in dataset.hypotheses if h.name == Backlash.name]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
     likeliest = max(play, key=lambda h: float(grams.of(h).evidence(h.scales).max()))
@@ -568,7 +567,6 @@ class ForwardSelection:
         return np.concatenate([order[known[order]][:CLOSE], order[~known[order]][:CLOSE_BLOCKS]])
 
     def _reexamined(self, current: ModelSet, slots: list[Slot]) -> tuple[ModelSet, list[Slot]]:
-        """Every item against all that could stand in its place, the others given."""
         for _ in range(2):
             changed, k = False, 0
             while k < len(current.items):

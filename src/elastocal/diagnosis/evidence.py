@@ -214,7 +214,6 @@ class EntrySums:
 
     @cached_property
     def _of_configurations(self) -> EntrySums:
-        """The same for directions that do not differ within a configuration: v = 1."""
         return EntrySums(
             self.local.sum(axis=(1, 3), keepdims=True), self.H.sum(axis=2, keepdims=True),
             tuple(r._replace(of=r.of.sum(axis=1, keepdims=True)) for r in self.residuals),

@@ -613,7 +613,7 @@ class RegressorDirection:
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
         held = {} if searched else set_constants(effect, where, chain, cell)
-        u = effect.drive(self._arm, where, {**held, **fitted, **searched})
+        u = effect.motion(self._arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
         # Most directions ask for one or two numbers of a row: evaluated at thousands of settings,

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from elastocal.above import Result, checked_arguments
+from elastocal.above import DataFrame, Result, checked_arguments
 from elastocal.cell import Cell
 from elastocal.cell_tables import TEST_POSE
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
@@ -28,7 +28,7 @@ from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.messages import InsufficientDataError, length, option
 from elastocal.messages import require as check
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, measurements_of
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.information import lacks_noise, with_noise_of
 from elastocal.planning.plan import Gain, Plan
@@ -117,7 +117,7 @@ class NextPoses(Result):
 @checked_arguments
 def next_poses(
     model: Model | Cell | str | Path,
-    data: Measurements | str | Path,
+    data: Measurements | str | Path | DataFrame,
     *,
     batch: int = 5,
     require: float | None = None,
@@ -163,7 +163,7 @@ def next_poses(
     check(0 <= least_gain < 1, f"{option('least_gain')} takes a share from 0 to below 1")
     tell: Progress = progress or (lambda message: None)
     model = model if isinstance(model, Model) else Model(model)
-    table = data if isinstance(data, Measurements) else model.read(data)
+    table = measurements_of(model, "data", data)
     model = model.with_markers_of(table)
     asked = _asked(model.cell, table, batch, candidates)
     shares_of(asked, batch, "batch")  # each level takes a pose
@@ -193,7 +193,6 @@ def next_poses(
 
 
 def _asked(cell: Cell, table: Measurements, batch: int, candidates: int) -> Cell:
-    """The cell that asks for a batch in the table's load states, chosen for the test poses."""
     spec = cell.design
     return replace(cell, design=replace(
         spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,

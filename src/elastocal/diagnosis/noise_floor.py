@@ -21,6 +21,7 @@ from elastocal.diagnosis.baseline import (
     NoiseValues,
     NoisyData,
     Projection,
+    prior_deviations,
     project,
 )
 from elastocal.diagnosis.diagnosis import (
@@ -365,14 +366,22 @@ def first_steps(
     base, data, blocks = dataset.base, dataset.data, dataset.blocks
     rows, good = base.nominal.reshape(-1, blocks.size, 1).copy(), ~data.faulty
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(data, blocks.pack(rows)[:, :, 0], rng))]
-    # Stage by stage, effects of the later step held at nominal.
+    # Stage by stage, effects of the later step held at nominal, in the columns of the others too:
+    # what moves the load would else pass for the compliances under it.
     effects = {p.name: p.effect for p in base.model.parameters}
     stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
+    own = np.array([base.model.names.index(n) for n in dataset.fitted if n in effects], dtype=int)
     for k, name in ((1, "geometry"), (2, "compliance")):
         if not (stage == k).any():
             continue
         later = tuple(p for p, effect in effects.items() if stage_of(effect) > k)
-        part = replace(data, X=data.X[:, :, stage <= k], precision=data.precision[stage <= k])
+        X = data.X
+        if later:
+            x = np.where(np.isin(base.model.names, later), base.model.nominal, base.x)
+            B = base.model.regressor(base.observed.table, x, own, base.observed).B
+            B = B.reshape(len(good), blocks.size, -1) * prior_deviations(base)[own]
+            X = np.concatenate([blocks.pack(B), X[:, :, len(own) :]], axis=2)
+        part = replace(data, X=X[:, :, stage <= k], precision=data.precision[stage <= k])
         left = left_out_residual(project(part, noise.of_instrument()))
         few = data.n_rows < FEW * part.X.shape[2]
         with suppress(ElastocalError):

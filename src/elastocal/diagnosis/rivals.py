@@ -246,7 +246,6 @@ class Discrimination:
         self.classes = connected_components(self.apart < APART_AT_LAST, directed=False)[1]
 
     def _gram(self, chosen: Sequence[int]) -> Array:
-        """Gram matrix (w, w) of the data so far and the chosen candidates."""
         H = self.pool[list(chosen)].reshape(-1, len(self.known))
         return self.known + H.T @ H
 

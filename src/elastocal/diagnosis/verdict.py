@@ -165,7 +165,6 @@ class FewAnswer(SumAnswer):
         return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
 
     def _is_sought(self, what: Hypothesis | Generic) -> bool:
-        """Whether its geometry was looked for from many starts."""
         return isinstance(what, Hypothesis) and bool(what.starts(self.dataset.base.model))
 
     def _error_without(self, gone: Sequence[int]) -> Array:

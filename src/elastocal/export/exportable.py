@@ -523,7 +523,6 @@ def _commanded(table: Measurements, correction: JointCorrection) -> Measurements
 
 
 def _rms(kept: Kept, part: Valued, table: Measurements, commanded: Measurements) -> float:
-    """Distance in m, rms over markers and poses, from those of the arm."""
     own, its = (evaluate_pieces(a, kept.conditions).points[1:] for a in (kept.exported, part))
     off = points_of(part, commanded, its) - points_of(kept.full, table, own)
     apart = np.linalg.norm(off, axis=2)

@@ -322,7 +322,6 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
 
 
 def _beside_stated(key: str, found: list[tuple[noise_summary.NoiseSize, float]], fits: bool) -> str:
-    """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
     if not (said := listed([rounded(1e6 * size) for _, size in found if size])):
         return f"State it as [noise] {key} in the cell for design and simulate."
     if all(size.agrees_with(stated) for size, stated in found):

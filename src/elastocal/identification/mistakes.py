@@ -413,7 +413,6 @@ LARGEST = 10.0  # a fitted length, over that of the arm and the distance of the 
 
 
 def _placed(model: Model, table: Measurements) -> bool:
-    """Whether positions, if there are any, agree with the nominal arm at first sight."""
     if table.position is None or np.abs(table.position).max() > FARTHEST:
         return True
     some = table.take(np.arange(min(len(table), SAMPLE)))
@@ -475,7 +474,6 @@ def refuse_nonsense(
 
 
 def _length(model: Model, table: Measurements) -> float:
-    """Of the arm stretched out, with its tool and the ways of its slides, in m."""
     frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
     sliding = np.array([joint.kind == "prismatic" for joint in model.chain.joints], dtype=bool)
     tool = max((np.linalg.norm(m) for m in model.cell.tool.markers.values()), default=0.0)

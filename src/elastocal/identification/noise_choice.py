@@ -164,7 +164,6 @@ class NoisyReadings:
 
 
 def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
-    """The parts of single readings: those of the k-th of a cluster's different variances, each."""
     (C, M), (L, size) = members.shape, root.shape[1:3]
     own = index[members]  # (C, M, L)
     place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)

@@ -343,7 +343,6 @@ def prior_widths(problem: Problem) -> Array:
 
 
 def _whitened(part: Problem, x: Array) -> tuple[Array, Array]:
-    """B (n, size, free) and residual (n, size) of a part at x, whitened."""
     (B, e), shape = part.whitened(x, part.free), (len(part.index), part.observations.size)
     return B.reshape(*shape, -1), e.reshape(shape)
 

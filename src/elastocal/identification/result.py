@@ -565,6 +565,7 @@ class Calibration(scrutiny.FoundFit, Result, Mapping[str, Estimate]):
         """Sets of parameters side by side: held-out errors and restricted likelihoods."""
         return scrutiny.parameter_sets(self) if self._looks else ()
 
+    @checked_arguments
     def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""

@@ -237,14 +237,16 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     held, plain, likelihood = list[Array](), list[float](), list[float]()
     for _, own in sets.values():
         # Whole rows count by the fit's weights, whatever the set.
-        left, alone = _refitted(fit, y, np.flatnonzero(own), weights)
+        columns = np.flatnonzero(own)
+        B = _by_itself(fit, columns)
+        left, alone = _refitted(fit, y, B, weights)
         plain.append(rms_3d(left, size))
         held.append((alone.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
         # log density off the span of what is placed, the others varying by their typical sizes.
-        placed, others = own & (stage == 0), own & (stage > 0)
-        A, off = white[:, others] * typical[others], target
+        B, placed = weights.apply(B), stage[columns] == 0
+        A, off = B[:, ~placed] * typical[columns[~placed]], target
         if placed.any():
-            basis = linalg.qr(white[:, placed], mode="economic")[0]
+            basis = linalg.qr(B[:, placed], mode="economic")[0]
             A, off = A - basis @ (basis.T @ A), off - basis @ (basis.T @ off)
         at = Standardised.of(A.T @ A, A.T @ off, np.full(A.shape[1], 1 / np.sqrt(s2)))
         likelihood.append(-0.5 * (at.log_det + (float(off @ off) - at.explained) / s2))
@@ -266,8 +268,18 @@ def parameter_sets(fit: FoundFit) -> tuple[ParameterSet, ...]:
     return tuple(found)
 
 
-def _refitted(fit: FoundFit, y: Array, columns: IntArray, weights: Weights) -> tuple[Array, Array]:
-    B, observed = fit.B[:, columns], fit.observations
+def _by_itself(fit: FoundFit, columns: IntArray) -> Array:
+    """B (rows, columns) with what belongs to later stages at nominal: what moves the load would
+    else pass for the compliances under it."""
+    later = (fit.stage > fit.stage[columns].max(initial=0)) & (fit.x != fit.model.nominal)
+    if not later.any():
+        return fit.B[:, columns]
+    x, observed = np.where(later, fit.model.nominal, fit.x), fit.observations
+    return fit.model.regressor(observed.table, x, columns, observed).B
+
+
+def _refitted(fit: FoundFit, y: Array, B: Array, weights: Weights) -> tuple[Array, Array]:
+    observed = fit.observations
     left = y - B @ least_norm(weights.apply(B), weights.apply(y))
     return left, held_out_residual(B, left, weights, observed.configuration, observed.size)
 
@@ -354,9 +366,9 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
     in passing.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
-    at nominal, on the model linearised at the whole fit; each configuration is predicted by the fit
-    to the others, the last step as the result has it.  The first step is "nominal_arm", with base
-    and markers placed by the others.  Intervals are by resampling configurations.
+    at nominal, on the model linearised there; each configuration is predicted by the fit to the
+    others, the last step as the result has it.  The first step is "nominal_arm", with base and
+    markers placed by the others.  Intervals are by resampling configurations.
     """
     model = result.model
     large = len(result.residual) * len(result.determined) > MOST_BUDGETED
@@ -381,19 +393,17 @@ def gap_budget(result: FoundFit) -> ErrorBudget | None:
 
 
 def _fitted(result: FoundFit, columns: IntArray, held: BoolArray) -> Array:
-    """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
-    model linearised at the whole fit."""
-    model, B = result.model, result.B
+    """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
+    model, B = result.model, _by_itself(result, columns)
     weights = weights_for(result.observations, model.cell.tracker, "auto")
-    y = result.residual + B @ np.where(held, result.x - model.nominal, 0.0)
+    y = result.residual + result.B @ np.where(held, result.x - model.nominal, 0.0)
     if result.smooth and len(columns):
         # What has a prior in the whole fit has none here: a minimal complete set.
         own = tuple(model.parameters[c] for c in columns)
         sizes = np.array([p.typical or 1.0 for p in own])
         sigma = max(float(np.sqrt(np.mean(weights.apply(y) ** 2))), 1e-300)
-        kept = reduce(weights.apply(B[:, columns]), sizes, own, sigma, WORTH_A_COLUMN).kept
-        columns = columns[kept]
-    return _refitted(result, y, columns, weights)[1] if len(columns) else y
+        B = B[:, reduce(weights.apply(B), sizes, own, sigma, WORTH_A_COLUMN).kept]
+    return _refitted(result, y, B, weights)[1] if B.shape[1] else y
 
 
 def _floor(result: FoundFit) -> tuple[float | None, str]:

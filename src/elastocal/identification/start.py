@@ -463,7 +463,6 @@ def check_limits(model: Model, table: Measurements, mistake: Mistake | None = No
 
 
 def _check_units(model: Model, table: Measurements) -> None:
-    """Compare the extent of the readings with that of the nominal arm at the same joints."""
     if table.position is None:
         return
     if len(table) > SOME:  # some of many readings tell it as well

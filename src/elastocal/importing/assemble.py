@@ -286,7 +286,6 @@ def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
 
 
 def _loads_apart(points: Records, log: Records) -> Iterator[tuple[str, IntArray, IntArray]]:
-    """Each load of the points, and the rows of both under it."""
     loads = np.array(points.texts.get("load", [""] * len(points)), dtype=object)
     own = np.array(log.texts.get("load", ()) if "load" in points.texts else (), dtype=object)
     for load in dict.fromkeys(loads):
@@ -710,7 +709,6 @@ def _placed(points: Records) -> Iterator[None]:
 
 
 def _with_joint_values(points: Records, log: Records, joined: Joined) -> Records:
-    """The points that found joint values, with what else the log says there."""
     rows = np.flatnonzero(joined.row >= 0)
     pose = {} if joined.pose is None else {"configuration": [joined.pose[i] for i in rows]}
     own, theirs, stems = points.take(rows), log.take(joined.row[rows]), joint_stems(log.numbers)

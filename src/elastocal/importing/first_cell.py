@@ -255,7 +255,6 @@ def _joints(chain: Chain) -> Iterator[str]:
 
 
 def _tool(robot: Robot, reach: float, arm: MjcfArm | None) -> dict[str, str]:
-    """Load point and markers: those of the file, where `export` has put them there."""
     there: dict[str, Array] = {}
     if arm is not None:
         there = arm.tree.places(arm.base, arm.flange)

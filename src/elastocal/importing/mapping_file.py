@@ -362,7 +362,6 @@ def _unnamed(asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
 
 
 def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
-    """What * stands for in a header; columns in a unit of something else are not meant."""
     found = []
     for cell in header:
         unit = split_unit(cell)[1]
@@ -451,7 +450,6 @@ def _find(names: str, header: Sequence[str]) -> list[int]:
 
 
 def _with_unit(source: str, target: ColumnKey, units: UnitsTable, hint: str | None) -> ColumnKey:
-    """AUTO where nothing says it."""
     if target.unit == "":
         return target
     stated = split_unit(target.header)[1]

@@ -29,7 +29,7 @@ from elastocal.model.effects.base import (
     index,
     row_inputs,
 )
-from elastocal.model.effects.catalogue import CATALOGUE, SymbolicArm, cell_of, effect_of
+from elastocal.model.effects.catalogue import BUILT_IN, CATALOGUE, SymbolicArm, cell_of, effect_of
 from elastocal.model.effects.geometry import DistanceSensor
 from elastocal.model.evaluate import CHUNK, chosen_backend, row_blocks, thread_count
 from elastocal.model.observations import Observations, observe
@@ -115,7 +115,8 @@ class Model(ByValue):
             "[tracker] anchor_m = [x, y, z] in the data's frame",
         )
         chain = load_chain(cell)
-        self._assemble(chain, numbered(cell, chain), (), backend)
+        chosen = None if backend is None else chosen_backend(backend)
+        self._assemble(chain, numbered(cell, chain), (), chosen)
 
     @classmethod
     def assembled(
@@ -147,7 +148,6 @@ class Model(ByValue):
         return _arrived, made_of, {"_markers_stated": self._markers_stated}
 
     def _compared(self) -> Mapping[str, Any]:
-        """The robot's numbers and all that the cell says, but for names and places of files."""
         cell = {k: v for k, v in vars(self.cell).items() if k not in ("name", "path", "robot")}
         extra = [(effect.name, place) for effect, place in self._extra]
         return cell | {"chain": self.chain, "extra": extra, "backend": self.symbolic.backend}
@@ -444,7 +444,7 @@ class Model(ByValue):
         chosen = tuple(range(len(x))) if columns is None else tuple(int(c) for c in columns)
         observed = observations or observe(table, self.observe)
         h, B = self.symbolic.regressor(row_inputs(self.symbolic.arm, table), x, columns=chosen)
-        check_equilibrium(table, h)
+        check_equilibrium(self, table, h)
         prediction = observed.apply(h).ravel()
         return Regression(observed.apply(B).reshape(len(prediction), -1), prediction, observed)
 
@@ -476,11 +476,25 @@ class Model(ByValue):
         return self.symbolic.frames(*inputs, x, self.symbolic.equilibrium(inputs, x)[0])
 
 
+def measurements_of(model: Model, name: str, given: object) -> Measurements:
+    """What a function takes as its argument of that name: measurements, or their table."""
+    if isinstance(given, Measurements):
+        return given
+    told = "takes measurements (Model.read, Model.table) or the path of their table; found"
+    known = isinstance(given, str | Path) or hasattr(given, "to_csv")
+    require(known, f"{option(name)} {told} {type(given).__name__}")
+    return model.read(given)
+
+
 NOMINAL = "check force_*_N and [model.nominal] joint_compliance, which is in rad/(N m)"
 
 
-def check_equilibrium(table: Measurements, predicted: Array, remedy: str = NOMINAL) -> None:
+def check_equilibrium(
+    model: Model, table: Measurements, predicted: Array, remedy: str = NOMINAL
+) -> None:
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
+    added = {p.effect for p in model.parameters} - BUILT_IN
+    remedy += f"; or {listed(sorted(added))} of a plug-in gives no number there" * bool(added)
     for i in bad[:1]:
         raise InputError(
             f"{table.source}, line {table.row[i]}: no static equilibrium under this load "

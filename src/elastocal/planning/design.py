@@ -218,7 +218,6 @@ class _Design:
             )
 
     def _leave_out(self) -> None:
-        """Smooth functions, and effects of what a pose has only once it stands in an order."""
         cell, self.fixed = self.model.cell, self.options.fixed
         done = self.options.done is not None
         effects = dict.fromkeys(c.name for c in cell.model.effects)
@@ -338,7 +337,6 @@ class _Design:
         return Gain.of(setup.target_rows, setup.prior, M, options.seed)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
-        """Poses (L,) to choose per level, beside those that stay."""
         shares = shares_of(self.cell, n_poses) - self.pinned
         require(
             bool((shares >= 0).all() and shares.any()),

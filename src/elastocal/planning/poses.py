@@ -740,7 +740,6 @@ def _carrying(cell: Cell, point: Array) -> Array:
 
 
 def _with_points(model: Model, points: Array) -> Model:
-    """The same arm with test points (k, 3) as markers whose place on the flange is known."""
     cell = model.cell
     # Effects act where they do on the model as it is, without the test points.
     active = choose_effects(model.chain, cell)

@@ -170,7 +170,6 @@ class Space:
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
 
     def _box(self) -> Array:
-        """Corners (2, 3) around everything that is drawn, with room for arrows."""
         every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
         every = np.vstack([every, *self.bodies])
         low, high = every.min(axis=0), every.max(axis=0)
@@ -425,7 +424,6 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
 
 
 def _draw_around(axes: Axes, space: Space, view: Array, whole: bool) -> None:
-    """Obstacles; where `whole` with their names, and keep-out planes that stand upright."""
     for shell in space.around:
         points = shell.points @ view.T
         _fill(axes, points, FAINT, 0.25)

@@ -489,7 +489,6 @@ class Residuals:
     def _over(
         self, axes: Axes, x: Array, shown: IntArray, size: float, lines: Sequence[str]
     ) -> None:
-        """Of positions over x (observations,): dots of the `shown`, running means of all."""
         level(axes, reach(self.lengths))
         for k, v in enumerate(self.lengths.T):
             dots(axes, x[shown], v[shown], SERIES[k], size)

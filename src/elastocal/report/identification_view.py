@@ -317,7 +317,6 @@ def spread_table(
 
 
 def _influence_table(result: Calibration) -> say.ShownTable:
-    """By Cook's distance; configurations without others to judge them first."""
     found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
     rows = [
         (
@@ -521,7 +520,6 @@ def _numbers(
     title: str, names: list[str], found: Sequence[Estimate | Combination],
     truth: list[float | None] | None, after: dict[str, list[str]],
 ) -> say.ShownTable:  # fmt: skip
-    """With true values where known, and columns `after`."""
     lopsided = any(
         e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
     )

@@ -168,7 +168,6 @@ def _weighted(plan: Plan) -> bool:
 
 
 def _rho(plan: Plan) -> float:
-    """ρ₀ in µm, also where the criterion weighs it with the error elsewhere."""
     e = plan.everywhere
     return plan.reported if e is None or not e.share else e.test_poses * 1e6
 
@@ -424,6 +423,7 @@ def next_lines(found: NextPoses) -> Told:
     doubts = [
         f"{say.effect_at_places(effect, [where])} ({say.probability(p)})"
         for effect, where, p in found.doubts[:3]
+        if not say.probability(p).startswith("<")
     ]
     if doubts:
         rivals = found.diagnosis is not None and found.diagnosis.open

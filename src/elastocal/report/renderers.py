@@ -31,6 +31,7 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal import __version__
+from elastocal.above import checked_arguments
 from elastocal.files import atomic_write, check_output, open_input
 from elastocal.measurements import in_file_units, joint_columns
 from elastocal.messages import (
@@ -415,13 +416,14 @@ def html(result: object) -> str:
     return html_of(blocks_of(result), 4, pictures=False)
 
 
+@checked_arguments
 def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) -> Any:
     """matplotlib's, in the place of `ax` where that is given, or of the arm plotly's where
     `interactive`."""
     folds = [block for block in blocks_of(result) if isinstance(block, say.Fold)]
     every = [name for fold in folds for name in fold.figures]
     arms = [name for name in every if name in ("space", "poses")]
-    chosen = kind or DEFAULTS.get(type(result).__name__, every[0])
+    chosen = DEFAULTS.get(type(result).__name__, every[0]) if kind is None else kind
     if interactive and kind is None and arms:
         chosen = arms[0]
     opened = say.unfolded(folds, lambda fold: chosen in fold.figures)
@@ -463,7 +465,6 @@ def frame(result: object) -> pd.DataFrame:
 
 
 def _estimates(result: Calibration) -> list[dict[str, Any]]:
-    """One row per parameter, SI units: NaN where the data do not determine it alone."""
     none = math.nan, math.nan
     return [
         {
@@ -479,7 +480,6 @@ def _estimates(result: Calibration) -> list[dict[str, Any]]:
 
 
 def _plan_frame(plan: Plan | None) -> dict[str, Any]:
-    """One row per pose: joints in ° or mm, place in the order, and the load where it states one."""
     if plan is None:
         return {}
     columns: dict[str, Any] = {"configuration": list(plan.configurations)}
@@ -513,7 +513,6 @@ def _candidates(d: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _commands(c: Compensation) -> pd.DataFrame:
-    """One row per target: the columns of the commands file, NaN where a target is not reached."""
     import pandas as pd
 
     from elastocal.compensation import commands_csv

@@ -6,7 +6,8 @@
 for (const element of document.querySelectorAll("p, dd, li, figcaption")) {
   for (const node of element.childNodes) {
     if (node.nodeType !== Node.TEXT_NODE) continue;
-    node.data = node.data.replace(/(\d) (?=([µm]?m|µ?rad|mrad|%|N|s|h|min|ppm)(?![\w/]))/g, "$1\u00a0");
+    const units = /(?<=\d) (?=([µm]?m|µ?rad|mrad|%|N|s|h|min|ppm)(?![\w/]))|(?<=[≤<±]) (?=\d)/g;
+    node.data = node.data.replace(units, "\u00a0");
   }
 }
 

@@ -666,7 +666,6 @@ def _xml(text: str) -> str:
 
 
 def _quantity(name: str, value: float | None, unit: str, expanded: float | None = None) -> str:
-    """A value with its expanded uncertainty, k = 2; none where there is no value."""
     what, name = "<dcc:noQuantity/>", _xml(name)
     if value is not None:
         what = REAL % (value, unit, "" if expanded is None else COVERED % (expanded, K))

@@ -21,7 +21,6 @@ KR270_CHAIN = read_urdf(KR270)
 
 
 def breaking(verdict: PoseFeasibility) -> dict[str, int]:
-    """Candidates that break each rule, whatever the others."""
     return dict(zip(verdict.rules, verdict.broken.sum(axis=0).tolist(), strict=True))
 
 
@@ -66,12 +65,10 @@ def gantry_rules(
 
 
 def gantry_at(*positions: tuple[float, float, float]) -> np.ndarray:
-    """Joint values that bring the flange to these positions."""
     return np.hstack([np.array(positions, dtype=float), np.zeros((len(positions), 1))])
 
 
 def broken(feasibility: Feasibility, q: np.ndarray, force: np.ndarray) -> list[set[str]]:
-    """The rules that each pose breaks."""
     verdict = feasibility.check(q, force)
     return [{r for r, hit in zip(verdict.rules, row, strict=True) if hit} for row in verdict.broken]
 

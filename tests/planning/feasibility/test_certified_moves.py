@@ -31,7 +31,6 @@ BALL = Workspace(bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),), clearanc
 
 
 def dense(rules, start, end, n=250):
-    """Poses all along a move."""
     return start + np.linspace(0, 1, n)[:, None] * (end - start)
 
 

@@ -96,7 +96,6 @@ def test_static_torque_is_pinocchios_gravity_and_the_transposed_jacobian(seed, t
 
 
 def reference_torque(chain, load_point, q, force):
-    """g(q) − Jᵀ f by pinocchio."""
     model, parent = pin.Model(), 0
     for i, joint in enumerate(chain.joints):
         kind = (

@@ -49,7 +49,6 @@ def execution_of(chain, **motion):
 
 
 def planned(execution):
-    """Joint values of every move, from the execution itself."""
     home = execution.motion.home
     moves = [] if home is None else [home]
     for stop in execution.stops:

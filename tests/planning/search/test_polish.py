@@ -66,7 +66,6 @@ class Case:
         return draw(self.rules, self.information.forces, n, 0)
 
     def criterion(self, name: str) -> ScenarioCriterion:
-        """`name` on three test poses."""
         p = len(self.information.columns)
         q = np.array([[0.0, 0.3, -0.5, 0.4], [0.5, -0.4, 1.0, 0.2], [0.0, -1.2, 1.5, -1.0]])
         A = self.information.blocks(q)[:, -3:] * SIGMA

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell import Cell
-from elastocal.files import check_registered
+from elastocal.files import REGISTERED, check_registered
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
 from elastocal.messages import InputError, listed, option, require
 from elastocal.model import rigid
@@ -44,6 +44,11 @@ class ParameterSpec:
     upper: float = np.inf
     shrunk: bool = False
     alike: str = ""
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.nominal) and (self.typical is None or 0 < self.typical < np.inf)):
+            told = "takes a finite nominal value, and a typical size above 0 or None; found"
+            raise ValueError(f"the parameter '{self.key}' {told} {self.nominal}, {self.typical}")
 
 
 @dataclass(frozen=True)
@@ -657,8 +662,20 @@ class DrivenEffect(Effect):
         """The entry that u acts on, which is another one at some places of few effects."""
         return self.entry
 
+    def motion(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        """`drive`, which of a plug-in need not return what it has to."""
+        u = self.drive(arm, place, p)
+        if type(self) in REGISTERED:
+            shape = (self.entry_at(place).size * len(self.entered_at(place, arm.chain)), 1)
+            own = ca.vertcat(*(p[s.key] for s in self.parameters(place, arm.chain, arm.cell)))
+            right = isinstance(u, ca.SX) and u.shape == shape and ca.is_linear(u, own)
+            if not (right and ca.substitute(u, own, 0 * own).is_zero()):
+                told = "linear in the parameters p and zero where they are"
+                raise ValueError(f"drive() returns an expression of shape {shape}, {told}")
+        return u
+
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         places, entry = self.entered_at(place, arm.chain), self.entry_at(place)
-        motions = ca.vertsplit(self.drive(arm, place, p), entry.size)
+        motions = ca.vertsplit(self.motion(arm, place, p), entry.size)
         for where, u in zip(places, motions, strict=True):
             entry.enter(arm, where, u)
