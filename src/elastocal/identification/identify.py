@@ -73,7 +73,7 @@ from elastocal.identification.start import (
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
-from elastocal.messages import ElastocalError, option, said_of
+from elastocal.messages import ElastocalError, InputError, listed, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
@@ -165,6 +165,13 @@ def _course(
         covariance = _of_readings(options.covariance, good, observed.size)
         weights = weights_for(some, model.cell.tracker, kind, covariance)
         problem = posed(model, some, weights, x0, own)
+        if problem.large and (options.method in ROBUST or options.noise != "auto"):
+            asked = f"method {options.method}"
+            asked = asked if options.noise == "auto" else f"noise model '{options.noise}'"
+            raise InputError(
+                f"the {asked} takes no table of this size; use the default method, which excludes "
+                "outliers and scales stated or equal noise to the residual"
+            )
         solution = solve(problem, progress, not smooth)
         if some.kind == "pose" and weights.kind == "none" and kind == "auto":
             # Without stated noise, metres and radians get their relative weight from a first fit.
@@ -520,11 +527,26 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         text = "profile of the nonlinear sum of squares (all readings independent)"
         return replace(classical, kind=kind, description=text, ends=own.ends)
 
+    table, lead, size = (
+        problem.observations.table,
+        problem.observations.lead,
+        problem.observations.size,
+    )
+
     def rows(part: Problem) -> Rows:
         (B, e), own = part.whitened(fit.x, fit.columns), part.observations
         return B @ V, e, part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
 
-    return clustered(problem.each(rows), V, kind.upper())
+    def named(cluster: int) -> str:
+        if kind[0] == "h":
+            return f"the reading of line {table.row[lead[cluster // size]]}"
+        return f"configuration {table.configuration_labels[cluster]}"
+
+    found = clustered(problem.each(rows), V, kind.upper(), named)
+    if lone := [problem.model.names[c] for c in fit.columns[found.dof == 0]]:
+        told = f"{found.description}; a single configuration determines {listed(lone, 4)}"
+        found = replace(found, description=told)
+    return found
 
 
 COMPUTED = (
@@ -591,9 +613,10 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
         held, solution, noise = {}, found.solution, found.noise
         fit, parameters = solution.fit, solution.problem.model.parameters
         for k, c in enumerate(solution.reduction.kept.tolist()):
-            p, (terms, *_, (low, high)) = parameters[c], found.told(k)
+            p, (terms, _, dof, (low, high)) = parameters[c], found.told(k)
             beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
-            if beyond and not p.shrunk and not terms:
+            # Without a degree of freedom it is the interval that is not known.
+            if beyond and dof > 0 and not p.shrunk and not terms:
                 limits.setdefault(c, (low, high))
             if c not in limits or not fitted:
                 continue

@@ -96,6 +96,11 @@ class Options:
         if self.method == "wls" and self.weights == "none":
             raise InputError("the method wls needs weights; for none, choose the method ols")
         stated = self.weights != "auto" or self.covariance is not None
+        if self.covariance is not None and self.weights not in ("auto", "covariance"):
+            raise InputError(
+                f"{option('covariance')} goes with {option('weights', 'covariance')}; found "
+                f"{quoted(self.weights)}, leave one of the two out"
+            )
         if stated and self.weights != "none" and self.resolved not in ("wls", *ROBUST):
             raise InputError(
                 f"the method {self.resolved} does not take stated weights; choose the method wls"
