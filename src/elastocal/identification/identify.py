@@ -274,6 +274,7 @@ def summarise(
     faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage = solution.crossed
+    there = np.isfinite(heldout)  # under a drift one that is not would reach all
     plainly_large = problem.large and solution.held is None
     report = None
     if not every.exact:
@@ -291,7 +292,8 @@ def summarise(
         excluded=faulty if set_apart else (), warnings=(),
         residual_summary=summarise_residuals(
             observed, final.whitened, None if plainly_large else leverage,
-            weights.apply(heldout), absolute=weights.absolute,
+            np.where(there, weights.apply(np.where(there, heldout, 0.0)), np.inf),
+            absolute=weights.absolute,
         ),
         faulty_report=report, active=found.active, prior_share=found.prior_share,
         smooth=found.smooth, left=left_open(own_sizes, found.limits), copies=copies,

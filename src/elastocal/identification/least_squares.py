@@ -360,7 +360,8 @@ def left_out(
         gap, alone = np.eye(share.shape[1]) - share, np.zeros(len(share), dtype=bool)
         # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
         heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
-        alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
+        if len(heavy):  # none where constraints hold all columns
+            alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
         gap[alone] = np.eye(share.shape[1])
         own = e[rows][..., None]
         moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)
