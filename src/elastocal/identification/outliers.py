@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, sparse, special
 
 from elastocal.identification.least_squares import (
+    ALONE,
     Covariance,
     clustered,
     f_test,
@@ -126,9 +127,6 @@ def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
 def named_runs(lines: list[int]) -> list[str]:
     """The same in words: "142–507", "610"."""
     return [str(a) if a == b else f"{a}–{b}" for a, b in blocks(lines)]
-
-
-ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
 class FitToGood:

@@ -309,11 +309,8 @@ def start_values(
         return _distance_start(model, table, x, movable)
     if table.position is None:
         return x
-    places = {
-        p.where
-        for i, p in enumerate(model.parameters)
-        if i in movable and p.effect in (BaseFrame.name, MarkerPosition.name)
-    }
+    fitted = (model.parameters[i] for i in movable)
+    places = {p.where for p in fitted if p.effect in (BaseFrame.name, MarkerPosition.name)}
     if not places:
         return x
     names = list(model.cell.tool.markers)
@@ -350,9 +347,8 @@ def start_values(
         for name, xyz in values.items()
         for k, v in zip("xyz", xyz, strict=True)
     }
-    for i, parameter in enumerate(model.parameters):
-        if parameter.name in of and i in movable:
-            x[i] = of[parameter.name]
+    for i in movable:
+        x[i] = of.get(model.names[i], x[i])
     return x
 
 
