@@ -507,8 +507,8 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     fit, problem = solution.fit, solution.problem
     if kind == "auto" and noise is not None:
         return noise.covariance
+    observed, table = problem.observations, problem.observations.table
     if kind == "auto" and problem.large:
-        observed = problem.observations
         enough = len(observed.lead) > observed.n_configurations >= ENOUGH * len(fit.columns)
         kind = "cr1" if enough else kind
     sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
@@ -529,24 +529,19 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         text = "profile of the nonlinear sum of squares (all readings independent)"
         return replace(classical, kind=kind, description=text, ends=own.ends)
 
-    table, lead, size = (
-        problem.observations.table,
-        problem.observations.lead,
-        problem.observations.size,
-    )
-
     def rows(part: Problem) -> Rows:
         (B, e), own = part.whitened(fit.x, fit.columns), part.observations
         return B @ V, e, part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
 
     def named(cluster: int) -> str:
         if kind[0] == "h":
-            return f"the reading of line {table.row[lead[cluster // size]]}"
+            return f"the reading of line {table.row[observed.lead[cluster // observed.size]]}"
         return f"configuration {table.configuration_labels[cluster]}"
 
     found = clustered(problem.each(rows), V, kind.upper(), named)
     if lone := [problem.model.names[c] for c in fit.columns[found.dof == 0]]:
-        told = f"{found.description}; a single configuration determines {listed(lone, 4)}"
+        one = "reading" if kind[0] == "h" else "configuration"
+        told = f"{found.description}; a single {one} determines {listed(lone, 4)}"
         found = replace(found, description=told)
     return found
 
