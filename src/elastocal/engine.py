@@ -72,24 +72,15 @@ class Pack:
     def of(self) -> IntArray:
         return np.concatenate([part.of for part in self.parts], axis=1)
 
-    @cached_property
-    def alike(self) -> bool:
-        """Whether the parts of all clusters have the same numbers."""
-        return bool((self.of == self.of[:1]).all())
-
     def added(self, values: Array, K: int) -> Array:
         """Sums (K, …) of `values` (C, k, …) by the numbers of the variances."""
-        of = self.of
-        if self.alike:
-            of, values = of[:1], values.sum(axis=0, keepdims=True)
-        n = of.size
+        of, n = self.of, self.of.size
         sums = sparse.csr_array((np.ones(n), (of.ravel(), np.arange(n))), shape=(K, n))
         return np.asarray(sums @ values.reshape(n, -1)).reshape(K, *values.shape[2:])
 
     def pairs(self, values: Array, K: int) -> Array:
         """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
-        of = self.of[: len(values)]
-        at = (of[:, :, None] * K + of[:, None, :]).ravel()
+        at = (self.of[:, :, None] * K + self.of[:, None, :]).ravel()
         return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
     def V(self, theta: Array) -> Array:
@@ -179,15 +170,10 @@ class Mixed:
         return int(sum((~pack.absent).sum() for pack in self.packs))
 
     def whitened(self, theta: Array) -> tuple[tuple[Whitened, ...], Products, float]:
-        """The packs under V, sums of products over their rows, and Σ log|V|; those of the last
-        state, once, where they are asked for again.
+        """The packs under V, sums of products over their rows, and Σ log|V|.
 
         Raises LinAlgError where V is not positive definite.
         """
-        last = vars(self).pop("_last", None)
-        if last is not None and np.allclose(last[0], theta, ROUNDING, 0.0):
-            return last[1]
-        del last
         packs, p = tuple(Whitened(pack, theta) for pack in self.packs), len(self.precision)
         M, z, squares = np.zeros((p, p)), np.zeros(p), 0.0
         for w in packs:
@@ -200,8 +186,7 @@ class Mixed:
     def state(self, theta: Array) -> State:
         """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
         without a prior depend on each other."""
-        packs, sums, value = found = self.whitened(theta)
-        vars(self)["_last"] = theta, found
+        packs, sums, value = self.whitened(theta)
         known, M, z = self.precision > 0, sums.M.copy(), sums.z
         # A little more than the prior: what others show as well must not drown in rounding.
         M[np.diag_indices_from(M)] += self.precision + ROUNDING * known * np.diag(M)
@@ -231,9 +216,6 @@ class Mixed:
             Ku = np.concatenate([part.times(u) for part in pack.parts], axis=1)
             slope += pack.added(theta * (trace - (Ku @ u[..., None])[..., 0]), K)
             own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
-            if pack.alike:  # as if they were one cluster: one product, not one for each
-                own = own.swapaxes(0, 1).reshape(1, own.shape[1], -1)
-                H = H.reshape(1, own.shape[2], H.shape[2])
             information += pack.pairs(own @ own.transpose(0, 2, 1), K)
             if H.shape[2]:
                 seen += pack.added(own @ H, K)

@@ -331,11 +331,18 @@ def by_rows(table: Measurements) -> Array:
 FOLLOWING = 3.3  # standard deviations of chance: one joint in a thousand
 
 
+def poses_in_turn(table: Measurements) -> Array:
+    """Joint values (n, joints) of the poses in the order of the rows; what only load, marker or
+    repeat tell apart counts once."""
+    moves = np.abs(np.diff(table.q, axis=0)).max(axis=1, initial=0.0) > 0
+    return table.q[np.append(True, moves)[: len(table)]]
+
+
 def in_any_order(table: Measurements) -> bool:
     """Whether no joint's value goes with the row: where it does (a grid, a sorted table), what
     changes between rows is not to be told from what depends on the pose.  The correlation of
-    successive visits' values; √n ρ is N(0, 1) in random order."""
-    q = table.q[np.unique(first_of_visit(table))]
+    successive poses' values; √n ρ is N(0, 1) in random order."""
+    q = poses_in_turn(table)
     q = q - q.mean(axis=0)
     square = (q**2).sum(axis=0)
     moved = square > 0

@@ -13,6 +13,7 @@ import pytest
 import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell_tables import EffectChoice
+from elastocal.measurements import in_any_order
 from elastocal.model.effects.catalogue import effect_of
 
 CASES = Path(__file__).parents[1] / "cases"
@@ -75,6 +76,7 @@ def test_in_a_sorted_table_a_step_is_no_jump() -> None:
     """What changes from row to row there may be the pose."""
     case = CASES / "jump_untimed"
     table = ec.Model(case / "cell.toml").read(case / "train.csv")
+    assert in_any_order(table.take(np.repeat(np.arange(len(table)), 2)))  # each pose twice
     by_joint_1 = np.lexsort((table.configuration, table.q[:, 0]))
     moved = replace(table.take(by_joint_1), row=table.row, move=None, direction=None)
     why = ec.diagnose(case / "cell.toml", moved)

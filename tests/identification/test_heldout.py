@@ -7,7 +7,7 @@ from support.calibration import cell_of, measured, planar_chain, table_at, true_
 from support.cells import random_poses
 
 from elastocal.cell_tables import Nominal
-from elastocal.identification.identify import identify
+from elastocal.identification.identify import Options, identify
 from elastocal.identification.least_squares import held_out_residual, predicts_better
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
@@ -64,7 +64,7 @@ def test_a_wider_set_is_needed_where_the_parameters_it_adds_are_something():
     assert sum(needed(6.0) for _ in range(50)) > 35
 
 
-def of_one_angle(effects, apart, forces, **given):
+def of_one_angle(effects, apart, forces, kind="auto", **given):
     """An arm whose joint 2 stands at one angle, `apart` rad about it, but in pose 4."""
     chain, rng = planar_chain(), np.random.default_rng(1)
     model = Model.assembled(chain, cell_of(effects, **given))
@@ -72,20 +72,21 @@ def of_one_angle(effects, apart, forces, **given):
     q[:, 1] = -0.5 + apart * rng.normal(size=12)
     q[4, 1] = 0.7
     table, truth = table_at(q, forces), true_values(model, rng)
-    result = identify(model, measured(model, table, truth, 2e-5, rng))
+    result = identify(model, measured(model, table, truth, 2e-5, rng), Options(intervals=kind))
     return result, np.repeat(table.configuration == 4, 3)
 
 
 def test_a_level_measured_once_has_no_held_out_residual():
     """Joint 2's compliance at a level that only one configuration visits."""
-    levels, nominal = {"joint2": (-0.5, 0.7)}, Nominal(joint_compliance=(1e-5,) * 3)
-    given = {"compliance_levels": levels, "nominal": nominal}
-    effects, forces = ("base_frame", "joint_compliance"), [[0, 0, 0], [0, 0, -300]]
-    result, alone = of_one_angle(effects, 0.0, forces, **given)
+    given = {"compliance_levels": {"joint2": (-0.5, 0.7)}, "forces": [[0, 0, 0], [0, 0, -300]]}
+    given |= {"nominal": Nominal(joint_compliance=(1e-5,) * 3), "apart": 0.0}
+    result, alone = of_one_angle(("base_frame", "joint_compliance"), **given)
     assert "joint2.compliance_level2" in result.determined
     assert np.isinf(result.held_out[alone]).all() and np.isfinite(result.held_out[~alone]).all()
     assert np.isinf(result.heldout_rms) and result.to_json()["heldout_rms_um"] is None
     assert any("Some configuration alone determines" in w for w in result.warnings)
+    known = of_one_angle(("base_frame", "joint_compliance"), kind="cr2", **given)[0]
+    assert known["joint2.compliance_level2"].value is not None and known.predicted is None
 
 
 def test_a_pose_that_hardly_any_other_replaces_is_predicted_with_typical_sizes():

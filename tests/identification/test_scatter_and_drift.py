@@ -11,7 +11,6 @@ from elastocal.cell_tables import CartesianNoise, Tracker, Unsteadiness
 from elastocal.identification.findings import judged, warning_sentences
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import LASTING as TRIED
-from elastocal.identification.noise_structure import in_random_order
 from elastocal.identification.start import Options
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
@@ -106,7 +105,6 @@ def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of
     assert "record times" in told.remedy
     along = identified(drift=DRIFT, timed=False, ordered=True, stated=False)
     assert along.finding("drift") is None
-    assert not in_random_order(along.observations.table)
     # Whoever states one knows that it is there.
     assert identified(drift=DRIFT, timed=False, ordered=True).finding("drift") is not None
 

@@ -356,7 +356,7 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
     # A rigid body's place is six numbers in each load state, however many markers it has and
     # however often they are read.
     observed, table, lead = result.observations, result.observations.table, result.observations.lead
-    code = numbered(observed.configuration, *np.round(table.force[lead], 3).T)
+    code = numbered(observed.configuration, observed.load)
     seen = code[np.unique(numbered(code, table.marker[lead]), return_index=True)[1]]
     size = 1 if observed.kind == "distance" else observed.size
     equations = int(np.minimum(size * np.bincount(seen), 6).sum())

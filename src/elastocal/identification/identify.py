@@ -73,7 +73,7 @@ from elastocal.identification.start import (
 )
 from elastocal.identification.weighted_problem import PriorRows, Problem, Weights, weights_for
 from elastocal.measurements import NEVER_YET, Measurements, numbered, order_contradicted
-from elastocal.messages import ElastocalError, option, said_of
+from elastocal.messages import ElastocalError, InputError, listed, option, said_of
 from elastocal.model.calibrated import Scatter, ShownPoses
 from elastocal.model.effects.base import Parameter
 from elastocal.model.effects.catalogue import effect_of
@@ -165,6 +165,13 @@ def _course(
         covariance = _of_readings(options.covariance, good, observed.size)
         weights = weights_for(some, model.cell.tracker, kind, covariance)
         problem = posed(model, some, weights, x0, own)
+        if problem.large and (options.method in ROBUST or options.noise != "auto"):
+            asked = f"method {options.method}"
+            asked = asked if options.noise == "auto" else f"noise model '{options.noise}'"
+            raise InputError(
+                f"the {asked} takes no table of this size; use the default method, which excludes "
+                "outliers and scales stated or equal noise to the residual"
+            )
         solution = solve(problem, progress, not smooth)
         if some.kind == "pose" and weights.kind == "none" and kind == "auto":
             # Without stated noise, metres and radians get their relative weight from a first fit.
@@ -267,6 +274,7 @@ def summarise(
     faulty = describe(every, solution, ~found.good)
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     heldout, leverage = solution.crossed
+    there = np.isfinite(heldout)  # under a drift one that is not would reach all
     plainly_large = problem.large and solution.held is None
     report = None
     if not every.exact:
@@ -284,7 +292,8 @@ def summarise(
         excluded=faulty if set_apart else (), warnings=(),
         residual_summary=summarise_residuals(
             observed, final.whitened, None if plainly_large else leverage,
-            weights.apply(heldout), absolute=weights.absolute,
+            np.where(there, weights.apply(np.where(there, heldout, 0.0)), np.inf),
+            absolute=weights.absolute,
         ),
         faulty_report=report, active=found.active, prior_share=found.prior_share,
         smooth=found.smooth, left=left_open(own_sizes, found.limits), copies=copies,
@@ -498,8 +507,8 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
     fit, problem = solution.fit, solution.problem
     if kind == "auto" and noise is not None:
         return noise.covariance
+    observed, table = problem.observations, problem.observations.table
     if kind == "auto" and problem.large:
-        observed = problem.observations
         enough = len(observed.lead) > observed.n_configurations >= ENOUGH * len(fit.columns)
         kind = "cr1" if enough else kind
     sigma, dof = residual_sigma(fit, len(fit.columns)), len(fit.whitened) - len(fit.columns)
@@ -524,7 +533,17 @@ def spread_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) ->
         (B, e), own = part.whitened(fit.x, fit.columns), part.observations
         return B @ V, e, part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
 
-    return clustered(problem.each(rows), V, kind.upper())
+    def named(cluster: int) -> str:
+        if kind[0] == "h":
+            return f"the reading of line {table.row[observed.lead[cluster // observed.size]]}"
+        return f"configuration {table.configuration_labels[cluster]}"
+
+    found = clustered(problem.each(rows), V, kind.upper(), named)
+    if lone := [problem.model.names[c] for c in fit.columns[found.dof == 0]]:
+        one = "reading" if kind[0] == "h" else "configuration"
+        told = f"{found.description}; a single {one} determines {listed(lone, 4)}"
+        found = replace(found, description=told)
+    return found
 
 
 COMPUTED = (
@@ -591,9 +610,10 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
         held, solution, noise = {}, found.solution, found.noise
         fit, parameters = solution.fit, solution.problem.model.parameters
         for k, c in enumerate(solution.reduction.kept.tolist()):
-            p, (terms, *_, (low, high)) = parameters[c], found.told(k)
+            p, (terms, _, dof, (low, high)) = parameters[c], found.told(k)
             beyond = low <= p.lower < np.inf or -np.inf < p.upper <= high
-            if beyond and not p.shrunk and not terms:
+            # Without a degree of freedom it is the interval that is not known.
+            if beyond and dof > 0 and not p.shrunk and not terms:
                 limits.setdefault(c, (low, high))
             if c not in limits or not fitted:
                 continue

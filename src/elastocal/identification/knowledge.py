@@ -32,7 +32,7 @@ from elastocal.engine import least_norm
 from elastocal.messages import (
     InputError,
     InsufficientDataError,
-    did_you_mean,
+    check_known,
     listed,
     option,
     quoted,
@@ -286,11 +286,7 @@ def combination(entry: Entry) -> dict[str, float]:
 
 
 def _index(name: str, position: Mapping[str, int], where: str) -> int:
-    require(
-        name in position,
-        f"{where}: {quoted(name)} is not a parameter{did_you_mean(name, position)}; "
-        f"there are {listed(position)}",
-    )
+    check_known(name, position, f"{where}: {quoted(name)} is not a parameter")
     return position[name]
 
 
@@ -373,11 +369,7 @@ class GaussianPrior:
         root = self._root()
         P = np.zeros((len(self.names), len(position)))
         for name in self.names:
-            require(
-                name in position,
-                f"the prior names {quoted(name)}, which is not a parameter"
-                f"{did_you_mean(name, position)}; there are {listed(position)}",
-            )
+            check_known(name, position, f"the prior names {quoted(name)}, which is not a parameter")
         P[:, [position[name] for name in self.names]] = root
         return P, root @ self.mean
 

@@ -3,11 +3,12 @@ assumptions on the errors, and what it would predict of readings that had been l
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import Problem, Weights, same_size
@@ -194,10 +195,15 @@ DESCRIPTION = {
 }
 
 
-Rows = tuple[Array, Array, IntArray]  # Q_c and e_c of whole clusters, and the cluster of each
+Rows = tuple[Array, Array, NDArray[Any]]  # Q_c and e_c of whole clusters, and the cluster of each
 
 
-def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
+def clustered(
+    parts: Iterable[Rows],
+    V: Array,
+    kind: str,
+    named: Callable[[Any], str] = "configuration {}".format,
+) -> Covariance:
     """Covariance of x̂ that allows any correlation within a cluster (equations above), of rows in
     parts, Q = B V with V Vᵀ = (BᵀB)⁻¹ and e = y − B x̂ the least-squares residual, whitened; HC0 to
     HC3 are the CR where every row is a cluster, with n − p degrees of freedom for HC0 and HC1.
@@ -213,7 +219,7 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     """
     p, n, G = len(V), 0, 0
     meat, outer, alone = np.zeros((p, p)), np.zeros((p, p, p)), np.zeros(p, dtype=bool)
-    lone: list[int] = []
+    lone: list[Any] = []
     size, trace, square = np.zeros((3, p))  # Σ aᵀa, tr Γ and tr Γ²
     for Q, e, cluster in parts:
         n, G = n + len(e), G + len(np.unique(cluster))
@@ -244,17 +250,14 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
         )
     of_rows, number = kind[0] == "H", kind[-1]
     if lone and number == "3":
-        what, left = ("row", "HC") if n == G else ("cluster", "CR")
         raise InsufficientDataError(
-            f"{what} {lone[0]} alone determines a combination of the parameters: leaving it out, "
-            f"as {left}3 does, leaves no answer; fit fewer parameters or use {left}2"
+            f"{named(lone[0])} alone determines a combination of the parameters: leaving it out, "
+            f"as {kind} does, leaves no answer; fit fewer parameters or use {kind[:2]}2"
         )
     if number == "1":
         meat *= G / (G - 1) * (n - 1) / (n - p)
     what = "each row its own variance" if of_rows else f"rows correlated within {G} clusters"
     text = f"{what}, {DESCRIPTION[kind]}"
-    if alone.any() and not of_rows:
-        text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
     square = square + (outer**2).sum(axis=(1, 2))
     told = (trace > 1e-9 * size) & (square > 0) & ~alone  # the residual says something of it
     dof = np.where(told, trace**2 / np.where(told, square, 1.0), 0.0)
@@ -357,7 +360,8 @@ def left_out(
         gap, alone = np.eye(share.shape[1]) - share, np.zeros(len(share), dtype=bool)
         # The largest eigenvalue is at most the trace: only configurations of weight need theirs.
         heavy = np.flatnonzero(np.trace(share, axis1=1, axis2=2) >= 0.5)
-        alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
+        if len(heavy):  # none where constraints hold all columns
+            alone[heavy] = np.linalg.eigvalsh(gap[heavy])[:, 0] < ALONE
         gap[alone] = np.eye(share.shape[1])
         own = e[rows][..., None]
         moved = np.linalg.solve(gap, Qt @ own) if many else Qt @ np.linalg.solve(gap, own)

@@ -18,7 +18,7 @@ from scipy import sparse, special
 
 from elastocal.cell_tables import Unsteadiness
 from elastocal.files import check_registered, same_class
-from elastocal.measurements import Measurements, numbered, visits
+from elastocal.measurements import Measurements, numbered, poses_in_turn, visits
 from elastocal.messages import InputError, did_you_mean, option, quoted, require
 from elastocal.model.effects.base import JointMotion
 from elastocal.model.manipulator import Model
@@ -120,9 +120,8 @@ SYSTEMATIC = 0.01
 def in_random_order(table: Measurements) -> bool:
     """Whether poses that follow each other in the table are no nearer than chance allows at 1 %.  Σ
     |q_i+1 − q_i|² / Σ |q_i − q̄|² has the mean 2 and the variance 4 (n − 2)/(n² − 1) for each joint
-    (von Neumann 1941), poses that only the load or a repeat tells apart counted once."""
-    moves = np.abs(np.diff(table.q, axis=0)).max(axis=1, initial=0.0) > 0
-    q = table.q[np.concatenate([[True], moves])] if len(table) else table.q
+    (von Neumann 1941)."""
+    q = poses_in_turn(table)
     n, spread = len(q), q.std(axis=0)
     q = q[:, spread > 0] / spread[spread > 0]
     if n < 3 or not q.shape[1]:

@@ -436,8 +436,7 @@ def groupings(
     """By what the `chosen` rows (rows,) fall into more than one group, the number of each row's
     group and the groups' names, in the table's order."""
     table, size = observed.table, observed.size
-    force = np.round(table.force[observed.lead], 3)
-    load = numbered(*force.T)
+    load, force = observed.load, table.force[observed.lead]
     loads = tuple(map(load_text, force[np.unique(load, return_index=True)[1]]))
     coded: list[tuple[str, IntArray, tuple[str, ...]]] = [
         ("component", np.arange(size)[None], COMPONENTS[observed.kind]),

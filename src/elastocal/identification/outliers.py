@@ -9,13 +9,14 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, sparse, special
 
 from elastocal.identification.least_squares import (
+    ALONE,
     Covariance,
     clustered,
     f_test,
@@ -29,7 +30,7 @@ from elastocal.identification.start import Options
 from elastocal.identification.weighted_problem import Problem, RFactor
 from elastocal.messages import ElastocalError, InputError, InsufficientDataError
 from elastocal.model.observations import Observations
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray
 
 FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
 TINY = np.finfo(float).tiny
@@ -126,9 +127,6 @@ def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
 def named_runs(lines: list[int]) -> list[str]:
     """The same in words: "142–507", "610"."""
     return [str(a) if a == b else f"{a}–{b}" for a, b in blocks(lines)]
-
-
-ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
 class FitToGood:
@@ -576,7 +574,7 @@ class HuberFit:
         """ψ(d)/d (n,)."""
         return c / np.maximum(self.distance, c)
 
-    def covariance(self, cluster: IntArray | None = None) -> Covariance:
+    def covariance(self, cluster: NDArray[Any] | None = None) -> Covariance:
         """Covariance (p, p) of x̂.
 
         Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and
@@ -628,11 +626,6 @@ def robust_result(
     them: a bad reading then also shows in those whitened after it.
     """
     problem, kept, x, steps = every.problem, sound.reduction.kept, sound.fit.x.copy(), 0
-    if problem.large:
-        raise InputError(
-            f"the method {method} takes no table of this size; use the default "
-            "method, which excludes outliers"
-        )
     if intervals not in ("auto", "cr3"):
         raise InputError(
             f"the method {method} has intervals of its own: 'auto' for independent readings, "
@@ -662,5 +655,6 @@ def robust_result(
     )
     solution = replace(sound, fit=fit)
     solution = replace(solution, held=(heldout, solution.crossed[1]))
-    cluster = None if intervals == "auto" else observed.configuration
+    labels = np.array(observed.table.configuration_labels)
+    cluster = None if intervals == "auto" else labels[observed.configuration]
     return MethodResult(method, solution, found.covariance(cluster), None, good)

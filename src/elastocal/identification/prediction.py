@@ -418,12 +418,12 @@ def predicted_error(
 
     e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
     by draws of z, normal, and t with the degrees of freedom of their mean square for what the
-    estimates' covariance holds.  None where nothing was determined, or no position follows from
-    what was read.
+    estimates' covariance holds.  None where nothing was determined, the variance of an estimate is
+    not known, or no position follows from what was read.
     """
     left = arm.left
     told = arm.determined and observed.kind != "distance" and np.isfinite(arm.covariance).all()
-    if left is None or not told:
+    if left is None or not told or not spread.dof.all():
         return None
     try:
         B, weight = poses.rows(arm, observed)

@@ -152,14 +152,10 @@ class Posterior:
         prior = RFactor(np.column_stack([self.P, np.zeros(len(own))]), 0)
         self.r_factor = linear.factor.of_columns(np.append(np.arange(k), k + own)).merged(prior)
 
-    @cached_property
-    def half(self) -> Array:
-        return self.r_factor.half
-
     @property
     def step(self) -> Array:
         """α and b (columns,)."""
-        return self.half @ self.r_factor.projected
+        return self.r_factor.half @ self.r_factor.projected
 
     @property
     def marginal(self) -> RFactor:
@@ -171,7 +167,7 @@ class Posterior:
 
     @cached_property
     def cofactor(self) -> Array:
-        return self.half @ self.half.T
+        return self.r_factor.half @ self.r_factor.half.T
 
     @property
     def prior_share(self) -> Array:
@@ -251,7 +247,7 @@ class JointFit:
         """Q (rows, columns), whose squares are by how much of the noise the fit varies at the
         readings of a part, and their residual (rows,)."""
         B, e = part.whitened(self.found.x, self.found.columns)
-        return B @ self.posterior.half, e
+        return B @ self.posterior.r_factor.half, e
 
     def standardised(self, others: Problem | None = None) -> Array:
         """Residuals (N, size) free of the fit's part in them, in m or rad: of the fit's own
@@ -363,7 +359,9 @@ class _Search:
         columns, x = np.append(fit.reduction.kept, f.columns[posterior.own]), found.x.copy()
         x[f.columns] = f.nominal
         x[columns] += posterior.step  # of functions from nominal
-        return held_out_by_parts(found.problem, found.x, columns, posterior.half, x - found.x)
+        return held_out_by_parts(
+            found.problem, found.x, columns, posterior.r_factor.half, x - found.x
+        )
 
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
         noise: NoiseFit | None = None

@@ -97,6 +97,11 @@ class Options:
         if self.method == "wls" and self.weights == "none":
             raise InputError("the method wls needs weights; for none, choose the method ols")
         stated = self.weights != "auto" or self.covariance is not None
+        if self.covariance is not None and self.weights not in ("auto", "covariance"):
+            raise InputError(
+                f"{option('covariance')} goes with {option('weights', 'covariance')}; found "
+                f"{quoted(self.weights)}, leave one of the two out"
+            )
         if stated and self.weights != "none" and self.resolved not in ("wls", *ROBUST):
             raise InputError(
                 f"the method {self.resolved} does not take stated weights; choose the method wls"
@@ -305,11 +310,8 @@ def start_values(
         return _distance_start(model, table, x, movable)
     if table.position is None:
         return x
-    places = {
-        p.where
-        for i, p in enumerate(model.parameters)
-        if i in movable and p.effect in (BaseFrame.name, MarkerPosition.name)
-    }
+    fitted = (model.parameters[i] for i in movable)
+    places = {p.where for p in fitted if p.effect in (BaseFrame.name, MarkerPosition.name)}
     if not places:
         return x
     names = list(model.cell.tool.markers)
@@ -346,9 +348,8 @@ def start_values(
         for name, xyz in values.items()
         for k, v in zip("xyz", xyz, strict=True)
     }
-    for i, parameter in enumerate(model.parameters):
-        if parameter.name in of and i in movable:
-            x[i] = of[parameter.name]
+    for i in movable:
+        x[i] = of.get(model.names[i], x[i])
     return x
 
 

@@ -258,7 +258,7 @@ class RFactor:
     def scaled(self, scale: Array) -> RFactor:
         return RFactor(self.augmented * np.append(scale, 1.0), self.rows)
 
-    @property
+    @cached_property
     def half(self) -> Array:
         """R⁻¹ (p, p)."""
         return np.asarray(linalg.solve_triangular(self.R, np.eye(self.columns)))
