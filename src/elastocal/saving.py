@@ -399,7 +399,7 @@ def check_six_axes(chain: Chain, language: str) -> None:
         what = what if sliding else f"it has {chain.n_joints}"
         raise InputError(
             f"robot '{chain.name}': a {language} program moves arms of {AXES} revolute joints, but "
-            f"{what}; external axes are not written: take the joint values from the plan's table"
+            f"{what}; external axes are not written: take the plan, with the via points of its JSON"
         )
 
 
