@@ -208,10 +208,9 @@ class CalibratedArm(Valued, Saved):
     def untried(self, force: Array) -> str:
         """In words, where some of the loads (N, 3) are heavier than any measured."""
         most, asked = (np.linalg.norm(f, axis=1).max(initial=0.0) for f in (self.loads, force))
-        if not self.elastic or not 0 < most * 1.001 < asked:  # as loads are rounded
-            return ""
         told = f"a load of {asked:.4g} N, where {most:.4g} N at most were measured: the springs are"
-        return f"{told} taken to yield alike beyond; measure under such a load"
+        told += " taken to yield alike beyond; measure under such a load"
+        return told if self.elastic and 0 < most * 1.001 < asked else ""  # loads are rounded
 
     @checked_arguments
     def pose(self, q: ArrayLike, load: ArrayLike | None = None) -> NDArray:
