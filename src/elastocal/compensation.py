@@ -506,6 +506,8 @@ def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
             f"{targets.table.source}: no load is stated, so no compliance is compensated; where "
             f"the tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
         )
+    if told := arm.untried(targets.table.force):
+        yield f"{targets.table.source}: {told}"
     where = "[model.compliance_levels], where the compliance of the nearest level is assumed"
     for name, values in spec.compliance_levels.items():
         angle = c.q[:, joint_index(name)]

@@ -394,12 +394,11 @@ def check_program(text: str, planned: Sequence[Step]) -> None:
 def check_six_axes(chain: Chain, language: str) -> None:
     sliding = [joint.name for joint in chain.joints if joint.kind != "revolute"]
     if chain.n_joints != AXES or sliding:
-        ends = ("s", "") if len(sliding) > 1 else ("", "s")
-        what = f"joint{ends[0]} {', '.join(sliding)} slide{ends[1]}"
-        what = what if sliding else f"it has {chain.n_joints}"
+        what = f"joint {sliding[0]} slides" if sliding else f"it has {chain.n_joints}"
+        what = f"joints {', '.join(sliding)} slide" if len(sliding) > 1 else what
         raise InputError(
             f"robot '{chain.name}': a {language} program moves arms of {AXES} revolute joints, but "
-            f"{what}; external axes are not written: take the joint values from the plan's table"
+            f"{what}; external axes are not written: take the plan, with the via points of its JSON"
         )
 
 

@@ -267,9 +267,10 @@ def _what_next(cell: str, output: Path, augment: Path | None, plan: Plan) -> str
         carried += f" --repeats {readings}"
     added = "" if augment is None else f" (add them to {augment})"
     read = "distance_mm" if plan.model.observe == "distance" else "x_mm, y_mm, z_mm"
+    via = f"by the via points of {output.with_suffix('.json')}, " * bool(plan.execution.between)
     text = (
-        f"Next: measure {output} in its order, {hung}a row with {read} for each marker{added}; "
-        "then\n"
+        f"Next: measure {output} in its order, {via}{hung}a row with {read} for each marker{added};"
+        " then\n"
         f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html"
     )
     if augment is None:  # an arm that was measured is not the one that --draw takes

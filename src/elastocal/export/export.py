@@ -194,6 +194,7 @@ def export(
         (calibrated.elastic and not cost.forces.any() and not spec.link_gravity,
          f"no load is given, so compliances cost nothing here: state one with {option('load')} "
          "(N, in the tracker's axes)"),
+        (calibrated.untried(cost.forces), calibrated.untried(cost.forces)),
         (spec.torque == "measured",
          "joint torques are taken from the load here, as a file has no measured torques"),
         (cost.unsettled, f"{cost.unsettled} of {cost.poses} random poses have no static "

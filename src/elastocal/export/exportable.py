@@ -466,8 +466,9 @@ class Refit:
 
     @property
     def taken(self) -> bool:
-        """Whether the file has what was fitted; else nothing is better than what was identified."""
-        return self.after < self.before
+        """Whether the file has what was fitted, as it must beside a correction that was fitted with
+        it; else nothing is better than what was identified."""
+        return self.correction is not None or self.after < self.before
 
     def to_json(self) -> dict[str, Any]:
         names = ("before", "after", "nominal", "with_correction")

@@ -468,6 +468,9 @@ class _Design:
         self.warnings += told
         pool, chosen = found.whole(found.chosen)
         q, blocks, readings = pool.q[chosen], pool.blocks[chosen], pool.readings[chosen]
+        names = self._names(pool, chosen, len(found.pool))
+        if few := ", ".join(names[k] for k in execution.one_sided):
+            self.warnings.append(f"approached from one side only, as the other is blocked: {few}")
         spec, model, done = self.cell.design, setup.information.model, self.done
         M = setup.gathered(blocks)
         without = np.stack([setup.gathered(np.delete(blocks, k, axis=0)) for k in range(len(q))])
@@ -497,7 +500,7 @@ class _Design:
             polished=int(((chosen >= found.first) & (chosen < len(found.pool))).sum()),
             bound_reported=None if bound is None else figure(bound),
             warnings=tuple(self.warnings), made_for="" if done is None else done.note,
-            names=self._names(pool, chosen, len(found.pool)),
+            names=names,
             chance=Chance.of(drawn, found.value, setup.criterion),
             everywhere=setup.everywhere(M, drawn, left), seen=None if seen.all() else seen,
             readings=readings, states=self.states, gain=gain,

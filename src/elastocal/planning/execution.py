@@ -429,6 +429,12 @@ class Execution:
         return sum(stop.travel for stop in self.stops) + self.home_travel
 
     @property
+    def between(self) -> list[tuple[int | None, Array]]:
+        """Via points and the stop, from 1, that they lead to; None: home."""
+        ways = ((k, q) for k, stop in enumerate(self.stops, start=1) for q in stop.via)
+        return [*ways, *((None, q) for q in self.home_via)]
+
+    @property
     def one_sided(self) -> tuple[int, ...]:
         sides = Counter((stop.pose, stop.load) for stop in self.stops if not stop.again)
         few = {pose for (pose, _), n in sides.items() if self.motion.both_directions and n < 2}

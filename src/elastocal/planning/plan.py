@@ -332,7 +332,7 @@ class Chosen:
 class LoadStates:
     """In which load states poses are read: each in `"all"`, or each in those `"chosen"` for it.
 
-    `crossed` and `chosen`: the relaxed optimum of both in the plan's unit, in the same time; None
+    `crossed` and `chosen`: the relaxed optimum of both in the plan's unit, in as much time; None
     where there is nothing to choose, and `why`.
     """
 
@@ -612,6 +612,7 @@ class Plan(Result):
             "scheduled": self.scheduled and asdict(self.scheduled),
             "timed": [asdict(size) for size in self.timed],
             "minutes": self.execution.total / 60,
+            "via": [{"stop": stop, "q_si": q.tolist()} for stop, q in self.execution.between],
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
             **({"made_for": self.made_for} if self.made_for else {}),

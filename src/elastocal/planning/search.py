@@ -533,23 +533,19 @@ def ordered(search: Search) -> tuple[Execution, Alias | None, list[str]]:
     """The execution of a search's plan, what a shift of its readings does, and warnings.  Poses
     that no chain of free moves reaches are replaced by the best others, unless they are pinned, and
     all then polished again, as far as moves reach them there."""
-    order, warnings = _Ordering(search), []
+    order = _Ordering(search)
     execution, alias = order.reachable()
-    if order.gone:
-        if search.effort.starts:
-            chosen = search.polished(search.chosen, "replaced")
-            with suppress(Unreachable):
-                if search.value_of(chosen) < search.value:
-                    execution, alias = order.put(chosen)
-                    search.exchange(chosen)
-        told = "one better pose was" if order.gone == 1 else f"{order.gone} better poses were"
-        warnings.append(
-            f"{told} left out: no free move reaches {'it' if order.gone == 1 else 'them'}"
-        )
-    if execution.one_sided:
-        told = ", ".join(str(k + 1) for k in execution.one_sided)
-        warnings.append(f"approached from one side only, as the other is blocked: {told}")
-    return execution, alias, warnings
+    if not order.gone:
+        return execution, alias, []
+    if search.effort.starts:
+        chosen = search.polished(search.chosen, "replaced")
+        with suppress(Unreachable):
+            if search.value_of(chosen) < search.value:
+                execution, alias = order.put(chosen)
+                search.exchange(chosen)
+    told = f"{order.gone} better poses were left out: no free move reaches them"
+    one = "one better pose was left out: no free move reaches it"
+    return execution, alias, [one if order.gone == 1 else told]
 
 
 class _Ordering:

@@ -573,20 +573,24 @@ def _with_loads(cell: Cell, loads: Array) -> Cell:
 
 REPEATS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 WORSE = 2  # numbers of repeats in a row that are worse than fewer: more are not tried
-TRIES = 3  # plans whose moves took longer than was thought
+TRIES = 3  # plans within a time
 
 
 def within(choice: Choice, cell: Cell, plan_of: Callable[[Cell], Plan], minutes: float) -> Plan:
-    asked = minutes
-    for left in reversed(range(TRIES)):
-        sizes, best = _sizes(choice, cell, asked)
-        plan = plan_of(best.cell)
-        took = plan.execution.total / 60
-        if took <= minutes or not left:
+    """The best of TRIES plans: moves take longer than was thought, or leave time for a pose."""
+    asked, found = minutes, list[Plan]()
+    for _ in range(TRIES):
+        sizes, fit = _sizes(choice, cell, asked)
+        told = tuple(replace(size, minutes=size.minutes * minutes / asked) for size in sizes)
+        found.append(replace(plan_of(fit.cell), timed=told))
+        took = found[-1].execution.total / 60
+        if took <= minutes < took * (1 + 1 / len(found[-1])):
             break
         asked *= minutes / took
+    best = min(found, key=lambda plan: (max(plan.execution.total / 60, minutes), plan.value))
+    took = best.execution.total / 60
     more = (f"the plan takes {took:.0f} minutes, as its moves are longer than was thought",)
-    return replace(plan, timed=sizes, warnings=plan.warnings + more * (took > minutes))
+    return replace(best, warnings=best.warnings + more * (took > minutes))
 
 
 class _Fit(NamedTuple):

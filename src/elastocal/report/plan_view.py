@@ -47,7 +47,8 @@ def plan_blocks(plan: Plan) -> Iterator[say.Block]:
             for s in plan.curve
         ]
         heads = ("poses", figure, "best possible on the pool")
-        curve = say.ShownTable(heads, rows, (), title="Number of poses")
+        drawn = ", of the candidates as drawn" * (plan.model.cell.design.target is None)
+        curve = say.ShownTable(heads, rows, (), title=f"Number of poses{drawn}")
         both: list[say.Block] = [curve, plan_curve(plan)]
         yield say.Fold(curve.title, lambda: both, printed=True, figures=("curve",))
     if plan.timed:
@@ -136,13 +137,20 @@ def interval_table(plan: Plan) -> say.ShownTable:
 
 
 def stop_table(plan: Plan) -> say.ShownTable:
-    rows, loads, e = [], len(plan.forces) > 1, plan.execution
+    rows, loads, e = list[tuple[str, ...]](), len(plan.forces) > 1, plan.execution
+
+    def via(stop: int | None) -> Iterator[tuple[str, ...]]:
+        points = [say.joint_texts(q, plan.model.chain.kinds) for at, q in e.between if at == stop]
+        return (("", f"via {', '.join(q)}", *[""] * (2 + loads)) for q in points)
+
     for k, (stop, now) in enumerate(zip(e.stops, e.arrivals, strict=True)):
+        rows += via(k + 1)
         change = ", to change" * (stop.change_after is not None)
         load = [f"{' '.join(f'{f:g}' for f in plan.forces[stop.load])}{change}"] if loads else []
         rows.append((str(k + 1), stop.name(plan.configurations), *load, f"{now / 60:.0f}", "☐"))
+    rows += via(None)
     heads = ("stop", "pose", *(["load in N"] if loads else []), "minute", "done")
-    return say.ShownTable(heads, rows, (2,) if loads else (), title="Stops in order")
+    return say.ShownTable(heads, rows, (1, 2) if loads else (1,), title="Stops in order")
 
 
 def plan_headline(plan: Plan) -> str:
@@ -273,7 +281,7 @@ def _chosen_lines(plan: Plan) -> Told:
         )
     if s.crossed is not None and s.chosen is not None:
         text += (
-            f" (relaxed on candidates, in the same time: in all load states "
+            " (relaxed on candidates, time saved spent on more stops: in all load states "
             f"{_value(plan, s.crossed)}, chosen for each pose {_value(plan, s.chosen)})"
         )
     yield "Loads", f"{text}."
@@ -367,8 +375,8 @@ def _execution_lines(plan: Plan) -> Told:
         text += f"; {are} measured unloaded at start and end (half the readings each{up})"
     if e.load_changes:
         text += f", {say.counted(e.load_changes, 'load change')} by hand"
-    via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
-    text += f", {say.counted(via, 'via point')}" if via else ""
+    via = len(e.between)
+    text += f", {say.counted(via, 'via point')} (page and JSON list them)" if via else ""
     checked = "every move checked"
     if not (len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0):
         if mounting_plane(plan.model.cell, plan.model.chain) is None:

@@ -278,15 +278,14 @@ def export_blocks(done: Exported) -> Iterator[say.Block]:
         told = f"the markers are {say.length(refit.after)} rms off"
         if refit.correction is not None:
             told += f", with its joint correction {say.length(refit.correction)}"
-        fitted = refit.taken or refit.correction is not None
         how = "Values as identified; no refit is better"
-        if fitted:
+        if refit.taken:
             how = f"Refitted to the calibrated arm at {refit.visits} measured visits"
             told += f", with the values identified {say.length(refit.before)}"
         worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
         told += f", the nominal file with base and tool placed {say.length(refit.nominal)}{worse}"
         yield say.Sentence(f"{how}: {told}.")
-        if fitted:
+        if refit.taken:
             there = ", which the file has" if done.framed else ": place it there"
             yield say.Sentence(f"The file is fitted {done.base_told}{there}.")
     if done.checked is not None:
