@@ -56,8 +56,8 @@ from elastocal.diagnosis.verdict import (
 from elastocal.files import atomic_writer, is_plugin_file, read_text
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.identify import misread_for_a_while
-from elastocal.identification.mistakes import refuse_nonsense
-from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty
+from elastocal.identification.mistakes import POOREST, length_of, refuse_nonsense
+from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty, named_runs
 from elastocal.identification.scrutiny import BudgetStep, autocorrelation
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
@@ -65,6 +65,7 @@ from elastocal.messages import (
     ElastocalError,
     InputError,
     InsufficientDataError,
+    counted,
     did_you_mean,
     length,
     listed,
@@ -73,6 +74,7 @@ from elastocal.messages import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
+from elastocal.model.observations import subset
 from elastocal.units import BoolArray, Progress
 
 # Keys of the cell file, in whatever table, whose texts are paths.
@@ -239,7 +241,23 @@ def _diagnosed(
         told = (*told, MISREAD.format(listed(map(str, blocks), 4), int(gone.sum()), len(gone)))
         table = table.take(~gone)
         base = fit_baseline(model, table, options.seed)
-    refuse_nonsense(model, base.observed, base.x, base.residual, table)
+    try:
+        refuse_nonsense(model, base.observed, base.x, base.residual, table)
+    except InsufficientDataError:
+        # Beside readings metres off nothing fits: as in `identify` they go first.
+        if base.problem is None or not (wrong := find_faulty(base.problem, base.x)).any():
+            raise
+        apart = subset(base.observed, wrong)
+        first = base.observed.table.row[base.observed.lead[wrong]]
+        sound = fit_baseline(model, table.take(~np.isin(table.row, first)), options.seed)
+        refuse_nonsense(model, sound.observed, sound.x, sound.residual, table, apart)
+        off = apart.value - model.predict(apart.table, sound.x, apart)
+        far = np.linalg.norm(off.reshape(len(first), -1)[:, :3], axis=1)
+        lines = first[far > POOREST * length_of(model, table)].tolist()
+        table = table.take(~np.isin(table.row, lines))
+        base = fit_baseline(model, table, options.seed)
+        runs = listed(named_runs(lines), 8)
+        told = (*told, FAR_OFF.format(counted(len(lines), "reading"), runs))
     if disordered := order_contradicted(table):
         told = (*told, disordered + OUT_OF_ORDER)
         options = replace(options, without=(*options.without, *BY_LAST_MOVE))
@@ -292,6 +310,7 @@ MISREAD = (
     "one common shift explains {0}: {1} of {2} readings were left out, as by identify; look for "
     "what moved there, a marker or the instrument"
 )
+FAR_OFF = "{} left out, as by identify, since no arm could be there: check lines {} of the table"
 
 
 def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup]:

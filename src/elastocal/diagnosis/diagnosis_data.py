@@ -81,6 +81,11 @@ class DiagnosisData:
         return self.base.observed.table
 
     @property
+    def turning(self) -> BoolArray:
+        """Which joints are revolute."""
+        return np.array([kind == "revolute" for kind in self.base.model.chain.kinds])
+
+    @property
     def lead(self) -> IntArray:
         """Row (N,) of the table that each observation stands in first."""
         return self.base.observed.lead

@@ -24,7 +24,13 @@ from elastocal.cell_tables import ModelSpec, Tool
 from elastocal.identification.outliers import FALSE_ALARM, named_runs
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
-from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
+from elastocal.identification.start import (
+    OF_A_TARGET,
+    OF_A_UNIT,
+    SCALED,
+    LinearFits,
+    Registration,
+)
 from elastocal.measurements import Measurements
 from elastocal.messages import InsufficientDataError, length, listed, rounded
 from elastocal.model.chain import Chain
@@ -221,7 +227,6 @@ def joint_maps(chain: Chain) -> list[JointMap]:
 
 UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
          (1 / 25.4, "mm read as inches"))  # fmt: skip
-OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
 SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
 ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
 
@@ -419,7 +424,7 @@ def refuse_nonsense(
         left.append(apart.value - model.predict(apart.table, x, apart))
     errors = np.concatenate(left).reshape(-1, observed.size)
     off, turned = (np.linalg.norm(e, axis=1) for e in (errors[:, :3], errors[:, 3:]))
-    table, length = observed.table, _length(model, observed.table)
+    table, length = observed.table, length_of(model, observed.table)
     share = float((off > POOREST * length).mean())
     with np.errstate(over="ignore"):  # median and rms of those fitted, and of all
         fitted, every_off = (
@@ -457,7 +462,7 @@ def refuse_nonsense(
     )
 
 
-def _length(model: Model, table: Measurements) -> float:
+def length_of(model: Model, table: Measurements) -> float:
     """Of the arm stretched out, with its tool and the ways of its slides, in m."""
     frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
     sliding = np.array([joint.kind == "prismatic" for joint in model.chain.joints], dtype=bool)
@@ -642,7 +647,7 @@ def impossible_values(result: Calibration) -> Iterator[Finding]:
 # for what the model lacks.
 
 # Beyond it the points hardly move, as of a tip that touches one, or do so otherwise.
-LARGEST_SCALE = 0.5
+LARGEST_SCALE = 3.0
 NEARLY = 0.1  # share of the square that a scale leaves of what it explains
 SOME = 400  # readings that are enough for it
 # What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
@@ -732,10 +737,10 @@ def scale_of(result: Calibration) -> float | None:
     found = LinearFits(flange[None], np.asarray(table.position), table.marker)
     if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
         return None
-    size = np.linalg.svd(found.matrix[0], compute_uv=False)
-    off = abs(float(found.scale[0]) - 1)
-    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
-    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST_SCALE else None
+    size, scale = np.linalg.svd(found.matrix[0], compute_uv=False), float(found.scale[0])
+    alike = found.determinant[0] > 0 and size[0] - size[-1] < abs(scale - 1)
+    some = 1 / LARGEST_SCALE < scale < LARGEST_SCALE and abs(scale - 1) > SCALED
+    return 1 / scale if alike and some else None
 
 
 def _size(value: float, unit: str) -> str:
