@@ -51,8 +51,8 @@ def identified(
 
 def test_joints_that_settle_anew_are_told_with_their_size():
     result = identified(scatter=SCATTER)
-    assert (finding := result.finding("joint_scatter")).severity == "note"
-    assert abs(finding.numbers["sigma_urad"][0] / 100 - 1) < 0.3
+    finding = result.finding("joint_scatter")
+    assert finding.severity == "note" and abs(finding.numbers["sigma_urad"][0] / 100 - 1) < 0.3
     assert "rounded to 0.1°" in identified(decimals=1).finding("joint_scatter").remedy
     assert any("settle anew" in warning for warning in result.warnings)
     assert "µrad" in noise_model_line(result)
@@ -95,9 +95,9 @@ def test_how_long_a_drift_lasts_is_not_taken_for_known_unless_the_cell_states_it
     single = np.eye(len(names))[[base, offset], None]
     dof, share = spread.tails(single)
     assert dof[0] < 20 < dof[1] and share[0] < 0.95 < share[1] <= 1
-    assert (at := result.position(np.zeros(6), point="M1")).dof[0] < 20
+    at = result.position(np.zeros(6), point="M1")
     normal = replace(at, dof=np.full(1, np.inf))
-    assert (at.half_axes() > 1.1 * normal.half_axes()).all()
+    assert at.dof[0] < 20 and (at.half_axes() > 1.1 * normal.half_axes()).all()
 
 
 def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of_poses():

@@ -31,6 +31,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of,
 from elastocal.diagnosis.effect_search import (
     MANY,
     ForwardSelection,
+    some_are_large,
     with_likelier_backlash_model,
 )
 from elastocal.diagnosis.hypotheses import (
@@ -265,9 +266,16 @@ def _diagnosed(
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
-    dataset, found, suspects = _searched(dataset, options, progress)
-    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
-    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
+    dataset, found, suspects, few = _few(dataset, options, progress)
+    if some_are_large(found):
+        # What may be of any size is believed to be where it leaves next to nothing open, nor needs
+        # more.
+        large = _few(dataset.of_any_size, options, progress)
+        left, before = (answer.supported.unexplained for answer in (large[3], few))
+        known = large[3].verdict != "unknown_effect" and large[1].chosen.items
+        closed = not large[3].supported.open or left < NEXT_TO_NOTHING * before
+        if known and closed and len(known) <= max(len(found.chosen.items), 1):
+            dataset, found, suspects, few = large
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
     tests, answer = structure_tests(found.first), whole or few
@@ -325,6 +333,22 @@ def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup
     return []
 
 
+NEXT_TO_NOTHING = 0.1
+
+
+def _few(
+    dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
+) -> tuple[DiagnosisData, ForwardSelection, BoolArray, FewAnswer]:
+    dataset, found, suspects = _searched(dataset, options, progress)
+    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
+    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
+    return dataset, found, suspects, few
+
+
+def _open(few: FewAnswer) -> bool:
+    return few.verdict == "unknown_effect" or few.supported.open
+
+
 def _sum_of_all(
     few: FewAnswer, options: DiagnosisOptions, progress: Progress
 ) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:
@@ -333,7 +357,7 @@ def _sum_of_all(
     progress("judging all that may act at once")
     found = few.selected
     chosen, nothing = found.chosen, found.nothing.score
-    open_ = few.verdict == "unknown_effect" or few.supported.open
+    open_ = _open(few)
 
     def summed(dataset: DiagnosisData, without: set[str]) -> tuple[SumAnswer, float, Growth] | None:
         if (searched := search_components(dataset, chosen, open_, without, progress)) is None:

@@ -27,7 +27,13 @@ from elastocal.diagnosis.baseline import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
+from elastocal.diagnosis.hypotheses import (
+    ANY_SCALES,
+    NO_SETTINGS,
+    Hypothesis,
+    compute_columns,
+    with_keys,
+)
 from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.effects.geometry import Backlash
@@ -415,6 +421,20 @@ def about(
     )  # fmt: skip
 
 
+LARGE = 5.0  # nats by which an effect has to be likelier where it may be of any size
+
+
+def some_are_large(found: ForwardSelection) -> bool:
+    """Whether an effect that may be of any size is likelier to be far larger than usual."""
+    nothing, dataset = found.nothing, found.before
+    grams = Grams(dataset, nothing.data, nothing.at)
+    for h in (h for h in dataset.hypotheses if h.effect.any_size):
+        usual, large = (grams.of(h).evidence(s).max() for s in (h.scales, ANY_SCALES))
+        if large > usual + LARGE:
+            return True
+    return False
+
+
 FLIPS = 199
 CLOSE = 6  # candidates whose noise is fitted for themselves
 HOPELESS = -6.0  # score below which none is
@@ -457,6 +477,7 @@ class ForwardSelection:
         self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
     ) -> None:
         self.dataset, self.generic, self._fitted = dataset, generic, dict[tuple, ModelSet]()
+        self.before = dataset
         flips = FLIPS, len(dataset.blocks.member)
         self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)

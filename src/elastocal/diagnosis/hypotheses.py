@@ -91,6 +91,7 @@ class Hypothesis:
     where: str
     parameters: tuple[ParameterSpec, ...]
     settings: tuple[Setting, ...]
+    any_size: bool = False  # beyond what is typical
 
     known: ClassVar[bool] = True
 
@@ -126,7 +127,7 @@ class Hypothesis:
     @property
     def scales(self) -> Array:
         """Scales of the size prior: wider where no typical size is known."""
-        if self.effect.any_size:
+        if self.any_size:
             return ANY_SCALES
         return UNSIZED_SCALES if any(p.typical is None for p in self.parameters) else SCALES
 

@@ -12,9 +12,9 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.identification import noise_summary
+from elastocal.identification.faulty_readings import exchanged
 from elastocal.identification.mistakes import (
     STATED_BY_FILE,
-    exchanged,
     far_values,
     impossible,
     impossible_values,
