@@ -345,10 +345,6 @@ def _few(
     return dataset, found, suspects, few
 
 
-def _open(few: FewAnswer) -> bool:
-    return few.verdict == "unknown_effect" or few.supported.open
-
-
 def _sum_of_all(
     few: FewAnswer, options: DiagnosisOptions, progress: Progress
 ) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:
@@ -357,7 +353,7 @@ def _sum_of_all(
     progress("judging all that may act at once")
     found = few.selected
     chosen, nothing = found.chosen, found.nothing.score
-    open_ = _open(few)
+    open_ = few.verdict == "unknown_effect" or few.supported.open
 
     def summed(dataset: DiagnosisData, without: set[str]) -> tuple[SumAnswer, float, Growth] | None:
         if (searched := search_components(dataset, chosen, open_, without, progress)) is None:

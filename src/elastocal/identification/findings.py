@@ -430,6 +430,12 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
             f"({listed(shown, 4)}). Predictions hold for poses and loads like those measured; for "
             "others, measure what shows them."
         )
+        still = np.flatnonzero(np.ptp(result.observations.table.q, axis=0) == 0)
+        if len(still) and not all(name.endswith(".compliance") for name in shown):
+            names = listed([str(j + 1) for j in still])
+            remedy = (
+                f"Joint {names} never moves in these data: move it, or check its column. {remedy}"
+            )
         yield _note("undetermined", remedy, parameters=n, names=shown)
 
 
