@@ -18,9 +18,18 @@ from numpy.typing import ArrayLike, NDArray
 from elastocal import tables
 from elastocal.above import DataFrame, Result, checked_arguments
 from elastocal.files import atomic_writer, open_input, read_text
-from elastocal.messages import InputError, check_known, is_label, listed, option, quoted, require
+from elastocal.messages import (
+    InputError,
+    check_known,
+    is_label,
+    listed,
+    option,
+    quoted,
+    require,
+    rounded,
+)
 from elastocal.tables import NO_UNIT, Columns, Family, Labels, RawTable, column
-from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
+from elastocal.units import ANGLE, LENGTH, TIME, Array, BoolArray, IntArray
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
 REQUIRED: dict[str, tuple[tuple[str, ...], ...]] = {
@@ -348,6 +357,35 @@ def in_any_order(table: Measurements) -> bool:
     moved = square > 0
     along = (q[1:] * q[:-1]).sum(axis=0)[moved] / square[moved]
     return bool((np.abs(along) * np.sqrt(len(q)) < FOLLOWING).all())
+
+
+STEPS = [(10.0**-k, unit) for k in range(5) for unit in ("°", " rad")]
+FEWEST_VALUES = 8  # of a finer step all are on a coarser one with a chance of 10 to the minus that
+
+
+def rounded_joints(table: Measurements, turning: BoolArray) -> tuple[float, str] | None:
+    """The standard deviation (rad) that rounding gives each of the `turning` joints' values, a
+    step over √12, and the coarsest decimal step that they are on; None where they are on none."""
+    q = table.q[:, turning]
+    if not q.size or max(len(np.unique(column)) for column in q.T) < FEWEST_VALUES:
+        return None
+    for step, unit in STEPS:
+        steps = (np.degrees(q) if unit == "°" else q) / step
+        if np.abs(steps - np.round(steps)).max() < 1e-6:
+            size = np.radians(step) if unit == "°" else step
+            return float(size / np.sqrt(12)), f"{step:g}{unit}"
+    return None
+
+
+def told_of_rounding(table: Measurements, turning: BoolArray, scatter: Array) -> str | None:
+    """That joint values were rounded, where that is as much as the joints scatter by (k,)."""
+    found = rounded_joints(table, turning)
+    if found is None or not found[0] / 2 < np.sqrt(np.mean(np.square(scatter))) < 2 * found[0]:
+        return None
+    return (
+        f"The joint values are rounded to {found[1]}, {rounded(found[0] * 1e6)} µrad rms, which is "
+        "what the joints seem to scatter by: record them with more decimals."
+    )
 
 
 # Share of the visits at which a joint that came from one side, by the order of the visits, was

@@ -25,10 +25,8 @@ import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell_tables import CartesianNoise, Nominal
 from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.verdict import confirm, unheard_of
 from elastocal.files import load_plugins
 from elastocal.identification.scrutiny import gap_budget
-from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 
 # Effects that others imitate in any poses, and those others.
@@ -102,14 +100,17 @@ def test_an_interval_holds_the_values_at_other_likely_time_constants() -> None:
         assert abs(fit.x[fit.model.names.index(p.name)] - p.value) < 1.96 * p.std
 
 
-def test_a_cause_far_larger_than_usual_is_to_be_confirmed() -> None:
-    (model, _), (found,) = campaign(DRIVEN), diagnosed(DRIVEN).effects
-    (p,), effect = found.parameters, CATALOGUE[found.effect]
-    (spec,) = effect.parameters(found.where, model.chain, model.cell)
-    assert spec.typical is not None and not unheard_of([found], model)
-    large = replace(p, value=40 * spec.typical, std=0.1 * spec.typical)
-    (told,) = confirm(unheard_of([replace(found, parameters=(large,))], model))
-    assert f"{p.name} (40 times)" in told
+def test_a_cause_far_larger_than_usual_is_named_and_to_be_confirmed() -> None:
+    """A gear of 51 teeth for 50: so large that it is not linear."""
+    fault = Fault("encoder_scale", "joint3", {"encoder_scale": 0.02})
+    model, _ = campaign()
+    why = ec.diagnose(
+        model, measured(model.chain, model.cell, [fault], plan(model.chain, 24, 1), 1)
+    )
+    (found,) = why.effects
+    assert (found.effect, found.where) == fault.key and why.gap.explained < 2 * why.gap.noise_floor
+    assert abs(found.parameters[0].value - 0.02) < 4 * found.parameters[0].std
+    assert any("joint3.encoder_scale (67 times)" in told for told in why.warnings)
 
 
 def test_a_ripple_is_named_with_its_order_and_amplitude() -> None:

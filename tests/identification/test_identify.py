@@ -1,5 +1,6 @@
 """The whole identification, from nothing: what it finds lies where its intervals say."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -37,8 +38,7 @@ LOADS = [[0, 0, 0], [0, 0, -2600], [800, 0, -2600]]
 
 def assert_one_arm_is_covered(result, truth):
     """The joint ellipsoid of all estimates at 99.9 %: a test of one arm, correlations included."""
-    z = z_scores(result, truth)
-    std = np.sqrt(np.diag(result.covariance))
+    z, std = z_scores(result, truth), np.sqrt(np.diag(result.covariance))
     squared = z @ np.linalg.solve(result.covariance / np.outer(std, std), z) / len(z)
     assert squared < stats.f.isf(1e-3, len(z), result.dof)
 
@@ -82,11 +82,16 @@ def test_pose_observation(stated):
         low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], result.dof)
         assert low < result.noise.ratio_to_stated**2 * result.dof < high
     assert_one_arm_is_covered(result, truth)
-    assert len(result.residual) == 180
-    with pytest.raises(InsufficientDataError, match=r"rotations are .*check the order of qw"):
-        identify(model, turned := replace(table, rotation=-table.rotation))  # the other way round
-    at_import = (nominal_fit(chain, model.cell, one) for one in (table, turned))
-    assert [fit is not None and "of qw" in fit.warning for fit in at_import] == [False, True]
+    for wrong, cause in (
+        (-table.rotation, "transpose them"),
+        ((read := Rotation.from_rotvec(table.rotation)).as_euler("ZYX"), "about the moving z, y"),
+        (Rotation.from_quat(np.roll(read.as_quat(), -1, axis=1)).as_rotvec(), "hold x, y, z, w:"),
+        ((Rotation.from_euler("x", np.pi / 2) * read).as_rotvec(), "turned by (90, 0, 0)°"),
+    ):
+        with pytest.raises(InsufficientDataError, match=f"rotations are .*{re.escape(cause)}"):
+            identify(model, turned := replace(table, rotation=wrong))
+        assert cause in nominal_fit(chain, model.cell, turned).warning
+    assert not nominal_fit(chain, model.cell, table).warning
 
 
 def test_distance_observation():
@@ -109,16 +114,14 @@ def test_distance_observation():
 def test_error_on_new_poses_is_the_cramer_rao_prediction():
     """UR10, 1 mm and 1 mrad of errors, 0.05 mm of noise, six arms: rms error on 200 noise-free
     poses against √(tr B cov Bᵀ / 200) of the minimal complete set, within 15 %."""
-    path, flange = packaged_urdf("UR10")
-    chain = read_urdf(path, flange=flange)
+    chain = read_urdf((ur10 := packaged_urdf("UR10"))[0], flange=ur10[1])
     model = Model.assembled(chain, cell_of(GEOMETRY))
     errors, bounds = [], []
     wide = table_at(random_poses(chain, 200, 999))
     at = model.regressor(wide).B
     kept = reduce(at, model.sizes(at), model.parameters, 1.0, 0.0).kept
     for seed in range(6):
-        rng = np.random.default_rng([seed, 30])
-        truth = true_values(model, rng)
+        truth = true_values(model, rng := np.random.default_rng([seed, 30]))
         plan = table_at(random_poses(chain, 30, 300 + seed))
         result = identify(model, measured(model, plan, truth, SIGMA, rng))
         exact = model.regressor(wide, truth, kept)

@@ -58,10 +58,10 @@ def test_the_unit_of_the_loads_is_named_with_its_direction(made):
         assert fitted(made, factor).finding("load_unit") is None
     for factor, larger, mistake, undo in (
         (1 / G, True, "kilograms", "multiply force_x_N"),
-        (G, False, "newtons were multiplied by 9.81", "divide force_x_N"),
+        (1e-3, True, "kilonewtons", "by 1000"),
+        (G, False, "newtons times 9.81", "divide force_x_N"),
     ):
-        fit = fitted(made, factor)
-        found = fit.finding("load_unit")
+        found = (fit := fitted(made, factor)).finding("load_unit")
         assert (found.number("ratio") > 1) == larger
         assert mistake in found.remedy and undo in found.remedy
         assert found.remedy in "\n".join(fit.warnings)

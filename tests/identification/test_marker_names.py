@@ -10,7 +10,7 @@ import pytest
 
 import elastocal as ec
 from elastocal.cell_tables import CartesianNoise, ModelSpec
-from elastocal.identification.mistakes import exchanged
+from elastocal.identification.faulty_readings import exchanged
 
 DEMO = Path(ec.__file__).parent / "demo"
 MARKERS = {"M1": [0.25, 0.0, 0.05], "M2": [-0.12, 0.22, 0.10], "M3": [0.0, -0.2, 0.08]}
@@ -27,9 +27,8 @@ def model() -> ec.Model:
 
 
 def campaign(model: ec.Model, seed: int = 0, poses: int = 16) -> ec.Measurements:
-    rng = np.random.default_rng(seed)
     lower, upper = [-1.2, -2, 0.3, -1.2, -1.2, -1.2], [1.2, -0.4, 2, 1.2, 1.2, 1.2]
-    q = rng.uniform(lower, upper, (poses, 6))
+    q = np.random.default_rng(seed).uniform(lower, upper, (poses, 6))
     return ec.simulate(model, q, draw=1.0, seed=seed)
 
 
@@ -43,8 +42,7 @@ def test_the_rows_are_told_from_whichever_pose_names_are_exchanged(model, first,
     rows, _, words = exchanged(model, renamed(table, table.configuration >= first, order))
     moved = (table.configuration >= first) & (np.array(order)[table.marker] != table.marker)
     assert np.array_equal(rows, np.flatnonzero(moved))
-    lines = f"{table.row[moved][0]}–{table.row[moved][-1]}"
-    assert f"{moved.sum()} rows (lines {lines}" in words
+    assert f"{moved.sum()} rows (lines {table.row[moved][0]}–{table.row[moved][-1]}" in words
 
 
 def test_names_exchanged_everywhere_are_told_by_the_places_of_the_cell(model):

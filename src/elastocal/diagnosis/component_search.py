@@ -50,7 +50,7 @@ from elastocal.diagnosis.components import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import ModelSet, about, extended, spans_of
 from elastocal.diagnosis.evidence import ANOTHER, Item, evidence_of_groups, log_prior_odds
-from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.hypotheses import NO_SETTINGS, possible
 from elastocal.diagnosis.noise_floor import scatter_beyond
 from elastocal.engine import ROUNDING, LogPrior, Standardised, beside, climb
 from elastocal.model.effects.base import index
@@ -207,7 +207,7 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     readings = base.observed
     residual = readings.value - model.predict(readings.table, at_sum, readings)
     at = replace(base, model=model, x=at_sum, residual=residual)
-    return about(dataset, at, weights, apart=True)
+    return about(dataset, at, [(h, NO_SETTINGS.values[0]) for h in weights], apart=True)
 
 
 def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:

@@ -31,6 +31,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of,
 from elastocal.diagnosis.effect_search import (
     MANY,
     ForwardSelection,
+    some_are_large,
     with_likelier_backlash_model,
 )
 from elastocal.diagnosis.hypotheses import (
@@ -56,8 +57,13 @@ from elastocal.diagnosis.verdict import (
 from elastocal.files import atomic_writer, is_plugin_file, read_text
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.identify import misread_for_a_while
-from elastocal.identification.mistakes import likely_mistake, refuse_nonsense
-from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty
+from elastocal.identification.mistakes import (
+    POOREST,
+    length_of,
+    likely_mistake,
+    refuse_nonsense,
+)
+from elastocal.identification.outliers import FALSE_ALARM, FEW, find_faulty, named_runs
 from elastocal.identification.scrutiny import BudgetStep, autocorrelation
 from elastocal.identification.start import check_table, fallen, solved_body, without_copies
 from elastocal.measurements import Measurements, order_contradicted
@@ -65,6 +71,7 @@ from elastocal.messages import (
     ElastocalError,
     InputError,
     InsufficientDataError,
+    counted,
     did_you_mean,
     length,
     listed,
@@ -73,6 +80,7 @@ from elastocal.messages import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model, where_smooth_functions_end
+from elastocal.model.observations import subset
 from elastocal.units import BoolArray, Progress
 
 # Keys of the cell file, in whatever table, whose texts are paths.
@@ -239,7 +247,23 @@ def _diagnosed(
         told = (*told, MISREAD.format(listed(map(str, blocks), 4), int(gone.sum()), len(gone)))
         table = table.take(~gone)
         base = fit_baseline(model, table, options.seed)
-    refuse_nonsense(model, base.observed, base.x, base.residual, table)
+    try:
+        refuse_nonsense(model, base.observed, base.x, base.residual, table)
+    except InsufficientDataError:
+        # Beside readings metres off nothing fits: as in `identify` they go first.
+        if base.problem is None or not (wrong := find_faulty(base.problem, base.x)).any():
+            raise
+        apart = subset(base.observed, wrong)
+        first = base.observed.table.row[base.observed.lead[wrong]]
+        sound = fit_baseline(model, table.take(~np.isin(table.row, first)), options.seed)
+        refuse_nonsense(model, sound.observed, sound.x, sound.residual, table, apart)
+        off = apart.value - model.predict(apart.table, sound.x, apart)
+        far = np.linalg.norm(off.reshape(len(first), -1)[:, :3], axis=1)
+        lines = first[far > POOREST * length_of(model, table)].tolist()
+        table = table.take(~np.isin(table.row, lines))
+        base = fit_baseline(model, table, options.seed)
+        runs = listed(named_runs(lines), 8)
+        told = (*told, FAR_OFF.format(counted(len(lines), "reading"), runs))
     if disordered := order_contradicted(table):
         told = (*told, disordered + OUT_OF_ORDER)
         options = replace(options, without=(*options.without, *BY_LAST_MOVE))
@@ -247,9 +271,16 @@ def _diagnosed(
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
-    dataset, found, suspects = _searched(dataset, options, progress)
-    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
-    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
+    dataset, found, suspects, few = _few(dataset, options, progress)
+    if some_are_large(found):
+        # What may be of any size is believed to be where it leaves next to nothing open, nor needs
+        # more.
+        large = _few(dataset.of_any_size, options, progress)
+        left, before = (answer.supported.unexplained for answer in (large[3], few))
+        known = large[3].verdict != "unknown_effect" and large[1].chosen.items
+        closed = not large[3].supported.open or left < NEXT_TO_NOTHING * before
+        if known and closed and len(known) <= max(len(found.chosen.items), 1):
+            dataset, found, suspects, few = large
     whole, nats, fields = _sum_of_all(few, options, progress)
     progress("confirming")
     tests, answer = structure_tests(found.first), whole or few
@@ -292,6 +323,7 @@ MISREAD = (
     "one common shift explains {0}: {1} of {2} readings were left out, as by identify; look for "
     "what moved there, a marker or the instrument"
 )
+FAR_OFF = "{} left out, as by identify, since no arm could be there: check lines {} of the table"
 
 
 def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup]:
@@ -304,6 +336,18 @@ def _misread(base: Baseline, table: Measurements, seed: int) -> list[FaultyGroup
         if find_faulty(base.problem, base.x).mean() > FEW:
             return misread_for_a_while(base.model, table, seed)
     return []
+
+
+NEXT_TO_NOTHING = 0.1
+
+
+def _few(
+    dataset: DiagnosisData, options: DiagnosisOptions, progress: Progress
+) -> tuple[DiagnosisData, ForwardSelection, BoolArray, FewAnswer]:
+    dataset, found, suspects = _searched(dataset, options, progress)
+    total, rng = sum_of(found.dataset, found.chosen), np.random.default_rng(options.seed)
+    few = FewAnswer(dataset, found.dataset, total, (), rng, {}, found)
+    return dataset, found, suspects, few
 
 
 def _sum_of_all(

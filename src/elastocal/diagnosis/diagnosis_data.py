@@ -81,6 +81,17 @@ class DiagnosisData:
         return self.base.observed.table
 
     @property
+    def of_any_size(self) -> DiagnosisData:
+        """The same with effects of any size that may be."""
+        wide = (replace(h, any_size=h.effect.any_size) for h in self.hypotheses)
+        return replace(self, hypotheses=tuple(wide))
+
+    @property
+    def turning(self) -> BoolArray:
+        """Which joints are revolute."""
+        return np.array([kind == "revolute" for kind in self.base.model.chain.kinds])
+
+    @property
     def lead(self) -> IntArray:
         """Row (N,) of the table that each observation stands in first."""
         return self.base.observed.lead

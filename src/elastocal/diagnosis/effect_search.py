@@ -27,7 +27,13 @@ from elastocal.diagnosis.baseline import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, Generic, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, Grams, Item, Scan
-from elastocal.diagnosis.hypotheses import NO_SETTINGS, Hypothesis, compute_columns, with_keys
+from elastocal.diagnosis.hypotheses import (
+    ANY_SCALES,
+    NO_SETTINGS,
+    Hypothesis,
+    compute_columns,
+    with_keys,
+)
 from elastocal.diagnosis.noise_floor import left_out_square
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.effects.geometry import Backlash
@@ -356,6 +362,9 @@ class Slot:
 # Rms signal in m beyond which the products of an effect with the fitted parameters, which it
 # moves by a tenth or so, are no longer small beside the noise.
 FAR = 2e-4
+# What moves joints is linear but for the square of their motion, a micrometre where a marker a
+# metre away moves by this.
+FAR_DRIVEN = 1.5e-3
 
 
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
@@ -363,19 +372,25 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     is large; else as they are.  What the effects explain is put back into the residual, so that
     sets with and without them are judged on the same footing."""
     used, whats = ~dataset.data.left_out, [item.what for item in chosen.items]
-    direct = {k: h for k, h in enumerate(whats) if isinstance(h, Hypothesis) and not h.driven}
-    signals = (chosen.signal(k)[used] for k in direct)
-    if not any((signal**2).mean() > FAR**2 for signal in signals):
+    direct = {
+        k: h
+        for k, h in enumerate(whats)
+        if isinstance(h, Hypothesis)
+        and (chosen.signal(k)[used] ** 2).mean() > (FAR_DRIVEN if h.driven else FAR) ** 2
+    }
+    if not direct:
         return dataset
     fitted = fit_extended(dataset, chosen, [chosen.items[k] for k in direct])
-    return about(dataset, fitted, list(direct.values()))
+    return about(dataset, fitted, [(h, chosen.items[k].settings) for k, h in direct.items()])
 
 
 def about(
-    dataset: DiagnosisData, fitted: Baseline, added: Sequence[Hypothesis], apart: bool = False
-) -> DiagnosisData:
-    """The data about a fit of the model with some of the hypotheses in it, what these explain put
-    back; `apart`: what they are to the model's own parameters is not in the columns of these."""
+    dataset: DiagnosisData, fitted: Baseline, added: Sequence[tuple[Hypothesis, Array]],
+    apart: bool = False,
+) -> DiagnosisData:  # fmt: skip
+    """The data about a fit of the model with some of the hypotheses in it, at settings, what these
+    explain put back; `apart`: what they are to the model's own parameters is not in the columns of
+    these."""
     base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
     own = np.array([x[name] for name in base.model.names])
@@ -383,23 +398,40 @@ def about(
     about_fit = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x, apart)
     # Put back by the data's own columns, which will have to explain it: those of the equilibrium
     # differ from them by a thousandth, and a large effect is a thousand deviations.
-    back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
-    for what in added:
+    back = np.zeros((*about_fit.data.r.shape, 1))
+    for what, settings in added:
         # What an effect tries from several starts has no size about any of them.
         open_keys = {key for start in what.starts(model) for key in start}
         moved_by = [
             0.0 if p.key in open_keys else x[f"{what.where}.{p.key}"] - p.nominal
             for p in what.parameters
         ]
-        back[:, :, 0] += base.observed.apply(about_fit.columns.of(what)) @ np.array(moved_by)
-    r = about_fit.data.r + about_fit.blocks.pack(back)[:, :, 0]
+        size = about_fit.sizes[what.key]
+        times = np.divide(moved_by, size, out=np.zeros(len(size)), where=size > 0)
+        back[:, :, 0] += about_fit.packed(what, settings) @ times
+    r = about_fit.data.r + back[:, :, 0]
+    whole = fitted.residual + about_fit.blocks.unpack(back).ravel()
     shares = dataset.columns.shares | about_fit.columns.shares
     columns = replace(about_fit.columns, shares=shares)
     return replace(
-        about_fit, columns=columns, base=replace(moved, residual=fitted.residual + back.ravel()),
+        about_fit, columns=columns, base=replace(moved, residual=whole),
         other_backlash=dataset.other_backlash,
         data=replace(about_fit.data, r=r, left_out=dataset.data.left_out),
     )  # fmt: skip
+
+
+LARGE = 5.0  # nats by which an effect has to be likelier where it may be of any size
+
+
+def some_are_large(found: ForwardSelection) -> bool:
+    """Whether an effect that may be of any size is likelier to be far larger than usual."""
+    nothing, dataset = found.nothing, found.before
+    grams = Grams(dataset, nothing.data, nothing.at)
+    for h in (h for h in dataset.hypotheses if h.effect.any_size):
+        usual, large = (grams.of(h).evidence(s).max() for s in (h.scales, ANY_SCALES))
+        if large > usual + LARGE:
+            return True
+    return False
 
 
 FLIPS = 199
@@ -444,6 +476,7 @@ class ForwardSelection:
         self, dataset: DiagnosisData, generic: list[Generic], level: float, seed: int
     ) -> None:
         self.dataset, self.generic, self._fitted = dataset, generic, dict[tuple, ModelSet]()
+        self.before = dataset
         flips = FLIPS, len(dataset.blocks.member)
         self.signs = np.random.default_rng(seed).choice([-1.0, 1.0], flips)
         nothing = current = ModelSet(dataset, (), dataset.data.noise)

@@ -74,9 +74,11 @@ RECORD = {
 
 
 # Scales of an effect's prior size, in typical sizes; one that nobody has stated is known to an
-# order of magnitude at best.
+# order of magnitude at best.  A gear of 101 teeth for 100, or a tripod that was moved, is a hundred
+# times as far off as is usual.
 SCALES = np.array([0.3, 1.0, 3.0])
 UNSIZED_SCALES = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
+ANY_SCALES = np.array([0.3, 1.0, 3.0, 10.0, 30.0, 100.0])
 
 EntryKey = tuple[str, tuple[str, ...]]
 
@@ -89,6 +91,7 @@ class Hypothesis:
     where: str
     parameters: tuple[ParameterSpec, ...]
     settings: tuple[Setting, ...]
+    any_size: bool = False  # beyond what is typical
 
     known: ClassVar[bool] = True
 
@@ -124,6 +127,8 @@ class Hypothesis:
     @property
     def scales(self) -> Array:
         """Scales of the size prior: wider where no typical size is known."""
+        if self.any_size:
+            return ANY_SCALES
         return UNSIZED_SCALES if any(p.typical is None for p in self.parameters) else SCALES
 
     def starts(self, model: Model) -> tuple[dict[str, float], ...]:

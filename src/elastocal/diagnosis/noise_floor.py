@@ -38,7 +38,7 @@ from elastocal.identification.noise_choice import SEVERAL, linearised
 from elastocal.identification.noise_structure import JOINTS
 from elastocal.identification.outliers import settle
 from elastocal.identification.scrutiny import BudgetStep, resampled_rms, stage_of
-from elastocal.measurements import numbered
+from elastocal.measurements import numbered, rounded_joints
 from elastocal.messages import ElastocalError
 from elastocal.model.effects.geometry import BaseFrame
 from elastocal.model.observations import pure_error, subset
@@ -191,8 +191,9 @@ MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREA
 MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
 
 
-def scatter_beyond(noise: NoiseValues) -> Array:
-    """Variance (joints,) of each joint's scatter beyond what the others let expect.  The logarithms
+def scatter_beyond(noise: NoiseValues, rounding: float = 0.0) -> Array:
+    """Variance (joints,) of each joint's scatter beyond what the others let expect, and beyond
+    twice what `rounding` gives their values.  The logarithms
     of scatter spread by JOINT_SPREAD about a mean that is REPEATABILITY's within its own spread, so
     that the others tell what one is to be expected of; beyond its limit any joint of an arm is with
     a chance of FALSE_SMOOTH."""
@@ -203,7 +204,8 @@ def scatter_beyond(noise: NoiseValues) -> Array:
     spread = np.sqrt(JOINT_SPREAD**2 + 1 / known)
     limit = np.exp(usual + others - float(special.ndtri(FALSE_SMOOTH / J)) * spread)
     scatter = noise.joint**2 * (1 + noise.shared**2)
-    return np.maximum(scatter - np.minimum(limit, MOST_SCATTER) ** 2, 0.0)
+    limit = np.maximum(np.minimum(limit, MOST_SCATTER), 2 * rounding)
+    return np.maximum(scatter - limit**2, 0.0)
 
 
 class SupportedFloor:
@@ -226,7 +228,8 @@ class SupportedFloor:
         smooth = np.minimum(smooth_scatter(dataset, data, self.at), scatter)
         above, excess = 0.0, np.zeros_like(scatter)
         if data.stated:  # else what joints do and what the instrument does are not to be told apart
-            excess = scatter_beyond(noise)
+            rounding = rounded_joints(dataset.table, dataset.turning)
+            excess = scatter_beyond(noise, rounding[0] if rounding else 0.0)
             smooth = np.maximum(smooth, excess)
             above = max(noise.factor**2 - MOST_STATED**2, 0.0)
         stated = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2))

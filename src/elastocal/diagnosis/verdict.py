@@ -37,6 +37,7 @@ from elastocal.diagnosis.hypotheses import CHANGE_TIMES, Hypothesis, moments_bet
 from elastocal.diagnosis.noise_floor import NEW_POSES, mean_square
 from elastocal.identification import noise_summary
 from elastocal.identification.solve import FAR, far_off
+from elastocal.measurements import told_of_rounding
 from elastocal.messages import listed, rounded
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.geometry import Backlash
@@ -354,6 +355,9 @@ def warnings(
     data = found.chosen.data
     if data.stated:
         yield from _stated_wrong(dataset, data, noise)
+    scatter = np.array(noise.repeatability)[dataset.turning]
+    if told := told_of_rounding(dataset.table, dataset.turning, scatter):
+        yield told[0].lower() + told[1:].removesuffix(".")
     if (faulty := data.faulty.mean()) > FAULTY_SHARE:
         yield (
             f"{100 * faulty:.0f} % of the readings disagree with all others and were excluded; "

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -20,13 +21,16 @@ from elastocal.identification.outliers import (
     FitToGood,
     blocks,
     median_scale,
+    named_runs,
     prior_widths,
 )
 from elastocal.identification.solve import Solution
+from elastocal.identification.start import Registration
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.measurements import Measurements
-from elastocal.messages import length
+from elastocal.messages import length, listed
 from elastocal.model.effects.geometry import MarkerPosition
+from elastocal.model.manipulator import Model
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which readings, markers, configurations and runs of lines lie beyond the noise.
@@ -334,3 +338,73 @@ def report_faulty(
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     sigma = float(np.sqrt(fit.variance))
     return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, judged.tests)
+
+
+# Markers whose names are exchanged: readings that lie where another marker is.
+#
+# The names of the majority place base and markers.  A reading that is not where its own marker is,
+# but where another one is, has that one's name.  How near a reading lies to the nearest marker says
+# what the arm's own errors are, σ by the median; a reading farther off than χ₃ σ at FALSE_ALARM / n
+# is not its marker's.  Where each of two markers lies where the cell states the other, the majority
+# has them exchanged: the sums of squares of both, three numbers a marker, are compared by F.
+
+POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
+MOST = 80  # % of the readings, which what they fit to is told of
+FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
+MOST_READINGS, PASSES = 200_000, 10
+# Poses err unlike each other: the other marker is near within this many limits, and this many times
+# nearer.  A reading that is wrong by r is as near to it by chance once in (r/least)³.
+BESIDE, NEARER = 3.0, 5.0
+SHOWN = 6  # runs of lines, and configurations, that are named
+
+
+def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, ...], str] | None:
+    """Rows (k,) with the name of another marker, the markers mixed up, and what to do."""
+    names, n = table.marker_names, len(table)
+    few = n > MOST_READINGS or len(np.unique(table.q, axis=0)) < FEWEST_POSES
+    if table.position is None or len(names) < 2 or few:
+        return None
+    flange, row = model.rigid.flange_poses(table), np.arange(n)
+    marker, far = table.marker, np.sqrt(special.chdtri(3, FALSE_ALARM / n))
+    for _ in range(PASSES):  # base and markers by the names as they should be
+        found = Registration.of(model, replace(table, marker=marker))
+        places = np.stack([found.places(flange, np.full(n, m)) for m in range(len(names))], axis=1)
+        distance = np.linalg.norm(table.position[:, None] - places, axis=2)
+        nearest = distance.argmin(axis=1)
+        least = distance[row, nearest]
+        limit = far * np.median(least) / np.sqrt(special.chdtri(3, 0.5))
+        own = distance[row, table.marker]
+        other = (own > limit) & (own > NEARER * least) & (least <= BESIDE * limit)
+        before, marker = marker, np.where(other, nearest, table.marker)
+        if np.array_equal(marker, before):
+            break
+    if np.percentile(distance[row, marker], MOST) > POOR:
+        return None  # of an arm that fits nowhere readings lie near another marker by chance
+    best, places, known = np.arange(len(names)), found.markers, model.cell.tool.markers
+    pairs = list(combinations([m for m, name in enumerate(names) if name in known], 2))
+    level = special.fdtri(6, 6, 1 - FALSE_ALARM / max(len(pairs), 1))
+    for a, b in pairs:
+        off = places[[a, b]] - np.array([known[names[m]] for m in (a, b)])
+        crossed = places[[a, b]] - np.array([known[names[m]] for m in (b, a)])
+        if (off**2).sum() > level * (crossed**2).sum():
+            best[[a, b]] = best[[b, a]]
+    meant = best[marker]
+    rows = np.flatnonzero(meant != table.marker)
+    if not len(rows):
+        return None
+    mixed = np.unique([*table.marker[rows], *meant[rows]])
+    markers = tuple(names[m] for m in mixed)
+    words = (
+        f"Markers {listed(markers)} lie where [tool.markers_m] states each other: their names are "
+        "exchanged in all rows of the table, or in the cell. Exchange them in one of the two."
+    )
+    if len(rows) < np.isin(table.marker, mixed).sum():
+        lines = named_runs(table.row[rows].tolist())
+        labels = dict.fromkeys(table.configuration_labels[c] for c in table.configuration[rows])
+        words = (
+            f"The names of markers {listed(markers)} are exchanged in {len(rows)} rows (lines "
+            f"{listed(lines, SHOWN)}; configuration{'s' * (len(labels) > 1)} "
+            f"{listed(labels, SHOWN)}): each reading there lies where the other marker is. "
+            "Exchange the names in these rows."
+        )
+    return rows, markers, words

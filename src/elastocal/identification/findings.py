@@ -12,9 +12,9 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.identification import noise_summary
+from elastocal.identification.faulty_readings import exchanged
 from elastocal.identification.mistakes import (
     STATED_BY_FILE,
-    exchanged,
     far_values,
     impossible,
     impossible_values,
@@ -26,7 +26,7 @@ from elastocal.identification.outliers import FEW, kept_of, named_runs
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.result import Calibration, Estimate, Finding, made, more_poses
 from elastocal.identification.solve import Solution
-from elastocal.measurements import Measurements, numbered
+from elastocal.measurements import Measurements, numbered, told_of_rounding
 from elastocal.messages import EXACT, counted, gathered, listed, option, rounded, size_of
 from elastocal.model.calibrated import MOSTLY, mostly_prior
 from elastocal.model.effects.base import Parameter
@@ -233,7 +233,15 @@ def _state_noise(result: Calibration) -> str:
     )
 
 
+def _rounded(result: Calibration) -> str | None:
+    scatter = np.array([s.sigma for s in result.noise.sizes or () if s.joints and s.sigma])
+    turning = np.array([kind == "revolute" for kind in result.model.chain.kinds])
+    return told_of_rounding(result.observations.table, turning, scatter) if len(scatter) else None
+
+
 def _lacking(result: Calibration) -> str:
+    if rounding := _rounded(result):
+        return rounding
     if named := _named(result):
         return (
             f"The cell has {listed(named, 3)} already. If diagnose named that, it has no name for "
@@ -290,6 +298,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
                 f"joints settle anew at every visit. {_beside_stated('joints_urad', said, fits)}"
             )
             of, sigma = zip(*((s.name, s.sigma) for s in joints), strict=True)
+            remedy = _rounded(result) or remedy
             yield _note("joint_scatter", remedy, of=of, p=test.p, sigma_urad=sigma)
         elif test.part == TIME and (drift := noise.drift) is not None:
             for size in [s for s in sizes if s.part == TIME][:1]:
@@ -420,6 +429,12 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
             f"({listed(shown, 4)}). Predictions hold for poses and loads like those measured; for "
             "others, measure what shows them."
         )
+        still = np.flatnonzero(np.ptp(result.observations.table.q, axis=0) == 0)
+        if len(still) and not all(name.endswith(".compliance") for name in shown):
+            names = listed([str(j + 1) for j in still])
+            remedy = (
+                f"Joint {names} never moves in these data: move it, or check its column. {remedy}"
+            )
         yield _note("undetermined", remedy, parameters=n, names=shown)
 
 

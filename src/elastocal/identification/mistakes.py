@@ -10,23 +10,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain as chain_of
 from itertools import combinations, product
 
 import numpy as np
-from scipy import special
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell import Cell
-from elastocal.cell_tables import ModelSpec, Tool
-from elastocal.identification.outliers import FALSE_ALARM, named_runs
+from elastocal.cell_tables import Convention, ModelSpec, Tool
+from elastocal.identification.faulty_readings import FEWEST_POSES, MOST, POOR, exchanged
 from elastocal.identification.result import AT_BOUND, Calibration, Estimate, Finding, made
 from elastocal.identification.solve import far_off
-from elastocal.identification.start import OF_A_TARGET, SCALED, LinearFits, Registration
+from elastocal.identification.start import (
+    OF_A_TARGET,
+    OF_A_UNIT,
+    SCALED,
+    LinearFits,
+    Registration,
+)
 from elastocal.measurements import Measurements
-from elastocal.messages import InsufficientDataError, length, listed, rounded
+from elastocal.messages import ElastocalError, InsufficientDataError, length, listed, rounded
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import Parameter, index
 from elastocal.model.effects.geometry import (
@@ -42,13 +48,11 @@ from elastocal.model.effects.statics import (
     usual_over_stated_mass,
     weight_torque,
 )
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, load_chain
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.units import Array, IntArray
 
-POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
-MOST = 80  # % of the readings, which what they fit to is told of
 # What an alternative must bring the error down by.  Of 8 readings it is a likelihood ratio of 38
 # nats, against 8 for the choice among all the alternatives.
 BETTER = 5.0
@@ -82,21 +86,21 @@ def nominal_fit(
     poses = len(np.unique(table.q, axis=0))
     if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
         return None
-    # The nominal arm without effects, its markers at the flange.
-    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
-    rigid = Model.assembled(chain, replace(cell, tool=tool, model=ModelSpec()))
+    rigid = _rigid(chain, cell, table)
     error, far = _errors(rigid, table)
     if len(table.marker_names) > 1:
         mixed = exchanged(Model.assembled(chain, replace(cell, model=ModelSpec())), table)
         if mixed is not None:
             return NominalFit(error, mixed[2].removesuffix("."), True)
     if far <= POOR:
-        return NominalFit(error, rotations_off(_turns(rigid, table), "the nominal arm"))
+        return NominalFit(error, rotations_off(rigid, table, "the nominal arm"))
     near, best = far, ""
     # The simplest that mends it, else what does most.
     of_columns = _of_columns(chain, _some(table), spherical)
-    for words, other in chain_of(of_columns, _of_rows(rigid, table)):
-        left = _errors(rigid, other)[1]
+    others = chain_of(_of_frames(table), of_columns, _of_rows(rigid, table))
+    of_arm = ((rigid, *other) for other in others)
+    for arm, words, other in chain_of(_of_robots(cell, table), of_arm):
+        left = _errors(arm, other)[1]
         if left < near:
             near, best = left, words.format(length(left))
         if near <= POOR:
@@ -118,6 +122,31 @@ def likely_mistake(model: Model, table: Measurements) -> str:
     return fit.warning if fit is not None and fit.mended else ""
 
 
+def _rigid(chain: Chain, cell: Cell, table: Measurements) -> Model:
+    """The nominal arm without effects, its markers at the flange."""
+    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
+    return Model.assembled(chain, replace(cell, tool=tool, model=ModelSpec()))
+
+
+def _of_robots(cell: Cell, table: Measurements) -> Iterator[tuple[Model, str, Measurements]]:
+    if cell.robot.dh is None:
+        return
+    convention: Convention = "modified" if cell.robot.dh_convention == "standard" else "standard"
+    with suppress(ElastocalError):  # a table of the one may be none of the other
+        chain = load_chain(replace(cell, robot=replace(cell.robot, dh_convention=convention)))
+        told = f'with [robot] dh_convention = "{convention}" they would fit to {{}}'
+        yield _rigid(chain, cell, table), told, table
+
+
+def _of_frames(table: Measurements) -> Iterator[Alternative]:
+    if table.rotation is None:
+        return
+    turn = Rotation.from_rotvec(np.asarray(table.rotation)).inv()
+    told = "turned round, from poses of the tracker in the target's axes to those of the target in "
+    told += "the tracker's, they would fit to {}"
+    yield told, replace(table, position=-turn.apply(table.position), rotation=turn.as_rotvec())
+
+
 def _some(table: Measurements) -> Measurements:
     light = np.flatnonzero(~np.any(table.force != 0, axis=1))
     rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
@@ -135,28 +164,61 @@ def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     return found.error, float(np.percentile(distance, MOST))
 
 
-def _turns(model: Model, table: Measurements) -> Array:
-    """Angles (n,) in rad of the rotations from the nominal arm's, each target mounted as on
-    average."""
-    if table.rotation is None:
-        return np.zeros(0)
-    table = _some(table)
-    found, flange = Registration.of(model, table), model.rigid.flange_poses(table)
-    arm = Rotation.from_matrix(found.rotation @ flange[:, :3, :3])
-    mounted = arm.inv() * Rotation.from_rotvec(np.asarray(table.rotation))
-    of = [mounted[table.marker == m] for m in np.unique(table.marker)]
+# What rx, ry, rz or qw, qx, qy, qz may hold other than the rotation that they are read as.
+EULER = {"xyz": "the fixed x, y and z", "XYZ": "the moving x, y and z",
+         "zyx": "the fixed z, y and x", "ZYX": "the moving z, y and x",
+         "ZYZ": "the moving z, y and z"}  # fmt: skip
+
+
+def _meant(raw: Array) -> Iterator[tuple[str, Rotation]]:
+    """Rotation vectors `raw` (n, 3) as they may be meant, after words that say how."""
+    x, y, z, w = (read := Rotation.from_rotvec(raw)).as_quat().T
+    other = Rotation.from_quat(np.column_stack([w, x, y, z]))
+    yield "qw, qx, qy, qz hold x, y, z, w", other
+    yield "qx, qy, qz, qw hold w, x, y, z", Rotation.from_quat(np.column_stack([y, z, w, x]))
+    yield "they turn the tracker's axes into the target's (transpose them)", read.inv()
+    yield "qw, qx, qy, qz hold x, y, z, w of the inverse rotation", other.inv()
+    for sequence, axes in EULER.items():
+        told = f"rx, ry, rz are Euler angles about {axes} axes, and no rotation vector"
+        yield told, Rotation.from_euler(sequence, raw)
+
+
+def _turned(arm: Rotation, read: Rotation, marker: IntArray) -> Array:
+    """Angles (n,) in rad of rotations from the arm's, each target mounted as on average."""
+    mounted = arm.inv() * read
+    of = [mounted[marker == m] for m in np.unique(marker)]
     return np.concatenate([(turn.mean().inv() * turn).magnitude() for turn in of])
 
 
-def rotations_off(angles: Array, of: str) -> str:
-    """What rotations that are these angles in rad from those `of` an arm let suspect."""
-    angle = float(np.median(angles)) if len(angles) else 0.0
+def rotations_off(model: Model, table: Measurements, of: str, turned: Array | None = None) -> str:
+    """What rotations that are the angles `turned` (n,) in rad from those `of` an arm let suspect;
+    `model`: the nominal arm, from whose rotations they are where None."""
+    if table.rotation is None:
+        return ""
+    table = _some(table)
+    found, flange = Registration.of(model, table), model.rigid.flange_poses(table)
+    arm, raw = Rotation.from_matrix(found.rotation @ flange[:, :3, :3]), np.asarray(table.rotation)
+    off, read = partial(_turned, arm, marker=table.marker), Rotation.from_rotvec(raw)
+    angle = float(np.median(off(read) if turned is None else turned))
     if angle <= POOREST:
         return ""
+    words = f"the rotations are {rounded(np.degrees(angle))}° (median) from {of}; "
+    least = min(POOREST, angle / BETTER)
+    if np.median(off(read)) < least:
+        return f"{words}the target is mounted at an angle: fit marker_orientation"
+    for told, meant in _meant(raw):
+        if np.median(off(meant)) < least:
+            return f"{words}most likely {told}: with that they fit"
+    # R = C A M with A the arm's turns the relative rotations about C times the same axes.
+    rows = np.argsort(table.marker, kind="stable")
+    steps = [(r[rows[1:]] * r[rows[:-1]].inv()).as_rotvec() for r in (read, arm)]
+    other, _ = Rotation.align_vectors(*steps)
+    if np.median(_turned(other * arm, read, table.marker)) < least:
+        axis = listed([f"{v:g}" for v in np.round(other.as_rotvec(degrees=True)) + 0.0])
+        return f"{words}they stand in other axes than the positions, turned by ({axis})° from these"
     return (
-        f"the rotations are {rounded(np.degrees(angle))}° (median) from {of}; check the order of "
-        "qw, qx, qy, qz (rx, ry, rz are a rotation vector, not Euler angles), and that they turn "
-        "the target's axes into the tracker's"
+        f"{words}check the order of qw, qx, qy, qz (rx, ry, rz are a rotation vector, not Euler "
+        "angles), and that they turn the target's axes into the tracker's"
     )
 
 
@@ -233,13 +295,37 @@ def joint_maps(chain: Chain) -> list[JointMap]:
 
 UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
          (1 / 25.4, "mm read as inches"))  # fmt: skip
-OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
 SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
 ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
 
 
+FACTORS = np.exp(np.linspace(-1.5, 1.5, 151))  # so near each other that one of them fits
+
+
+def _geared(chain: Chain, table: Measurements) -> Iterator[JointMap]:
+    """Each revolute joint with its values times the factor, or a full unit, that suits it best."""
+    eye = np.eye(chain.n_joints)
+
+    def left(j: int, factors: Array) -> Array:
+        q = table.q + (factors[:, None, None] - 1) * table.q[:, j, None] * eye[j]
+        flange = nominal_flanges(chain, q.reshape(-1, q.shape[2]))
+        flange = flange.reshape(*q.shape[:2], 4, 4)
+        return LinearFits(flange, np.asarray(table.position), table.marker).left
+
+    moved = np.ptp(table.q, axis=0) > 0
+    for j in [j for j, kind in enumerate(chain.kinds) if kind == "revolute" and moved[j]]:
+        tried = np.concatenate([FACTORS, -FACTORS, [np.pi / 180, 180 / np.pi]])
+        best = float(tried[np.argmin(left(j, tried))])
+        for step in (2e-2, 5e-3, 1e-3):
+            near = best * (1 + step * np.linspace(-1, 1, 9))
+            best = float(near[np.argmin(left(j, near))])
+        told = f"with the values of joint {j + 1} times {rounded(best, 4)} (unit or gear ratio)"
+        yield JointMap((told,), eye + (best - 1) * np.outer(eye[j], eye[j]), mistakes=1.3)
+
+
 def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[Alternative]:
-    position, maps = np.asarray(table.position), joint_maps(chain)
+    position = np.asarray(table.position)
+    maps = [*joint_maps(chain), *_geared(chain, table)]
     q = np.stack([joint_map.of(table.q) for joint_map in maps])
     flange = nominal_flanges(chain, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
     points: list[tuple[Array, tuple[str, ...]]] = [(position, ())]
@@ -435,7 +521,7 @@ def refuse_nonsense(
         left.append(apart.value - model.predict(apart.table, x, apart))
     errors = np.concatenate(left).reshape(-1, observed.size)
     off, turned = (np.linalg.norm(e, axis=1) for e in (errors[:, :3], errors[:, 3:]))
-    table, length = observed.table, _length(model, observed.table)
+    table, length = observed.table, length_of(model, observed.table)
     share = float((off > POOREST * length).mean())
     with np.errstate(over="ignore"):  # median and rms of those fitted, and of all
         fitted, every_off = (
@@ -447,12 +533,10 @@ def refuse_nonsense(
     # A joint whose values were not recorded may move the markers by less than that.
     most = POOR if (every.q == every.q[0]).all(axis=0).any() else np.inf
     sane = max(fitted) <= min(POOREST * length, most) and share <= FEW and not beyond
-    wrong = rotations_off(turned, "the model")
-    if wrong and (sane or _placed(model, every)):
-        raise InsufficientDataError(
-            f"{table.source}: after the fit {wrong}; for a target mounted at an angle fit "
-            "marker_orientation"
-        )
+    if turned.size and np.median(turned) > POOREST and (sane or _placed(model, every)):
+        rigid = _rigid(model.chain, model.cell, every)
+        wrong = rotations_off(rigid, every, "the model", turned)
+        raise InsufficientDataError(f"{table.source}: after the fit {wrong}")
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return
     fit = nominal_fit(model.chain, model.cell, every)
@@ -473,7 +557,8 @@ def refuse_nonsense(
     )
 
 
-def _length(model: Model, table: Measurements) -> float:
+def length_of(model: Model, table: Measurements) -> float:
+    """Of the arm stretched out, with its tool and the ways of its slides, in m."""
     frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
     sliding = np.array([joint.kind == "prismatic" for joint in model.chain.joints], dtype=bool)
     tool = max((np.linalg.norm(m) for m in model.cell.tool.markers.values()), default=0.0)
@@ -496,74 +581,6 @@ def _cause(every: Measurements, fit: NominalFit | None) -> str:
     )
 
 
-# Markers whose names are exchanged: readings that lie where another marker is.
-#
-# The names of the majority place base and markers.  A reading that is not where its own marker is,
-# but where another one is, has that one's name.  How near a reading lies to the nearest marker says
-# what the arm's own errors are, σ by the median; a reading farther off than χ₃ σ at FALSE_ALARM / n
-# is not its marker's.  Where each of two markers lies where the cell states the other, the majority
-# has them exchanged: the sums of squares of both, three numbers a marker, are compared by F.
-
-FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
-MOST_READINGS, PASSES = 200_000, 10
-# Poses err unlike each other: the other marker is near within this many limits, and this many times
-# nearer.  A reading that is wrong by r is as near to it by chance once in (r/least)³.
-BESIDE, NEARER = 3.0, 5.0
-SHOWN = 6  # runs of lines, and configurations, that are named
-
-
-def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, ...], str] | None:
-    """Rows (k,) with the name of another marker, the markers mixed up, and what to do."""
-    names, n = table.marker_names, len(table)
-    few = n > MOST_READINGS or len(np.unique(table.q, axis=0)) < FEWEST_POSES
-    if table.position is None or len(names) < 2 or few:
-        return None
-    flange, row = model.rigid.flange_poses(table), np.arange(n)
-    marker, far = table.marker, np.sqrt(special.chdtri(3, FALSE_ALARM / n))
-    for _ in range(PASSES):  # base and markers by the names as they should be
-        found = Registration.of(model, replace(table, marker=marker))
-        places = np.stack([found.places(flange, np.full(n, m)) for m in range(len(names))], axis=1)
-        distance = np.linalg.norm(table.position[:, None] - places, axis=2)
-        nearest = distance.argmin(axis=1)
-        least = distance[row, nearest]
-        limit = far * np.median(least) / np.sqrt(special.chdtri(3, 0.5))
-        own = distance[row, table.marker]
-        other = (own > limit) & (own > NEARER * least) & (least <= BESIDE * limit)
-        before, marker = marker, np.where(other, nearest, table.marker)
-        if np.array_equal(marker, before):
-            break
-    if np.percentile(distance[row, marker], MOST) > POOR:
-        return None  # of an arm that fits nowhere readings lie near another marker by chance
-    best, places, known = np.arange(len(names)), found.markers, model.cell.tool.markers
-    pairs = list(combinations([m for m, name in enumerate(names) if name in known], 2))
-    level = special.fdtri(6, 6, 1 - FALSE_ALARM / max(len(pairs), 1))
-    for a, b in pairs:
-        off = places[[a, b]] - np.array([known[names[m]] for m in (a, b)])
-        crossed = places[[a, b]] - np.array([known[names[m]] for m in (b, a)])
-        if (off**2).sum() > level * (crossed**2).sum():
-            best[[a, b]] = best[[b, a]]
-    meant = best[marker]
-    rows = np.flatnonzero(meant != table.marker)
-    if not len(rows):
-        return None
-    mixed = np.unique([*table.marker[rows], *meant[rows]])
-    markers = tuple(names[m] for m in mixed)
-    words = (
-        f"Markers {listed(markers)} lie where [tool.markers_m] states each other: their names are "
-        "exchanged in all rows of the table, or in the cell. Exchange them in one of the two."
-    )
-    if len(rows) < np.isin(table.marker, mixed).sum():
-        lines = named_runs(table.row[rows].tolist())
-        labels = dict.fromkeys(table.configuration_labels[c] for c in table.configuration[rows])
-        words = (
-            f"The names of markers {listed(markers)} are exchanged in {len(rows)} rows (lines "
-            f"{listed(lines, SHOWN)}; configuration{'s' * (len(labels) > 1)} "
-            f"{listed(labels, SHOWN)}): each reading there lies where the other marker is. "
-            "Exchange the names in these rows."
-        )
-    return rows, markers, words
-
-
 # Loads in another unit.
 #
 # Deflections tell compliance times load: loads that are too small by a factor make every
@@ -573,12 +590,13 @@ def exchanged(model: Model, table: Measurements) -> tuple[IntArray, tuple[str, .
 # its links' weights let expect, and 1.5 times what its length does.
 EXPECTED_TO = 2.0
 SURELY = 5.0  # standard deviations beyond a physical bound, by which no estimate errs by chance
-KILOGRAMS = 9.80665  # N, the weight of one
+# In N, what force columns may hold, and what they may hold where the compliances are too small.
+LOAD_UNITS = ((9.80665, "kilograms", "newtons times 9.81"), (1e3, "kilonewtons", "millinewtons"))
 _note, _care, _poor = (partial(made, s) for s in ("note", "care", "poor"))
 
 
 def load_unit(result: Calibration) -> Iterator[Finding]:
-    """Are all compliances about as much too large as kilograms for newtons make them, or too small?
+    """Are all compliances too large, or too small, about as another unit of the loads makes them?
 
     What they should be about is what the cell states, else what winds each revolute joint up by
     RATED_WIND_UP at its rated torque, by the links' weights: a rule of thumb, worth a look, and no
@@ -604,17 +622,16 @@ def load_unit(result: Calibration) -> Iterator[Finding]:
     ratio, by = float(np.median(ratios)), "the cell's nominal compliances"
     if not given:
         by = "the weights of the links" if heavier == 1 else "the length of the arm"
-    if abs(abs(math.log(ratio)) - math.log(KILOGRAMS)) > math.log(EXPECTED_TO):
+    off = abs(math.log(ratio))
+    near = [u for u in LOAD_UNITS if abs(off - math.log(u[0])) <= math.log(EXPECTED_TO)]
+    if not near:
         return
-    unit, cause, undo = (
-        ("kilograms", "the force columns hold kilograms", "multiply")
-        if ratio > 1
-        else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
-    )
+    ((factor, *units),) = near
+    unit, undo = (units[0], "multiply") if ratio > 1 else (units[1], "divide")
     remedy = (
         f"Check the unit of the loads: the compliances are {rounded(ratio, 2)} times those "
-        f"expected from {by}, as where {cause}. If so, {undo} force_x_N, force_y_N "
-        "and force_z_N by 9.81."
+        f"expected from {by}, as where the force columns hold {unit}. If so, {undo} force_x_N, "
+        f"force_y_N and force_z_N by {rounded(factor)}."
     )
     yield (_care if given else _note)("load_unit", remedy, ratio=ratio, by=by, unit=unit)
 
@@ -657,7 +674,7 @@ def impossible_values(result: Calibration) -> Iterator[Finding]:
 # for what the model lacks.
 
 # Beyond it the points hardly move, as of a tip that touches one, or do so otherwise.
-LARGEST_SCALE = 0.5
+LARGEST_SCALE = 3.0
 NEARLY = 0.1  # share of the square that a scale leaves of what it explains
 SOME = 400  # readings that are enough for it
 # What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
@@ -747,10 +764,10 @@ def scale_of(result: Calibration) -> float | None:
     found = LinearFits(flange[None], np.asarray(table.position), table.marker)
     if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
         return None
-    size = np.linalg.svd(found.matrix[0], compute_uv=False)
-    off = abs(float(found.scale[0]) - 1)
-    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
-    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST_SCALE else None
+    size, scale = np.linalg.svd(found.matrix[0], compute_uv=False), float(found.scale[0])
+    alike = found.determinant[0] > 0 and size[0] - size[-1] < abs(scale - 1)
+    some = 1 / LARGEST_SCALE < scale < LARGEST_SCALE and abs(scale - 1) > SCALED
+    return 1 / scale if alike and some else None
 
 
 def _size(value: float, unit: str) -> str:

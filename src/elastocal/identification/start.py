@@ -468,7 +468,8 @@ def _check_units(model: Model, table: Measurements) -> None:
         return
     if len(table) > SOME:  # some of many readings tell it as well
         table = table.take(np.linspace(0, len(table) - 1, SOME).astype(np.int64))
-    reach, position = _reach(model, table), np.asarray(table.position)
+    flange, position = model.rigid.flange_poses(table), np.asarray(table.position)
+    reach = float(np.linalg.norm(np.ptp(flange[:, :3, 3], axis=0)))
     extent = float(np.linalg.norm(np.ptp(position, axis=0)))
     if reach < SAME or extent < SAME:
         return
@@ -481,6 +482,10 @@ def _check_units(model: Model, table: Measurements) -> None:
         1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
     ):  # fmt: skip
         cause = "the joint angles are probably radians in columns named …_deg: rename to …_rad"
+    elif (unit := _unit_of(flange, position, table.marker, reach)) is not None:
+        factor, cause = unit
+        cause = f"the positions are probably {cause}: convert them (elastocal import), or multiply "
+        cause += f"them by {factor:g}"
     elif ratio > EXTENT_FACTOR and usual > EXTENT_FACTOR:
         cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
     elif ratio < 1 / EXTENT_FACTOR:
@@ -491,6 +496,24 @@ def _check_units(model: Model, table: Measurements) -> None:
         f"{table.source}: the readings extend over {rounded(extent * 1e3, 4)} mm, but the nominal "
         f"arm's flange moves over {rounded(reach * 1e3, 4)} mm at these joint values; {cause}"
     )
+
+
+# By what readings of the same shape as the nominal arm's places may have to be multiplied.
+CONVERTED = {
+    10.0: "centimetres in columns named …_mm", 25.4: "inches in columns named …_mm",
+    0.01: "centimetres in columns named …_m", 0.0254: "inches in columns named …_m",
+}  # fmt: skip
+OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
+ALIKE = 0.05  # of the arm's reach: what its own errors leave of a likeness
+
+
+def _unit_of(
+    flange: Array, position: Array, marker: IntArray, reach: float
+) -> tuple[float, str] | None:
+    some = np.unique(np.linspace(0, len(marker) - 1, SAMPLE).astype(int))
+    found = LinearFits(flange[None, some], position[some], marker[some])
+    near = (u for u in CONVERTED.items() if abs(found.scale[0] / u[0] - 1) < OF_A_UNIT)
+    return next(near, None) if found.left[0] < ALIKE * reach else None
 
 
 FAR_OFF = 10.0  # times the median, which is more than any noise is

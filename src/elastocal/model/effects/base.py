@@ -389,6 +389,9 @@ class Effect:
     family: ClassVar[str] = ""
     # How many times its typical size it may be at most: beyond, it is something else.
     most: ClassVar[float] = 1000.0
+    # Beyond what is typical it may be of any size: a ratio of the controller that is wrong, an
+    # instrument that was set up anew.
+    any_size: ClassVar[bool] = False
     # What to measure besides more poses where those do not tell it from other effects.
     remedy: ClassVar[str] = ""
 

@@ -248,6 +248,8 @@ class Jump(WarmUp):
     """u = d for t ≥ T, d all parameters of the place and T the one setting, in s: nobody knows
     beforehand when something changed."""
 
+    any_size = True
+
     def course(self, arm: Arm, p: Symbols) -> ca.SX:
         return arm.input("time", 1) >= p[self.constants[0].key]
 
@@ -390,7 +392,7 @@ class JointOffset(Effect):
 class EncoderScale(DrivenEffect):
     """δq = a·q with the commanded joint value q; a is dimensionless."""
 
-    name, stage = "encoder_scale", "transmission"
+    name, stage, any_size = "encoder_scale", "transmission", True
     entry = JointMotion()
     unknowns = (ParameterSpec("encoder_scale", "1", 0.0, 3e-4),)
 
@@ -549,7 +551,7 @@ class WristCoupling(DrivenEffect):
     ratios.  a, b and c (dimensionless) are the errors of those ratios.
     """
 
-    name, stage = "wrist_coupling", "transmission"
+    name, stage, any_size = "wrist_coupling", "transmission", True
     entry = JointMotion()
     unknowns = tuple(ParameterSpec(f"coupling_{k}", "1", 0.0, 2e-4) for k in "abc")
 
