@@ -13,6 +13,7 @@ However a run ends, what was done by then is kept, and the next one goes on from
 from __future__ import annotations
 
 import atexit
+import gc
 import hashlib
 import importlib
 import json
@@ -556,7 +557,10 @@ def connect(address: str, **way: Any) -> Any:
         return distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         told = f"no scheduler answers ({error}); check the address, or start one here: dask"
-        raise InputError(f"{option('cluster', where)}: {told} scheduler --host 127.0.0.1") from None
+    # What did not connect closes as it is collected: while another client starts, for whose lock it
+    # would wait for ever.
+    gc.collect()
+    raise InputError(f"{option('cluster', where)}: {told} scheduler --host 127.0.0.1")
 
 
 @dataclass(frozen=True)
